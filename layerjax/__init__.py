@@ -1,0 +1,24 @@
+"""layerjax: evaluate, sample and differentiate the BSDF of layered materials as pure JAX functions."""
+
+from layerjax._parameters import RANGES as RANGES
+from layerjax.directions import angles as angles
+from layerjax.directions import direction as direction
+from layerjax.evaluate import Prepared as Prepared
+from layerjax.evaluate import albedo as albedo
+from layerjax.evaluate import evaluate as evaluate
+from layerjax.evaluate import pdf as pdf
+from layerjax.evaluate import prepare as prepare
+from layerjax.evaluate import sample as sample
+from layerjax.evaluate import unscattered as unscattered
+from layerjax.phase import SGGX as SGGX
+from layerjax.phase import HenyeyGreenstein as HenyeyGreenstein
+from layerjax.stack import Interface as Interface
+from layerjax.stack import Medium as Medium
+from layerjax.stack import Stack as Stack
+from layerjax.surfaces import Conductor as Conductor
+from layerjax.surfaces import Lambertian as Lambertian
+from layerjax.surfaces import OrenNayar as OrenNayar
+from layerjax.transport import SingleScattering as SingleScattering
+from layerjax.transport import Transport as Transport
+
+__version__ = "0.1.0"

@@ -1,0 +1,62 @@
+"""Stable elementary functions, safe in value and in gradient.
+
+Every guard here sanitises the *input* of the branch that is not taken (with an interior stand-in) and only then selects:
+a clamp or a ``where`` after the fact still gives NaN gradients.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+SERIES_LIMIT = 0.3
+"""Below this argument `exprel` and `one_minus_exp` use a Taylor series."""
+
+
+def safe_sqrt(x: Array) -> Array:
+    """Square root that is 0, with gradient 0, for x <= 0."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def safe_div(numerator: Array, denominator: Array, otherwise: float = 0.0) -> Array:
+    """Quotient that is `otherwise`, with gradient 0, where the denominator is 0."""
+    nonzero = denominator != 0
+    return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), otherwise)
+
+
+def exprel(x: Array) -> Array:
+    """(1 - exp(-x)) / x for x >= 0, equal to 1 at x = 0; relative error of a few units of rounding."""
+    small, tame, inner = _split(x)
+    return jnp.where(small, _series(inner), (1.0 - jnp.exp(-tame)) / tame)
+
+
+def one_minus_exp(x: Array) -> Array:
+    """1 - exp(-x) for x >= 0, to a few units of rounding at any x."""
+    small, tame, inner = _split(x)
+    return jnp.where(small, inner * _series(inner), 1.0 - jnp.exp(-tame))
+
+
+def absorb(x: Array) -> tuple[Array, Array]:
+    """(exp(-x), 1 - exp(-x)) for x >= 0, both to a few units of rounding, with one exponential."""
+    small = x < SERIES_LIMIT
+    transmitted = jnp.exp(-x)
+    inner = jnp.where(small, x, 0.5 * SERIES_LIMIT)
+    return transmitted, jnp.where(small, inner * _series(inner), 1.0 - transmitted)
+
+
+def horizon(dtype: jnp.dtype) -> float:
+    """Cosines below this count as lying in the tangent plane: their squares must not overflow when divided by."""
+    return 1e-9 if jnp.finfo(dtype).bits >= 32 else 1e-3
+
+
+def _split(x: Array) -> tuple[Array, Array, Array]:
+    small = x < SERIES_LIMIT
+    return small, jnp.where(small, 1.0, x), jnp.where(small, x, 0.5 * SERIES_LIMIT)
+
+
+def _series(x: Array) -> Array:
+    # sum of (-x)^n / (n + 1)!; the first term left out is below half a unit of rounding at SERIES_LIMIT
+    terms = 13 if jnp.finfo(x.dtype).bits == 64 else 7
+    total = jnp.ones_like(x)
+    for n in range(terms, 1, -1):
+        total = 1.0 - x / n * total
+    return total

@@ -1,0 +1,101 @@
+"""Numeric fields of the material classes: conversion to arrays, and validation of concrete values by name and range."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+RANGES: dict[str, tuple[float, float]] = {
+    "Interface.ior": (0.25, 4.0),
+    "Interface.alpha": (1e-4, 1.0),
+    "Medium.thickness": (0.0, 1e4),
+    "Medium.albedo": (0.0, 1.0),
+    "Medium.f0": (0.0, 1.0),
+    "HenyeyGreenstein.g": (-0.999, 0.999),
+    "SGGX.alpha": (1e-4, 1.0),
+    "Lambertian.albedo": (0.0, 1.0),
+    "OrenNayar.albedo": (0.0, 1.0),
+    "OrenNayar.roughness": (0.0, 1.0),
+    "Conductor.ior": (0.01, 10.0),
+    "Conductor.k": (0.0, 20.0),
+    "Conductor.alpha": (1e-4, 1.0),
+}
+"""The documented box: the range of every numeric field."""
+
+PER_CHANNEL = frozenset(
+    {
+        "Medium.thickness",
+        "Medium.albedo",
+        "Medium.f0",
+        "Lambertian.albedo",
+        "OrenNayar.albedo",
+        "Conductor.ior",
+        "Conductor.k",
+    }
+)
+"""Fields that take a value a channel, shape (C,), as well as one for all, shape ()."""
+
+
+def is_placeholder(value: object) -> bool:
+    """Whether the value stands for a number that is not known yet (as ``fits.Free`` does)."""
+    return getattr(value, "__layerjax_placeholder__", False) is True
+
+
+def parameter(name: str, *, default: Any = dataclasses.MISSING, optional: bool = False) -> Any:
+    """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
+
+    Traced values are not checked (they have no value yet), placeholders pass as they are.
+    """
+
+    def convert(value: Any) -> Any:
+        if (optional and value is None) or is_placeholder(value):
+            return value
+        return _checked(name, value)
+
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=convert)
+    return eqx.field(converter=convert, default=default)
+
+
+def floating(name: str, value: Any) -> jax.Array:
+    """The value as an array of the default floating type, or of its own if it is a floating JAX array."""
+    if isinstance(value, str | bytes | bool | None):
+        raise ValueError(f"{name}: {value!r} is not a number")
+    try:
+        array = jnp.asarray(value)
+        if not jnp.issubdtype(array.dtype, jnp.floating):
+            if not jnp.issubdtype(array.dtype, jnp.integer):
+                raise TypeError
+            array = array.astype(jnp.result_type(float))
+        return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: {value!r} is not a number or an array of real numbers") from None
+
+
+def _checked(name: str, value: Any) -> jax.Array:
+    low, high = RANGES[name]
+    array = floating(name, value)
+    limit = 1 if name in PER_CHANNEL else 0
+    if array.ndim > limit or (array.ndim == 1 and array.shape[0] == 0):
+        wanted = "() or (channels,)" if limit else "()"
+        raise ValueError(
+            f"{name}: shape {array.shape} given, {wanted} allowed (use jax.vmap for many materials at a time)"
+        )
+    if not isinstance(array, jax.core.Tracer):
+        concrete = np.asarray(array, dtype=np.float64)
+        slack = 1e-6 if array.dtype != np.float64 else 1e-12  # the bounds themselves round when converted
+        outside = ~((concrete >= low - slack * abs(low)) & (concrete <= high + slack * abs(high)))
+        if outside.any():
+            bad = concrete[outside] if concrete.ndim else concrete
+            raise ValueError(f"{name}: {float(np.ravel(bad)[0]):g} is outside [{low:g}, {high:g}]")
+    return array
+
+
+def leaves_with_names(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Every leaf of the tree with its name as a user would write it, such as ``layers[0].phase.alpha``."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_placeholder):
+        yield prefix + jax.tree_util.keystr(path).lstrip("."), leaf

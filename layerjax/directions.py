@@ -1,0 +1,152 @@
+"""Conventions, and elementary geometry of directions.
+
+THE CONVENTIONS (everything else in the package links here)
+
+- Local frame: z is the macroscopic normal and points out of the top of the stack.
+- ``wi`` points towards the light, ``wo`` towards the viewer; both are unit vectors of shape ``(..., 3)`` that point *away*
+  from the surface. Below-horizon ``wi`` (z < 0) lights the stack from below.
+- Angles are in radians here, in degrees in files and on the command line. ``direction(theta, phi)`` has polar angle theta
+  from +z and azimuth phi from +x; ``phi_o = phi_i + pi`` is the mirror direction.
+- A BSDF value f is in 1/sr and does not contain the cosine. Channels are the last axis and always there.
+- Radiance is carried; between media of different index, reciprocity holds for f / ior_o^2.
+
+Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): separate components keep XLA from shuffling
+an inner axis of three.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from layerjax._numerics import safe_sqrt
+
+Vector = tuple[Array, Array, Array]
+
+
+def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
+    """Unit vector with polar angle `theta` from +z and azimuth `phi` from +x, in radians.
+
+    `theta` and `phi` broadcast; the result has shape ``broadcast(theta, phi) + (3,)``. theta > pi/2 points below.
+    """
+    theta, phi = jnp.broadcast_arrays(_real(theta), _real(phi))
+    sin_theta = jnp.sin(theta)
+    return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
+
+
+def angles(w: ArrayLike) -> tuple[Array, Array]:
+    """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions of shape ``(..., 3)``, in radians."""
+    x, y, z = split(_real(w))
+    planar = x * x + y * y
+    at_pole = planar == 0  # the azimuth is undefined there: give 0, with gradient 0
+    azimuth = jnp.where(at_pole, 0.0, jnp.arctan2(jnp.where(at_pole, 0.0, y), jnp.where(at_pole, 1.0, x)))
+    return jnp.arctan2(safe_sqrt(planar), z), azimuth
+
+
+def split(w: Array) -> Vector:
+    """Components of directions of shape ``(..., 3)``."""
+    return w[..., 0], w[..., 1], w[..., 2]
+
+
+def join(w: Vector) -> Array:
+    """Directions of shape ``(..., 3)`` from components."""
+    return jnp.stack(jnp.broadcast_arrays(*w), axis=-1)
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def add(a: Vector, b: Vector) -> Vector:
+    """a + b."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def select(chosen: Array, a: Vector, b: Vector) -> Vector:
+    """a where chosen, else b."""
+    return (jnp.where(chosen, a[0], b[0]), jnp.where(chosen, a[1], b[1]), jnp.where(chosen, a[2], b[2]))
+
+
+def scale(factor: Array, a: Vector) -> Vector:
+    """The vector times a number."""
+    return (factor * a[0], factor * a[1], factor * a[2])
+
+
+def combine(p: Array, a: Vector, q: Array, b: Vector) -> Vector:
+    """p a + q b."""
+    return (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])
+
+
+def normalize(a: Vector) -> Vector:
+    """The unit vector along a; a zero vector becomes +z, with gradient 0."""
+    squared = dot(a, a)
+    valid = squared > 0
+    inverse = 1.0 / jnp.sqrt(jnp.where(valid, squared, 1.0))
+    return (
+        jnp.where(valid, a[0] * inverse, 0.0),
+        jnp.where(valid, a[1] * inverse, 0.0),
+        jnp.where(valid, a[2] * inverse, 1.0),
+    )
+
+
+def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vector, Array]:
+    """Half vector h of wi and wo, and the cosine |wi . h|.
+
+    At wo = -wi the half vector is undefined (any vector normal to wi is a limit): one fixed vector normal to wi stands in.
+    `same_side` promises that wi and wo lie on the same side of the surface, where that cannot happen, and skips the guard.
+    """
+    total = add(wi, wo)
+    squared = dot(total, total)
+    if same_side:
+        inverse = 1.0 / jnp.sqrt(squared)
+        return scale(inverse, total), 0.5 * squared * inverse  # wi . h = |wi + wo| / 2 for unit vectors
+    defined = squared > 16.0 * jnp.finfo(squared.dtype).eps ** 2
+    inverse = 1.0 / jnp.sqrt(jnp.where(defined, squared, 1.0))
+    tangent, _ = frame(wi)
+    h = (
+        jnp.where(defined, total[0] * inverse, tangent[0]),
+        jnp.where(defined, total[1] * inverse, tangent[1]),
+        jnp.where(defined, total[2] * inverse, tangent[2]),
+    )
+    return h, jnp.where(defined, 0.5 * squared * inverse, 0.0)
+
+
+def reflect(w: Vector, m: Vector) -> Vector:
+    """Mirror image of w about the unit vector m (both pointing away from the surface)."""
+    cosine = dot(w, m)
+    return (2 * cosine * m[0] - w[0], 2 * cosine * m[1] - w[1], 2 * cosine * m[2] - w[2])
+
+
+def refract(w: Vector, m: Vector, ior: Array) -> tuple[Vector, Array]:
+    """Direction that w refracts into at a facet with unit normal m, and whether it exists.
+
+    `ior` is the index on the far side of the facet over that on w's side. Both w and the result point away from the
+    facet, to opposite sides of it. Under total internal reflection the flag is False and the vector has no meaning (it is
+    finite, with finite gradient).
+    """
+    cosine = dot(w, m)
+    squared = 1.0 - (1.0 - cosine * cosine) / (ior * ior)  # cosine of refraction, squared
+    exists = squared > 0
+    refracted = jnp.sqrt(jnp.where(exists, squared, 1.0))
+    along = cosine / ior - jnp.sign(cosine) * refracted
+    return combine(along, m, -1.0 / ior, w), exists
+
+
+def frame(n: Vector) -> tuple[Vector, Vector]:
+    """Two unit vectors that complete the unit vector n to a right-handed frame (Duff et al. 2017, JCGT 6(1))."""
+    sign = jnp.where(n[2] < 0, -1.0, 1.0)
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    tangent = (1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0])
+    bitangent = (b, sign + n[1] * n[1] * a, -n[1])
+    return tangent, bitangent
+
+
+def _real(value: ArrayLike) -> Array:
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))

@@ -1,0 +1,150 @@
+"""What a layered material is made of: `Interface`, `Medium`, and the `Stack` that holds them over a base.
+
+All are pytrees whose numeric leaves are arrays (concrete or traced); what is not a number is static. Constructors refuse
+concrete values outside the documented box (`layerjax.RANGES`) by name.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax import Array
+
+from layerjax._parameters import is_placeholder, leaves_with_names, parameter
+from layerjax.phase import HenyeyGreenstein, PhaseFunction
+from layerjax.surfaces import Surface
+
+
+class Interface(eqx.Module):
+    """Rough dielectric interface of GGX microfacets.
+
+    ========= ====== ========= ======= ===========================================================================
+    parameter symbol range     default meaning
+    ========= ====== ========= ======= ===========================================================================
+    ior       eta    [0.25, 4]         index of what lies below, relative to what surrounds the stack
+    alpha     alpha  [1e-4, 1]         GGX width
+    ========= ====== ========= ======= ===========================================================================
+    """
+
+    ior: Array = parameter("Interface.ior")
+    alpha: Array = parameter("Interface.alpha")
+
+
+class Medium(eqx.Module):
+    """Plane-parallel medium that absorbs and scatters.
+
+    ========= ====== ================== ================ ==========================================================
+    parameter symbol range              default          meaning
+    ========= ====== ================== ================ ==========================================================
+    thickness tau    [0, 1e4]                            optical depth T rho, per channel; extinction along w is
+                                                         thickness * sigma(w)
+    albedo    gamma  [0, 1]             1                share that survives a collision, per channel; 0 absorbs only
+    phase            HenyeyGreenstein   HenyeyGreenstein where a collision sends the light
+                     or SGGX            (g=0)
+    f0        F0     [0, 1]             None             Schlick reflectance of a flake, per channel; every collision
+                                                         keeps albedo * schlick(f0). None or 1: no Fresnel term
+    ========= ====== ================== ================ ==========================================================
+    """
+
+    thickness: Array = parameter("Medium.thickness")
+    albedo: Array = parameter("Medium.albedo", default=1.0)
+    phase: PhaseFunction = eqx.field(default_factory=lambda: HenyeyGreenstein(g=0.0))
+    f0: Array | None = parameter("Medium.f0", default=None, optional=True)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.phase, HenyeyGreenstein | PhaseFunction):
+            raise ValueError(f"Medium.phase: {self.phase!r} is not a HenyeyGreenstein or an SGGX")
+
+
+class Stack(eqx.Module):
+    """Layers from top to bottom over a base.
+
+    Args:
+        layers: any number of `Interface` and `Medium`, the topmost first.
+        base: an opaque surface (`Lambertian`, `OrenNayar`, `Conductor`), or None: light passes.
+
+    Raises:
+        ValueError: something else stands in the list, or parameters disagree on the number of channels.
+    """
+
+    layers: tuple[Interface | Medium, ...]
+    base: Surface | None = None
+
+    def __init__(self, layers: Iterable[Interface | Medium], base: Surface | None = None):
+        self.layers = tuple(layers)
+        self.base = base
+
+    def __check_init__(self) -> None:
+        for index, layer in enumerate(self.layers):
+            if not isinstance(layer, Interface | Medium):
+                raise ValueError(f"Stack.layers[{index}]: {layer!r} is not an Interface or a Medium")
+        if self.base is not None and not isinstance(self.base, Surface):
+            raise ValueError(f"Stack.base: {self.base!r} is not a surface or None")
+        channel_count(self)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C of the stack's values."""
+        return channel_count(self)
+
+
+def channel_count(stack: Stack) -> int:
+    """Number of channels, 1 if every parameter is a scalar."""
+    seen: dict[int, str] = {}
+    for name, leaf in leaves_with_names(stack):
+        if isinstance(leaf, float) or is_placeholder(leaf) or name.endswith("axis"):
+            continue
+        if leaf.ndim == 1 and leaf.shape[0] > 1:
+            seen.setdefault(leaf.shape[0], name)
+    if len(seen) > 1:
+        raise ValueError(
+            "Stack: parameters disagree on the number of channels: "
+            + ", ".join(f"{name} has {size}" for size, name in seen.items())
+        )
+    return next(iter(seen), 1)
+
+
+def require_numbers(stack: Stack) -> None:
+    """Refuse a stack that still holds placeholders (a family of stacks rather than one)."""
+    free = [name for name, leaf in leaves_with_names(stack) if is_placeholder(leaf)]
+    if free:
+        raise ValueError(f"Stack: {', '.join(free)} not given a value: this stack describes a family (see fits.fit)")
+
+
+def simplify(stack: Stack) -> Stack:
+    """The same stack without what its concrete values say is not there.
+
+    Media of thickness 0 go; f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
+    Traced values are kept as they are, so derivatives with respect to them are exact.
+    """
+    layers = []
+    for layer in stack.layers:
+        if isinstance(layer, Medium):
+            if _is_everywhere(layer.thickness, 0.0):
+                continue
+            f0 = layer.f0
+            if f0 is not None and _is_everywhere(f0, 1.0):
+                f0 = None
+            elif f0 is not None and _is_everywhere(f0, 0.0):
+                f0 = 0.0
+            albedo: Any = layer.albedo
+            for known in (0.0, 1.0):
+                albedo = known if _is_everywhere(albedo, known) else albedo
+            layer = eqx.tree_at(
+                lambda m: (m.albedo, m.f0), layer, (albedo, f0), is_leaf=lambda leaf: leaf is None
+            )
+        layers.append(layer)
+    return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
+
+
+def is_known(value: Any, number: float) -> bool:
+    """Whether the parameter is known while tracing to be that number (see `simplify`)."""
+    return isinstance(value, float) and value == number
+
+
+def _is_everywhere(value: Any, known: float) -> bool:
+    if isinstance(value, jax.core.Tracer | float):
+        return False
+    return bool(np.all(np.asarray(value) == known))

@@ -1,0 +1,45 @@
+"""The contract that every transport keeps."""
+
+import abc
+from typing import Any, Literal
+
+import equinox as eqx
+from jax import Array
+
+from layerjax.directions import Vector
+from layerjax.stack import Stack
+
+Side = Literal["all", "reflection", "transmission"]
+"""Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
+
+
+class Transport(eqx.Module):
+    """One way of solving a stack; its options are static fields.
+
+    Directions come as components, already broadcast against each other; results are one array a channel. `state` is what
+    `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
+    """
+
+    @abc.abstractmethod
+    def check(self, stack: Stack) -> None:
+        """Raise a ValueError that names the first layer or base which this transport cannot carry."""
+
+    @abc.abstractmethod
+    def prepare(self, stack: Stack) -> Any:
+        """All the work that no direction is needed for."""
+
+    @abc.abstractmethod
+    def evaluate(self, state: Any, wi: Vector, wo: Vector, side: Side) -> tuple[Array, ...]:
+        """BSDF values in 1/sr, without the cosine."""
+
+    @abc.abstractmethod
+    def sample(self, state: Any, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        """Outgoing directions from three uniform numbers each."""
+
+    @abc.abstractmethod
+    def pdf(self, state: Any, wi: Vector, wo: Vector) -> Array:
+        """Density of `sample` in solid angle, 1/sr."""
+
+    @abc.abstractmethod
+    def albedo(self, state: Any, wi: Vector, nodes: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""

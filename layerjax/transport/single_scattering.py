@@ -1,0 +1,240 @@
+"""SpongeCake, exact single scattering in stacks of media over a substrate (Wang et al. 2022, Sec. 4).
+
+Symbols: tau thickness, sigma projected area of the flakes, c = |cos|, a = tau sigma(wi)/ci, b = tau sigma(wo)/co. Both
+the reflection and the transmission of a layer are, in a form without cancellation or overflow,
+
+    f = gamma F D/4 * tau/(ci co) * exp(-m) * exprel(y),    exprel(y) = (1 - exp(-y)) / y
+
+with (m, y) = (0, a + b) on the same side and (min(a, b), |a - b|) on opposite sides (Eqs. 12 and 16, the sign of Eq. 15
+put right), times the attenuation of the layers that lie between it and wi, and between it and wo.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+from operator import add
+from typing import Any
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._numerics import absorb, exprel, horizon, one_minus_exp, safe_div
+from layerjax.channels import Channels, count, largest, mean, per_channel, pick
+from layerjax.directions import Vector, half_vector, select
+from layerjax.quadrature import Nodes
+from layerjax.stack import Interface, Medium, Stack, is_known, simplify
+from layerjax.transport._transport import Side, Transport
+
+BASE = -1
+"""Stands for the base among the indices of layers."""
+
+
+class SingleScattering(Transport):
+    """Every path with one collision: reflection and transmission, light from above and from below, any number of media.
+
+    Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
+    """
+
+    def check(self, stack: Stack) -> None:
+        for index, layer in enumerate(stack.layers):
+            if isinstance(layer, Interface):
+                raise ValueError(
+                    f"layers[{index}]: SingleScattering carries no Interface (media over a base only); "
+                    "no transport of this version does"
+                )
+
+    def prepare(self, stack: Stack) -> Stack:
+        return simplify(stack)
+
+    def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
+        return _total(list(_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
+
+    def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        u, u1, u2 = uniforms
+        wo: Vector = (jnp.zeros_like(u1), jnp.zeros_like(u1), jnp.ones_like(u1))
+        edge = jnp.zeros_like(u)
+        for probability, lobe in _choices(state, wi):
+            chosen = (u >= edge) & (probability > 0)
+            wo = select(chosen, lobe.sample(wi, u1, u2), wo)
+            edge = edge + probability
+        return wo
+
+    def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
+        density = jnp.zeros_like(wi[2] * wo[2])
+        for probability, lobe in _choices(state, wi):
+            if lobe is state.base:
+                above = jnp.where(wo[2] > horizon(wo[2].dtype), lobe.pdf(_lifted(wi), _lifted(wo)), 0.0)
+                density = density + probability * above
+            else:
+                density = density + probability * lobe.pdf(wi, wo)
+        return density
+
+    def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+        near, far = [], []
+        spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
+        for index in _scattering(state):
+            same_side, other_side = state.layers[index].phase.rule(wi, nodes)
+            near.append(_integral(_lobes(state, spread, same_side[0], "all")[index], same_side))
+            if state.base is None:
+                far.append(_integral(_lobes(state, spread, other_side[0], "all")[index], other_side))
+        if state.base is not None:
+            upper = state.base.rule(_lifted(wi), nodes)
+            near.append(_integral(_lobes(state, spread, upper[0], "reflection")[BASE], upper))
+        zero = jnp.zeros_like(wi[2])
+        return _total(near, zero), _total(far, zero)
+
+
+def optical_depths(media: Sequence[Medium], w: Vector) -> list[Channels]:
+    """Optical depth of each medium along w, tau sigma(w) / |cos|, one array a channel of its thickness."""
+    inverse = 1.0 / jnp.abs(w[2])
+    return [
+        tuple(tau * (medium.phase.cross_section(w) * inverse) for tau in per_channel(medium.thickness))
+        for medium in media
+    ]
+
+
+def _scattering(stack: Stack) -> list[int]:
+    """Indices of the media that scatter at all."""
+    return [k for k, medium in enumerate(stack.layers) if not is_known(medium.albedo, 0.0)]
+
+
+def _lobes(stack: Stack, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+    """BSDF of each medium that scatters, by its index, and of the base, by `BASE`."""
+    opaque = stack.base is not None
+    if opaque and side == "transmission":
+        return {}
+    edge = horizon(wi[2].dtype)
+    if opaque or side == "reflection":
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        lobes = _from_above(stack, _lifted(wi), _lifted(wo))
+    else:
+        valid_i, valid_o = jnp.abs(wi[2]) > edge, jnp.abs(wo[2]) > edge
+        valid = valid_i & valid_o & (wi[2] * wo[2] < 0) if side == "transmission" else valid_i & valid_o
+        inside_i = (wi[0], wi[1], jnp.where(valid_i, wi[2], 0.5))
+        inside_o = (wo[0], wo[1], jnp.where(valid_o, wo[2], 0.5))
+        lobes = _from_any_side(stack, inside_i, inside_o, side)
+    return {k: tuple(jnp.where(valid, value, 0.0) for value in lobe) for k, lobe in lobes.items()}
+
+
+def _from_above(stack: Stack, wi: Vector, wo: Vector) -> dict[int, Channels]:
+    """wi and wo above: each layer is seen through those over it, exp(-sum (a_j + b_j)), as a running product."""
+    lobes: dict[int, Channels] = {}
+    scattering = _scattering(stack)
+    last = len(stack.layers) - 1
+    half = half_vector(wi, wo, same_side=True) if scattering else None
+    inverse = 1.0 / (wi[2] * wo[2]) if stack.layers else None
+    through: Channels | None = None
+    for k, medium in enumerate(stack.layers):
+        weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
+        depths = tuple(tau * (weight * inverse) for tau in per_channel(medium.thickness))
+        shares = [absorb(depth) for depth in depths]
+        if half is not None and k in scattering:
+            lost = tuple(share / weight for _, share in shares)
+            lobes[k] = _times(_collision(medium, wi, wo, half), lost if through is None else _times(through, lost))
+        if k < last or stack.base is not None:
+            transmitted = tuple(share for share, _ in shares)
+            through = transmitted if through is None else _times(through, transmitted)
+    if stack.base is not None:
+        values = stack.base.evaluate(wi, wo)
+        lobes[BASE] = values if through is None else _times(through, values)
+    return lobes
+
+
+def _from_any_side(stack: Stack, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+    """Any sides, no base: a direction above crosses the layers over k, one below those under it."""
+    lobes: dict[int, Channels] = {}
+    scattering = _scattering(stack)
+    if not scattering:
+        return lobes
+    half = half_vector(wi, wo)
+    inverse = 1.0 / jnp.abs(wi[2] * wo[2])
+    depths_i, depths_o = optical_depths(stack.layers, wi), optical_depths(stack.layers, wo)
+    paths_i, paths_o = _paths(depths_i, wi), _paths(depths_o, wo)
+    same_side = wi[2] * wo[2] > 0
+    for k in scattering:
+        medium = stack.layers[k]
+        gains = []
+        for c in range(count(*paths_i, depths_i[k])):
+            a, b = pick(depths_i[k], c), pick(depths_o[k], c)
+            m, y = jnp.minimum(a, b), jnp.abs(a - b)
+            if side == "all":
+                m, y = jnp.where(same_side, 0.0, m), jnp.where(same_side, a + b, y)
+            if len(stack.layers) > 1:
+                m = m + pick(paths_i[k], c) + pick(paths_o[k], c)
+            gains.append(pick(per_channel(medium.thickness), c) * inverse * jnp.exp(-m) * exprel(y))
+        lobes[k] = _times(_collision(medium, wi, wo, half), tuple(gains))
+    return lobes
+
+
+def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
+    """Optical depth that a ray along w crosses between the outside and each layer; one channel count for all layers."""
+    channels = count(*depths)
+    above = w[2] > 0
+    zero = jnp.zeros_like(w[2])
+    per_layer = [[zero] * channels for _ in depths]
+    for c in range(channels):
+        over = [zero]
+        under = [zero]
+        for down, up in zip(depths[:-1], depths[:0:-1], strict=True):
+            over.append(over[-1] + pick(down, c))
+            under.append(under[-1] + pick(up, c))
+        for k, (from_top, from_bottom) in enumerate(zip(over, reversed(under), strict=True)):
+            per_layer[k][c] = jnp.where(above, from_top, from_bottom)
+    return [tuple(layer) for layer in per_layer]
+
+
+def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array]) -> Channels:
+    """gamma F D/4 (Eq. 4), or gamma times the phase function: what a collision sends from wi to wo."""
+    h, cosine = half
+    kernel = medium.phase.kernel(wi, wo, h)
+    strength: Channels = (kernel,)
+    if is_known(medium.f0, 0.0):
+        strength = (kernel * fresnel.schlick(cosine, 0.0),)
+    elif medium.f0 is not None:
+        strength = tuple(kernel * fresnel.schlick(cosine, f0) for f0 in per_channel(medium.f0))
+    return strength if is_known(medium.albedo, 1.0) else _times(per_channel(medium.albedo), strength)
+
+
+def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Any]]:
+    """Probability of each lobe and the lobe: first collision in that layer (Sec. 4.6) times the share that survives it.
+
+    The base is the last choice; without one the light that collides nowhere is left out, and the rest normalised.
+    """
+    edge = horizon(wi[2].dtype)
+    valid = wi[2] > edge if stack.base is not None else jnp.abs(wi[2]) > edge
+    wi = (wi[0], wi[1], jnp.where(valid, wi[2], 0.5))
+    depths = optical_depths(stack.layers, wi)
+    paths = _paths(depths, wi)
+    choices: list[tuple[Array, Any]] = []
+    for k in _scattering(stack):
+        medium = stack.layers[k]
+        collides = mean(_times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
+        survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
+        choices.append((collides * survives, medium.phase))
+    if stack.base is not None:
+        reached = jnp.ones_like(wi[2])
+        for depth in depths:
+            reached = reached * mean(tuple(jnp.exp(-d) for d in depth))
+        choices.append((reached, stack.base))
+    total = sum((weight for weight, _ in choices), jnp.zeros_like(wi[2]))
+    return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in choices]
+
+
+def _lifted(w: Vector) -> Vector:
+    """w, with the cosine of one that is not above the horizon replaced by an interior stand-in."""
+    return (w[0], w[1], jnp.where(w[2] > horizon(w[2].dtype), w[2], 0.5))
+
+
+def _times(a: Channels, b: Channels) -> Channels:
+    return tuple(pick(a, c) * pick(b, c) for c in range(count(a, b)))
+
+
+def _total(lobes: Sequence[Channels], zero: Array) -> Channels:
+    if not lobes:
+        return (zero,)
+    return tuple(reduce(add, (pick(lobe, c) for lobe in lobes)) for c in range(count(*lobes)))
+
+
+def _integral(lobe: Channels, nodes: Nodes) -> Channels:
+    wo, weight = nodes
+    return tuple(jnp.sum(value * jnp.abs(wo[2]) * weight, axis=-1) for value in lobe)
