@@ -1,7 +1,7 @@
 """Stable elementary functions, safe in value and in gradient.
 
-Every guard here sanitises the *input* of the branch that is not taken (with an interior stand-in) and only then selects:
-a clamp or a ``where`` after the fact still gives NaN gradients.
+Every guard here sanitises the *input* of the branch that is not taken (with an interior stand-in) and only then
+selects: a clamp or a ``where`` after the fact still gives NaN gradients.
 """
 
 import jax.numpy as jnp
@@ -58,5 +58,5 @@ def _series(x: Array) -> Array:
     terms = 13 if jnp.finfo(x.dtype).bits == 64 else 7
     total = jnp.ones_like(x)
     for n in range(terms, 1, -1):
-        total = 1.0 - x / n * total
+        total = 1.0 - (x * (1.0 / n)) * total
     return total

@@ -40,6 +40,10 @@ PER_CHANNEL = frozenset(
 """Fields that take a value a channel, shape (C,), as well as one for all, shape ()."""
 
 
+Parameter = Any
+"""Type of a numeric field: numbers, sequences, traced arrays and placeholders go in, arrays or placeholders stay."""
+
+
 def is_placeholder(value: object) -> bool:
     """Whether the value stands for a number that is not known yet (as ``fits.Free`` does)."""
     return getattr(value, "__layerjax_placeholder__", False) is True

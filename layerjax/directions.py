@@ -3,15 +3,15 @@
 THE CONVENTIONS (everything else in the package links here)
 
 - Local frame: z is the macroscopic normal and points out of the top of the stack.
-- ``wi`` points towards the light, ``wo`` towards the viewer; both are unit vectors of shape ``(..., 3)`` that point *away*
-  from the surface. Below-horizon ``wi`` (z < 0) lights the stack from below.
-- Angles are in radians here, in degrees in files and on the command line. ``direction(theta, phi)`` has polar angle theta
-  from +z and azimuth phi from +x; ``phi_o = phi_i + pi`` is the mirror direction.
+- ``wi`` points towards the light, ``wo`` towards the viewer; both are unit vectors of shape ``(..., 3)`` that point
+  *away* from the surface. Below-horizon ``wi`` (z < 0) lights the stack from below.
+- Angles are in radians here, in degrees in files and on the command line. ``direction(theta, phi)`` has polar angle
+  theta from +z and azimuth phi from +x; ``phi_o = phi_i + pi`` is the mirror direction.
 - A BSDF value f is in 1/sr and does not contain the cosine. Channels are the last axis and always there.
 - Radiance is carried; between media of different index, reciprocity holds for f / ior_o^2.
 
-Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): separate components keep XLA from shuffling
-an inner axis of three.
+Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): separate components keep XLA from
+shuffling an inner axis of three.
 """
 
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from jax.typing import ArrayLike
 from layerjax._numerics import safe_sqrt
 
 Vector = tuple[Array, Array, Array]
+Factor = Array | float
 
 
 def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
@@ -72,12 +73,12 @@ def select(chosen: Array, a: Vector, b: Vector) -> Vector:
     return (jnp.where(chosen, a[0], b[0]), jnp.where(chosen, a[1], b[1]), jnp.where(chosen, a[2], b[2]))
 
 
-def scale(factor: Array, a: Vector) -> Vector:
+def scale(factor: Factor, a: Vector) -> Vector:
     """The vector times a number."""
     return (factor * a[0], factor * a[1], factor * a[2])
 
 
-def combine(p: Array, a: Vector, q: Array, b: Vector) -> Vector:
+def combine(p: Factor, a: Vector, q: Factor, b: Vector) -> Vector:
     """p a + q b."""
     return (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])
 
@@ -97,8 +98,9 @@ def normalize(a: Vector) -> Vector:
 def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vector, Array]:
     """Half vector h of wi and wo, and the cosine |wi . h|.
 
-    At wo = -wi the half vector is undefined (any vector normal to wi is a limit): one fixed vector normal to wi stands in.
-    `same_side` promises that wi and wo lie on the same side of the surface, where that cannot happen, and skips the guard.
+    At wo = -wi the half vector is undefined (any vector normal to wi is a limit): one fixed vector normal to wi
+    stands in. `same_side` promises that wi and wo lie on the same side of the surface, where that cannot happen, and
+    skips the guard.
     """
     total = add(wi, wo)
     squared = dot(total, total)
@@ -126,11 +128,11 @@ def refract(w: Vector, m: Vector, ior: Array) -> tuple[Vector, Array]:
     """Direction that w refracts into at a facet with unit normal m, and whether it exists.
 
     `ior` is the index on the far side of the facet over that on w's side. Both w and the result point away from the
-    facet, to opposite sides of it. Under total internal reflection the flag is False and the vector has no meaning (it is
-    finite, with finite gradient).
+    facet, to opposite sides of it. Under total internal reflection the flag is False and the vector has no meaning
+    (it is finite, with finite gradient).
     """
     cosine = dot(w, m)
-    squared = 1.0 - (1.0 - cosine * cosine) / (ior * ior)  # cosine of refraction, squared
+    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)  # cosine of refraction, squared
     exists = squared > 0
     refracted = jnp.sqrt(jnp.where(exists, squared, 1.0))
     along = cosine / ior - jnp.sign(cosine) * refracted

@@ -1,8 +1,8 @@
 """The public way in: evaluate, sample, pdf, albedo, unscattered, prepare.
 
-Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``, ``vmap`` and
-``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so that a gradient
-holds no more than one chunk in memory and accumulates as it goes.
+Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``,
+``vmap`` and ``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so
+that a gradient holds no more than one chunk in memory and accumulates as it goes.
 """
 
 import math
@@ -19,9 +19,8 @@ from jax.typing import ArrayLike
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, split
-from layerjax.stack import Interface, Stack, channel_count, require_numbers, simplify
+from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, SingleScattering, Transport
-from layerjax.transport.single_scattering import optical_depths
 
 CHUNK_BYTES = 20_000
 """Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
@@ -68,12 +67,13 @@ def evaluate(
         wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface.
         wo: unit directions towards the viewer, shape ``(..., 3)``. Same side as wi: reflection; opposite: transmission.
         transport: see `prepare`.
-        side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and one below.
+        side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
+        one below.
             Other pairs give 0, and what only they need is left out of the program.
 
     Returns:
-        Values of shape ``broadcast(wi, wo)[:-1] + (C,)`` in the floating type of the directions, the channel axis last. A
-        direction in the tangent plane gives 0.
+        Values of shape ``broadcast(wi, wo)[:-1] + (C,)`` in the floating type of the directions, the channel axis
+        last. A direction in the tangent plane gives 0.
     """
     if side not in get_args(Side):
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
@@ -87,8 +87,9 @@ def sample(
     """Draw one outgoing direction for each wi.
 
     Returns:
-        ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf`` of shape
-        ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have weight 0.
+        ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf``
+        of shape ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have
+        weight 0.
     """
     (wi,) = _directions(wi=wi)
     return _sample(_prepared(stack, transport, wi.dtype), wi, key)
@@ -176,10 +177,11 @@ def _albedo(prepared: Prepared, wi: Array, nodes: int) -> tuple[Array, Array]:
 @eqx.filter_jit
 def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     x, y, z = split(wi)
-    if stack.base is not None or any(isinstance(layer, Interface) for layer in stack.layers):
+    media = media_of(stack)
+    if stack.base is not None or len(media) < len(stack.layers):
         return jnp.zeros((*z.shape, channels), z.dtype)
     visible = jnp.abs(z) > horizon(z.dtype)
-    depths = optical_depths(stack.layers, (x, y, jnp.where(visible, z, 0.5)))
+    depths = optical_depths(media, (x, y, jnp.where(visible, z, 0.5)))
     totals = [sum((pick(depth, c) for depth in depths), jnp.zeros_like(z)) for c in range(channels)]
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
@@ -205,7 +207,7 @@ def _in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> tu
 
 
 def _stack(components: Sequence[Array]) -> Array:
-    """Components along a new last axis; built along the first and transposed once, which XLA does several times faster."""
+    """Components along a new last axis; built along the first and transposed, which XLA does several times faster."""
     return jnp.moveaxis(jax.lax.optimization_barrier(jnp.stack(components)), 0, -1)
 
 

@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import safe_sqrt
+from layerjax._numerics import safe_div, safe_sqrt
 
 
-def schlick(cosine: Array, f0: Array) -> Array:
+def schlick(cosine: Array, f0: Array | float) -> Array:
     """Schlick's approximation f0 + (1 - f0) (1 - cosine)^5 for |cosine| in [0, 1] (Schlick 1994)."""
-    complement = 1.0 - cosine
+    complement = jnp.maximum(1.0 - cosine, 0.0)  # a cosine may round to just above 1
     squared = complement * complement
     fifth = squared * squared * complement
     return f0 + (1.0 - f0) * fifth
@@ -24,7 +24,7 @@ def dielectric(cosine: Array, ior: Array) -> Array:
     The two amplitudes are formed without a difference of squares, so that ior = 1 gives exactly 0 at every angle.
     Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it).
     """
-    squared = 1.0 - (1.0 - cosine * cosine) / (ior * ior)
+    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)  # exact at ior = 1
     transmits = squared > 0
     refracted = jnp.sqrt(jnp.where(transmits, squared, 0.25))
     c = jnp.where(transmits, cosine, 0.5)
@@ -48,14 +48,13 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     sin2 = 1.0 - cos2
     real = ior * ior - k * k - sin2
     product = ior * k
-    modulus = safe_sqrt(real * real + 4.0 * product * product)  # |n^2 - sin^2|
-    # Re sqrt(n^2 - sin^2): for real < 0 the textbook form cancels, its conjugate does not
-    positive = real >= 0
-    upper = safe_sqrt(0.5 * (modulus + jnp.where(positive, real, 0.0)))
-    lower = product * jnp.sqrt(2.0) / jnp.sqrt(modulus - jnp.where(positive, -1.0, real))
-    a = jnp.where(positive, upper, lower)
-    even, odd = modulus + cos2, 2.0 * a * cosine
-    perpendicular = (even - odd) / (even + odd)
-    even, odd = modulus * cos2 + sin2 * sin2, odd * sin2
-    tiny = jnp.finfo(even.dtype).tiny
-    return 0.5 * perpendicular * (1.0 + (even - odd) / (even + odd + tiny))
+    modulus = safe_sqrt(real * real + 4.0 * product * product)
+    # a + i b = sqrt(n^2 - sin^2): the larger part by a sum, the other from their product, so that nothing cancels
+    larger = 0.5 * (modulus + jnp.abs(real))
+    smaller = safe_div(product * product, larger)
+    a2, b2 = jnp.where(real > 0, larger, smaller), jnp.where(real > 0, smaller, larger)
+    a = safe_sqrt(a2)
+    perpendicular = ((a - cosine) ** 2 + b2) / ((a + cosine) ** 2 + b2)
+    tiny = jnp.finfo(modulus.dtype).tiny
+    ratio = ((a * cosine - sin2) ** 2 + b2 * cos2) / ((a * cosine + sin2) ** 2 + b2 * cos2 + tiny)
+    return 0.5 * perpendicular * (1.0 + ratio)

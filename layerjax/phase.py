@@ -8,7 +8,7 @@ Each offers the same few functions of directions as components (see `layerjax.di
 - ``rule(wi, nodes)``: quadrature nodes that resolve the lobe (see `layerjax.quadrature`).
 """
 
-from typing import Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._parameters import floating, is_placeholder, parameter
+from layerjax._parameters import Parameter, floating, is_placeholder, parameter
 from layerjax.directions import Vector, add, combine, dot, frame, half_vector, normalize, reflect, scale, split
-from layerjax.distributions import radii, sggx_area, sggx_density, sggx_sample
+from layerjax.distributions import Kind, radii, sggx_area, sggx_density, sggx_sample
 from layerjax.quadrature import Rule, flake_rule, henyey_greenstein_inverse, henyey_greenstein_rule
 
 
@@ -32,7 +32,7 @@ class HenyeyGreenstein(eqx.Module):
     ========= ====== ================ ======= ============================================
     """
 
-    g: Array = parameter("HenyeyGreenstein.g")
+    g: Parameter = parameter("HenyeyGreenstein.g")
 
     def cross_section(self, w: Vector) -> Array:
         return jnp.ones_like(w[2])
@@ -74,16 +74,13 @@ class SGGX(eqx.Module):
     ========= ====== ===================== ======== ===========================================================
     """
 
-    alpha: Array = parameter("SGGX.alpha")
-    axis: Array | None
-    kind: Literal["surface", "fiber"] = eqx.field(static=True)
+    kind: Kind = eqx.field(static=True)
+    alpha: Parameter = parameter("SGGX.alpha")
+    axis: Parameter = eqx.field(converter=lambda axis: _axis(axis), default=None)
 
-    def __init__(self, kind: Literal["surface", "fiber"], alpha: Array | float, axis: Array | None = None):
-        if kind not in ("surface", "fiber"):
-            raise ValueError(f'SGGX.kind: {kind!r} is not one of "surface", "fiber"')
-        self.kind = kind
-        self.alpha = alpha
-        self.axis = _axis(axis)
+    def __check_init__(self) -> None:
+        if self.kind not in ("surface", "fiber"):
+            raise ValueError(f'SGGX.kind: {self.kind!r} is not one of "surface", "fiber"')
 
     def cross_section(self, w: Vector) -> Array:
         return sggx_area(w, self.kind, self.alpha, self._axis())
@@ -108,9 +105,9 @@ class SGGX(eqx.Module):
 PhaseFunction = HenyeyGreenstein | SGGX
 
 
-def _axis(axis: object) -> Array | None:
+def _axis(axis: Any) -> Any:
     if axis is None or is_placeholder(axis):
-        return axis  # type: ignore[return-value]  # a placeholder stands for an array
+        return axis
     array = floating("SGGX.axis", axis)
     if array.shape != (3,):
         raise ValueError(f"SGGX.axis: shape {array.shape} given, (3,) needed")
@@ -119,4 +116,3 @@ def _axis(axis: object) -> Array | None:
         if not np.isfinite(concrete).all() or not concrete.any():
             raise ValueError(f"SGGX.axis: {concrete.tolist()} is not a finite vector other than zero")
     return array
-

@@ -2,8 +2,8 @@
 
 Every rule splits the sphere at the horizon, where BSDFs have a kink, and warps it so that the lobe is smooth in the new
 coordinates however narrow it is. A rule is a pair (nodes on wi's side of the horizon, nodes on the other side), each a
-direction (components of shape ``batch + (nodes,)``) and a weight so that ``sum(weight g(wo))`` approximates the integral
-of g over that hemisphere. A narrow g must be the lobe that the rule was made for, times something smooth.
+direction (components of shape ``batch + (nodes,)``) and a weight so that ``sum(weight g(wo))`` approximates the
+integral of g over that hemisphere. A narrow g must be the lobe that the rule was made for, times something smooth.
 """
 
 import functools
@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._numerics import safe_div, safe_sqrt
-from layerjax.directions import Vector, add, combine, dot, frame, normalize, scale
+from layerjax.directions import Vector, add, combine, cross, dot, frame, normalize, scale, select
 
 Nodes = tuple[Vector, Array]
 Rule = tuple[Nodes, Nodes]
@@ -60,9 +60,9 @@ def hemisphere_rule(wi: Vector, nodes: int) -> Nodes:
 def flake_rule(wi: Vector, radial: Array, axial: Array, axis: Vector | None, nodes: int) -> Rule:
     """Nodes for mirrors whose normals m follow an ellipsoid, S = radial^2 (I - a a') + axial^2 a a'.
 
-    With m = normalize(S^(1/2) y) the density of visible normals is uniform in the cosine of y, however narrow it is. Great
-    circles of y through the image of wi are great circles of m through wi, and each of them crosses the horizon of wo once:
-    polar coordinates about that point split the two hemispheres exactly.
+    With m = normalize(S^(1/2) y) the density of visible normals is uniform in the cosine of y, however narrow it is.
+    Great circles of y through the image of wi are great circles of m through wi, and each of them crosses the horizon
+    of wo once: polar coordinates about that point split the two hemispheres exactly.
     """
     a: Vector = axis if axis is not None else (jnp.zeros_like(wi[2]), jnp.zeros_like(wi[2]), jnp.ones_like(wi[2]))
 
@@ -142,7 +142,7 @@ def _half_turns(dtype: jnp.dtype) -> Array:
 
 
 def _crossings(wi: Vector, first: Vector, second: Vector) -> Array:
-    """Azimuths at which the mirror m = cos(psi) first + sin(psi) second sends wi into the horizon, and +-pi/2, in order.
+    """Azimuths where the mirror m = cos(psi) first + sin(psi) second sends wi into the horizon, and +-pi/2, in order.
 
     Thin fibers have all their normals there: the crossing leaps from one end of the great circle to the other.
     """
@@ -164,18 +164,13 @@ def _panel_frame(pole: Vector, towards: Vector) -> tuple[Vector, Vector]:
     projected = combine(jnp.ones_like(pole[2]), towards, -dot(towards, pole), pole)
     tangent, _ = frame(pole)
     parallel = dot(projected, projected) < 1e-24
-    first = normalize(tuple(jnp.where(parallel, t, p) for t, p in zip(tangent, projected, strict=True)))
-    second = (
-        pole[1] * first[2] - pole[2] * first[1],
-        pole[2] * first[0] - pole[0] * first[2],
-        pole[0] * first[1] - pole[1] * first[0],
-    )
-    return first, second
+    first = normalize(select(parallel, tangent, projected))
+    return first, cross(pole, first)
 
 
 def _expand(w: Vector, axes: int) -> Vector:
     index = (...,) + (None,) * axes
-    return tuple(component[index] for component in w)
+    return (w[0][index], w[1][index], w[2][index])
 
 
 def _flatten(wo: Vector, weight: Array) -> Nodes:

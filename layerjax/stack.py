@@ -1,18 +1,20 @@
 """What a layered material is made of: `Interface`, `Medium`, and the `Stack` that holds them over a base.
 
-All are pytrees whose numeric leaves are arrays (concrete or traced); what is not a number is static. Constructors refuse
-concrete values outside the documented box (`layerjax.RANGES`) by name.
+All are pytrees whose numeric leaves are arrays (concrete or traced); what is not a number is static. Constructors
+refuse concrete values outside the documented box (`layerjax.RANGES`) by name.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
-from layerjax._parameters import is_placeholder, leaves_with_names, parameter
+from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
+from layerjax.channels import Channels, per_channel
+from layerjax.directions import Vector
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Surface
 
@@ -28,8 +30,8 @@ class Interface(eqx.Module):
     ========= ====== ========= ======= ===========================================================================
     """
 
-    ior: Array = parameter("Interface.ior")
-    alpha: Array = parameter("Interface.alpha")
+    ior: Parameter = parameter("Interface.ior")
+    alpha: Parameter = parameter("Interface.alpha")
 
 
 class Medium(eqx.Module):
@@ -48,10 +50,10 @@ class Medium(eqx.Module):
     ========= ====== ================== ================ ==========================================================
     """
 
-    thickness: Array = parameter("Medium.thickness")
-    albedo: Array = parameter("Medium.albedo", default=1.0)
+    thickness: Parameter = parameter("Medium.thickness")
+    albedo: Parameter = parameter("Medium.albedo", default=1.0)
     phase: PhaseFunction = eqx.field(default_factory=lambda: HenyeyGreenstein(g=0.0))
-    f0: Array | None = parameter("Medium.f0", default=None, optional=True)
+    f0: Parameter = parameter("Medium.f0", default=None, optional=True)
 
     def __check_init__(self) -> None:
         if not isinstance(self.phase, HenyeyGreenstein | PhaseFunction):
@@ -124,7 +126,7 @@ def simplify(stack: Stack) -> Stack:
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
-            f0 = layer.f0
+            f0: Any = layer.f0
             if f0 is not None and _is_everywhere(f0, 1.0):
                 f0 = None
             elif f0 is not None and _is_everywhere(f0, 0.0):
@@ -132,11 +134,23 @@ def simplify(stack: Stack) -> Stack:
             albedo: Any = layer.albedo
             for known in (0.0, 1.0):
                 albedo = known if _is_everywhere(albedo, known) else albedo
-            layer = eqx.tree_at(
-                lambda m: (m.albedo, m.f0), layer, (albedo, f0), is_leaf=lambda leaf: leaf is None
-            )
+            layer = eqx.tree_at(lambda m: (m.albedo, m.f0), layer, (albedo, f0), is_leaf=lambda leaf: leaf is None)
         layers.append(layer)
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
+
+
+def media_of(stack: Stack) -> list[Medium]:
+    """The media of a stack, from top to bottom."""
+    return [layer for layer in stack.layers if isinstance(layer, Medium)]
+
+
+def optical_depths(media: Sequence[Medium], w: Vector) -> list[Channels]:
+    """Optical depth of each medium along w, tau sigma(w) / |cos|, one array a channel of its thickness."""
+    inverse = 1.0 / jnp.abs(w[2])
+    return [
+        tuple(tau * (medium.phase.cross_section(w) * inverse) for tau in per_channel(medium.thickness))
+        for medium in media
+    ]
 
 
 def is_known(value: Any, number: float) -> bool:

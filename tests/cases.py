@@ -1,8 +1,8 @@
 """Published and reference values: SpongeCake single scattering.
 
-Point values come from a matrix form of SGGX (determinant and inverse), projected areas by quadrature over the sphere and
-the depth integral by adaptive quadrature; hemispherical values from converged product quadrature, matched by an analog
-random walk. Neither shares code or formulas with the package. Directions are (theta, phi).
+Point values come from a matrix form of SGGX (determinant and inverse), projected areas by quadrature over the sphere
+and the depth integral by adaptive quadrature; hemispherical values from converged product quadrature, matched by an
+analog random walk. Neither shares code or formulas with the package. Directions are (theta, phi).
 """
 
 from math import pi
@@ -63,7 +63,12 @@ POINTS = {
     ),
     "R2.6 grazing": (lambda: [flakes("surface", 0.05, NORMAL, 1e4)], (1.5, 0.0), (1.48, pi), 1940.97623366),
     "R2.7 thin": (lambda: [flakes("surface", 0.5, NORMAL, 1e-6)], (0.7, 0.0), (0.3, 2.0), 2.52939554802e-07),
-    "R2.8 equal attenuations": (lambda: [flakes("surface", 0.5, NORMAL, 3.0)], (0.7, 0.0), (pi - 0.7, 2.0), 0.0039354706715),
+    "R2.8 equal attenuations": (
+        lambda: [flakes("surface", 0.5, NORMAL, 3.0)],
+        (0.7, 0.0),
+        (pi - 0.7, 2.0),
+        0.0039354706715,
+    ),
     "R2.9 haze": (lambda: [haze(0.4, 0.7, 0.8)], (0.6, 0.2), (1.1, 2.5), 0.0292158328285),
     "R2.9 haze, transmitted": (lambda: [haze(0.4, 0.7, 0.8)], (0.6, 0.2), (2.1, 2.5), 0.0696975769741),
     # the reference has thickness 1e12: what the box ends at, 1e4, leaves exp(-1e4) of difference

@@ -12,8 +12,8 @@ from layerjax.quadrature import Nodes, hemisphere_rule
 class Surface(eqx.Module):
     """An opaque surface, lit and seen from above.
 
-    Directions come as components (see `layerjax.directions`); callers guarantee that their z is positive. Values are one
-    array a channel, so that nothing is stacked before the very end.
+    Directions come as components (see `layerjax.directions`); callers guarantee that their z is positive. Values are
+    one array a channel, so that nothing is stacked before the very end.
     """
 
     @abc.abstractmethod

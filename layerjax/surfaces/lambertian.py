@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import safe_sqrt
-from layerjax._parameters import parameter
+from layerjax._parameters import Parameter, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector
 from layerjax.surfaces._surface import Surface
@@ -20,7 +20,7 @@ class Lambertian(Surface):
     ========= ====== ======= ======= =======================================
     """
 
-    albedo: Array = parameter("Lambertian.albedo")
+    albedo: Parameter = parameter("Lambertian.albedo")
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         return tuple(albedo / jnp.pi for albedo in per_channel(self.albedo))

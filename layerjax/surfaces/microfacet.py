@@ -1,9 +1,9 @@
-"""Rough interfaces of microfacets: single scattering with GGX normals and separable Smith masking (Walter et al. 2007)."""
+"""Rough interfaces of GGX microfacets: single scattering, separable Smith masking (Walter et al. 2007)."""
 
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._parameters import parameter
+from layerjax._parameters import Parameter, parameter
 from layerjax.channels import count, per_channel, pick
 from layerjax.directions import Vector, half_vector, reflect
 from layerjax.distributions import ggx_density, ggx_masking, ggx_sample, sggx_area
@@ -23,9 +23,9 @@ class Conductor(Surface):
     ========= ====== ============ ======= ===============================================================
     """
 
-    ior: Array = parameter("Conductor.ior")
-    k: Array = parameter("Conductor.k")
-    alpha: Array = parameter("Conductor.alpha")
+    ior: Parameter = parameter("Conductor.ior")
+    k: Parameter = parameter("Conductor.k")
+    alpha: Parameter = parameter("Conductor.alpha")
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         h, cosine = half_vector(wi, wo, same_side=True)
@@ -34,9 +34,7 @@ class Conductor(Surface):
         area_o = sggx_area(wo, "surface", self.alpha, None)
         lobe = ggx_density(h, self.alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
         ior, k = per_channel(self.ior), per_channel(self.k)
-        return tuple(
-            lobe * fresnel.conductor(cosine, pick(ior, c), pick(k, c)) for c in range(count(ior, k))
-        )
+        return tuple(lobe * fresnel.conductor(cosine, pick(ior, c), pick(k, c)) for c in range(count(ior, k)))
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, ggx_sample(wi, self.alpha, u1, u2))

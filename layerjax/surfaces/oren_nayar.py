@@ -1,8 +1,9 @@
 """Rough diffuse reflection: V-shaped grooves of Lambertian facets.
 
 ``form="energy_preserving"`` is EON (Portsmouth, Kutz & Hill 2025, "EON: a practical energy-preserving rough diffuse
-BRDF", JCGT 14(1)): the Fujii form of Oren-Nayar with its directional albedo in closed form, plus a term that returns the
-energy lost. ``form="classic"`` is the qualitative model of Oren & Nayar 1994, which loses energy; it is here to compare.
+BRDF", JCGT 14(1)): the Fujii form of Oren-Nayar with its directional albedo in closed form, plus a term that returns
+the energy lost. ``form="classic"`` is the qualitative model of Oren & Nayar 1994, which loses energy; it is here to
+compare.
 """
 
 from typing import Literal
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import safe_sqrt
-from layerjax._parameters import parameter
+from layerjax._parameters import Parameter, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector
 from layerjax.surfaces._surface import Surface
@@ -25,20 +26,21 @@ _MEAN = 2.0 / 3.0 - 28.0 / (15.0 * jnp.pi)
 class OrenNayar(Surface):
     """Rough diffuse surface.
 
-    ========= ======== ======================================= ===================== =======================================
-    parameter symbol   range                                   default               meaning
-    ========= ======== ======================================= ===================== =======================================
-    albedo    rho      [0, 1]                                                        albedo of a facet, per channel
-    roughness r, sigma [0, 1]                                                        energy_preserving: the paper's r;
-                                                                                     classic: slope deviation in radians
-    form               "energy_preserving" | "classic"         "energy_preserving"
-    ========= ======== ======================================= ===================== =======================================
+    ========= ======== =================== =================== ===========================================
+    parameter symbol   range               default             meaning
+    ========= ======== =================== =================== ===========================================
+    albedo    rho      [0, 1]                                  albedo of a facet, per channel
+    roughness r, sigma [0, 1]                                  "energy_preserving": the paper's r;
+                                                               "classic": slope deviation in radians
+    form               "energy_preserving" "energy_preserving" which of the two models
+                       | "classic"
+    ========= ======== =================== =================== ===========================================
 
     Not smooth where the azimuths of wi and wo differ by pi/2, and (classic and Fujii alike) where theta_i = theta_o.
     """
 
-    albedo: Array = parameter("OrenNayar.albedo")
-    roughness: Array = parameter("OrenNayar.roughness")
+    albedo: Parameter = parameter("OrenNayar.albedo")
+    roughness: Parameter = parameter("OrenNayar.roughness")
     form: Literal["energy_preserving", "classic"] = eqx.field(static=True, default="energy_preserving")
 
     def __check_init__(self) -> None:
@@ -49,7 +51,7 @@ class OrenNayar(Surface):
         return self._classic(wi, wo) if self.form == "classic" else self._energy_preserving(wi, wo)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        # mostly by the cosine; uniform for a share, because towards grazing f cos stays finite while the cosine goes to 0
+        # mostly by the cosine; uniform for a share, because f cos stays finite where the cosine goes to 0
         share = _uniform_share(self.roughness)
         uniform = u1 < share
         v1 = jnp.where(uniform, u1 / jnp.maximum(share, 1e-6), (u1 - share) / (1.0 - share))

@@ -1,4 +1,4 @@
-"""Ways of carrying light through a stack. Each is one `Transport`, takes the same `Stack`, and says what it supports."""
+"""Ways of carrying light through a stack: each is one `Transport` and takes the same `Stack`."""
 
 from layerjax.transport._transport import Side as Side
 from layerjax.transport._transport import Transport as Transport

@@ -16,8 +16,8 @@ Side = Literal["all", "reflection", "transmission"]
 class Transport(eqx.Module):
     """One way of solving a stack; its options are static fields.
 
-    Directions come as components, already broadcast against each other; results are one array a channel. `state` is what
-    `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
+    Directions come as components, already broadcast against each other; results are one array a channel. `state` is
+    what `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
     """
 
     @abc.abstractmethod

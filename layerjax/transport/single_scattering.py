@@ -11,9 +11,11 @@ put right), times the attenuation of the layers that lie between it and wi, and 
 
 from collections.abc import Sequence
 from functools import reduce
+from itertools import accumulate
 from operator import add
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
@@ -22,11 +24,19 @@ from layerjax._numerics import absorb, exprel, horizon, one_minus_exp, safe_div
 from layerjax.channels import Channels, count, largest, mean, per_channel, pick
 from layerjax.directions import Vector, half_vector, select
 from layerjax.quadrature import Nodes
-from layerjax.stack import Interface, Medium, Stack, is_known, simplify
+from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths, simplify
+from layerjax.surfaces import Surface
 from layerjax.transport._transport import Side, Transport
 
 BASE = -1
 """Stands for the base among the indices of layers."""
+
+
+class Media(eqx.Module):
+    """A stack that holds media alone, without what is known to be absent."""
+
+    media: tuple[Medium, ...]
+    base: Surface | None
 
 
 class SingleScattering(Transport):
@@ -43,13 +53,14 @@ class SingleScattering(Transport):
                     "no transport of this version does"
                 )
 
-    def prepare(self, stack: Stack) -> Stack:
-        return simplify(stack)
+    def prepare(self, stack: Stack) -> Media:
+        slim = simplify(stack)
+        return Media(tuple(media_of(slim)), slim.base)
 
-    def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: Media, wi: Vector, wo: Vector, side: Side) -> Channels:
         return _total(list(_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
 
-    def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: Media, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
         wo: Vector = (jnp.zeros_like(u1), jnp.zeros_like(u1), jnp.ones_like(u1))
         edge = jnp.zeros_like(u)
@@ -59,21 +70,21 @@ class SingleScattering(Transport):
             edge = edge + probability
         return wo
 
-    def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: Media, wi: Vector, wo: Vector) -> Array:
         density = jnp.zeros_like(wi[2] * wo[2])
         for probability, lobe in _choices(state, wi):
-            if lobe is state.base:
+            if isinstance(lobe, Surface):
                 above = jnp.where(wo[2] > horizon(wo[2].dtype), lobe.pdf(_lifted(wi), _lifted(wo)), 0.0)
                 density = density + probability * above
             else:
                 density = density + probability * lobe.pdf(wi, wo)
         return density
 
-    def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+    def albedo(self, state: Media, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         near, far = [], []
         spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
         for index in _scattering(state):
-            same_side, other_side = state.layers[index].phase.rule(wi, nodes)
+            same_side, other_side = state.media[index].phase.rule(wi, nodes)
             near.append(_integral(_lobes(state, spread, same_side[0], "all")[index], same_side))
             if state.base is None:
                 far.append(_integral(_lobes(state, spread, other_side[0], "all")[index], other_side))
@@ -84,82 +95,72 @@ class SingleScattering(Transport):
         return _total(near, zero), _total(far, zero)
 
 
-def optical_depths(media: Sequence[Medium], w: Vector) -> list[Channels]:
-    """Optical depth of each medium along w, tau sigma(w) / |cos|, one array a channel of its thickness."""
-    inverse = 1.0 / jnp.abs(w[2])
-    return [
-        tuple(tau * (medium.phase.cross_section(w) * inverse) for tau in per_channel(medium.thickness))
-        for medium in media
-    ]
-
-
-def _scattering(stack: Stack) -> list[int]:
+def _scattering(slab: Media) -> list[int]:
     """Indices of the media that scatter at all."""
-    return [k for k, medium in enumerate(stack.layers) if not is_known(medium.albedo, 0.0)]
+    return [k for k, medium in enumerate(slab.media) if not is_known(medium.albedo, 0.0)]
 
 
-def _lobes(stack: Stack, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+def _lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
     """BSDF of each medium that scatters, by its index, and of the base, by `BASE`."""
-    opaque = stack.base is not None
+    opaque = slab.base is not None
     if opaque and side == "transmission":
         return {}
     edge = horizon(wi[2].dtype)
     if opaque or side == "reflection":
         valid = (wi[2] > edge) & (wo[2] > edge)
-        lobes = _from_above(stack, _lifted(wi), _lifted(wo))
+        lobes = _from_above(slab, _lifted(wi), _lifted(wo))
     else:
         valid_i, valid_o = jnp.abs(wi[2]) > edge, jnp.abs(wo[2]) > edge
         valid = valid_i & valid_o & (wi[2] * wo[2] < 0) if side == "transmission" else valid_i & valid_o
         inside_i = (wi[0], wi[1], jnp.where(valid_i, wi[2], 0.5))
         inside_o = (wo[0], wo[1], jnp.where(valid_o, wo[2], 0.5))
-        lobes = _from_any_side(stack, inside_i, inside_o, side)
+        lobes = _from_any_side(slab, inside_i, inside_o, side)
     return {k: tuple(jnp.where(valid, value, 0.0) for value in lobe) for k, lobe in lobes.items()}
 
 
-def _from_above(stack: Stack, wi: Vector, wo: Vector) -> dict[int, Channels]:
+def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     """wi and wo above: each layer is seen through those over it, exp(-sum (a_j + b_j)), as a running product."""
     lobes: dict[int, Channels] = {}
-    scattering = _scattering(stack)
-    last = len(stack.layers) - 1
+    scattering = _scattering(slab)
+    last = len(slab.media) - 1
     half = half_vector(wi, wo, same_side=True) if scattering else None
-    inverse = 1.0 / (wi[2] * wo[2]) if stack.layers else None
     through: Channels | None = None
-    for k, medium in enumerate(stack.layers):
+    for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
-        depths = tuple(tau * (weight * inverse) for tau in per_channel(medium.thickness))
+        depths = tuple(tau * (weight / (wi[2] * wo[2])) for tau in per_channel(medium.thickness))
         shares = [absorb(depth) for depth in depths]
         if half is not None and k in scattering:
             lost = tuple(share / weight for _, share in shares)
             lobes[k] = _times(_collision(medium, wi, wo, half), lost if through is None else _times(through, lost))
-        if k < last or stack.base is not None:
+        if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
             through = transmitted if through is None else _times(through, transmitted)
-    if stack.base is not None:
-        values = stack.base.evaluate(wi, wo)
+    if slab.base is not None:
+        values = slab.base.evaluate(wi, wo)
         lobes[BASE] = values if through is None else _times(through, values)
     return lobes
 
 
-def _from_any_side(stack: Stack, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
     """Any sides, no base: a direction above crosses the layers over k, one below those under it."""
     lobes: dict[int, Channels] = {}
-    scattering = _scattering(stack)
+    scattering = _scattering(slab)
     if not scattering:
         return lobes
     half = half_vector(wi, wo)
     inverse = 1.0 / jnp.abs(wi[2] * wo[2])
-    depths_i, depths_o = optical_depths(stack.layers, wi), optical_depths(stack.layers, wo)
+    depths_i, depths_o = optical_depths(slab.media, wi), optical_depths(slab.media, wo)
     paths_i, paths_o = _paths(depths_i, wi), _paths(depths_o, wo)
     same_side = wi[2] * wo[2] > 0
     for k in scattering:
-        medium = stack.layers[k]
+        medium = slab.media[k]
         gains = []
         for c in range(count(*paths_i, depths_i[k])):
             a, b = pick(depths_i[k], c), pick(depths_o[k], c)
             m, y = jnp.minimum(a, b), jnp.abs(a - b)
             if side == "all":
                 m, y = jnp.where(same_side, 0.0, m), jnp.where(same_side, a + b, y)
-            if len(stack.layers) > 1:
+            if len(slab.media) > 1:
                 m = m + pick(paths_i[k], c) + pick(paths_o[k], c)
             gains.append(pick(per_channel(medium.thickness), c) * inverse * jnp.exp(-m) * exprel(y))
         lobes[k] = _times(_collision(medium, wi, wo, half), tuple(gains))
@@ -168,19 +169,15 @@ def _from_any_side(stack: Stack, wi: Vector, wo: Vector, side: Side) -> dict[int
 
 def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
     """Optical depth that a ray along w crosses between the outside and each layer; one channel count for all layers."""
-    channels = count(*depths)
     above = w[2] > 0
     zero = jnp.zeros_like(w[2])
-    per_layer = [[zero] * channels for _ in depths]
-    for c in range(channels):
-        over = [zero]
-        under = [zero]
-        for down, up in zip(depths[:-1], depths[:0:-1], strict=True):
-            over.append(over[-1] + pick(down, c))
-            under.append(under[-1] + pick(up, c))
-        for k, (from_top, from_bottom) in enumerate(zip(over, reversed(under), strict=True)):
-            per_layer[k][c] = jnp.where(above, from_top, from_bottom)
-    return [tuple(layer) for layer in per_layer]
+    per_channel_paths = []
+    for c in range(count(*depths)):
+        layers = [pick(depth, c) for depth in depths]
+        over = list(accumulate(layers[:-1], initial=zero))
+        under = list(accumulate(layers[:0:-1], initial=zero))[::-1]
+        per_channel_paths.append([jnp.where(above, *pair) for pair in zip(over, under, strict=True)])
+    return list(zip(*per_channel_paths, strict=True)) if depths else []
 
 
 def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array]) -> Channels:
@@ -195,27 +192,27 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
     return strength if is_known(medium.albedo, 1.0) else _times(per_channel(medium.albedo), strength)
 
 
-def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Any]]:
+def _choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """Probability of each lobe and the lobe: first collision in that layer (Sec. 4.6) times the share that survives it.
 
     The base is the last choice; without one the light that collides nowhere is left out, and the rest normalised.
     """
     edge = horizon(wi[2].dtype)
-    valid = wi[2] > edge if stack.base is not None else jnp.abs(wi[2]) > edge
+    valid = wi[2] > edge if slab.base is not None else jnp.abs(wi[2]) > edge
     wi = (wi[0], wi[1], jnp.where(valid, wi[2], 0.5))
-    depths = optical_depths(stack.layers, wi)
+    depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
     choices: list[tuple[Array, Any]] = []
-    for k in _scattering(stack):
-        medium = stack.layers[k]
+    for k in _scattering(slab):
+        medium = slab.media[k]
         collides = mean(_times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
         choices.append((collides * survives, medium.phase))
-    if stack.base is not None:
+    if slab.base is not None:
         reached = jnp.ones_like(wi[2])
         for depth in depths:
             reached = reached * mean(tuple(jnp.exp(-d) for d in depth))
-        choices.append((reached, stack.base))
+        choices.append((reached, slab.base))
     total = sum((weight for weight, _ in choices), jnp.zeros_like(wi[2]))
     return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in choices]
 

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.cases import HEMISPHERES, POINTS, X, fiber_2, flakes
 
 import layerjax as lj
+from tests.cases import HEMISPHERES, POINTS, X, fiber_2, flakes
 
 
 @pytest.mark.parametrize("name", POINTS)

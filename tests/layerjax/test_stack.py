@@ -1,0 +1,125 @@
+"""Validation by name, value and range; pytrees that can be traced, mapped and differentiated."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import layerjax as lj
+
+HG = lj.HenyeyGreenstein(0.5)
+
+REFUSED = {
+    "Interface.ior: 0.1 is outside [0.25, 4]": lambda: lj.Interface(0.1, 0.1),
+    "Interface.alpha: 2 is outside [0.0001, 1]": lambda: lj.Interface(1.5, 2.0),
+    "Medium.thickness: -1 is outside [0, 10000]": lambda: lj.Medium(-1.0),
+    "Medium.thickness: nan is outside": lambda: lj.Medium(float("nan")),
+    "Medium.albedo: 1.5 is outside [0, 1]": lambda: lj.Medium(1.0, [0.5, 1.5]),
+    "Medium.f0: -0.1 is outside [0, 1]": lambda: lj.Medium(1.0, 0.5, HG, -0.1),
+    "Medium.phase: 'haze' is not": lambda: lj.Medium(1.0, 0.5, "haze"),
+    "HenyeyGreenstein.g: 1 is outside [-0.999, 0.999]": lambda: lj.HenyeyGreenstein(1.0),
+    "SGGX.alpha: 0 is outside [0.0001, 1]": lambda: lj.SGGX("surface", 0.0),
+    'SGGX.kind: \'flake\' is not one of "surface", "fiber"': lambda: lj.SGGX("flake", 0.1),
+    "SGGX.axis: [0.0, 0.0, 0.0] is not a finite vector": lambda: lj.SGGX("fiber", 0.1, (0.0, 0.0, 0.0)),
+    "SGGX.axis: shape (2,) given, (3,) needed": lambda: lj.SGGX("fiber", 0.1, (0.0, 1.0)),
+    "SGGX.alpha: shape (3,) given, () allowed": lambda: lj.SGGX("fiber", [0.1, 0.2, 0.3]),
+    "Lambertian.albedo: 'red' is not a number": lambda: lj.Lambertian("red"),
+    "Lambertian.albedo: None is not a number": lambda: lj.Lambertian(None),
+    "OrenNayar.roughness: 2 is outside [0, 1]": lambda: lj.OrenNayar(0.5, 2.0),
+    "OrenNayar.form: 'modern' is not one of": lambda: lj.OrenNayar(0.5, 0.5, "modern"),
+    "Conductor.k: 30 is outside [0, 20]": lambda: lj.Conductor(0.2, 30.0, 0.1),
+    "Stack.layers[1]: 3 is not an Interface or a Medium": lambda: lj.Stack([lj.Medium(1.0), 3]),
+    "Stack.base: 0.5 is not a surface": lambda: lj.Stack([], 0.5),
+    "layers[0].albedo has 3, base.albedo has 2": lambda: lj.Stack([lj.Medium(1.0, [1, 1, 1])], lj.Lambertian([1, 1])),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_bad_values_are_refused_by_name_value_and_range(message):
+    with pytest.raises(ValueError) as error:  # noqa: PT011  (the message is compared below, brackets and all)
+        REFUSED[message]()
+    assert message in str(error.value)
+
+
+def test_every_range_is_enforced_at_both_ends():
+    makers = {
+        "Interface.ior": lambda v: lj.Interface(v, 0.1),
+        "Interface.alpha": lambda v: lj.Interface(1.5, v),
+        "Medium.thickness": lambda v: lj.Medium(v),
+        "Medium.albedo": lambda v: lj.Medium(1.0, v),
+        "Medium.f0": lambda v: lj.Medium(1.0, f0=v),
+        "HenyeyGreenstein.g": lj.HenyeyGreenstein,
+        "SGGX.alpha": lambda v: lj.SGGX("fiber", v),
+        "Lambertian.albedo": lj.Lambertian,
+        "OrenNayar.albedo": lambda v: lj.OrenNayar(v, 0.5),
+        "OrenNayar.roughness": lambda v: lj.OrenNayar(0.5, v),
+        "Conductor.ior": lambda v: lj.Conductor(v, 1.0, 0.1),
+        "Conductor.k": lambda v: lj.Conductor(1.0, v, 0.1),
+        "Conductor.alpha": lambda v: lj.Conductor(1.0, 1.0, v),
+    }
+    assert set(makers) == set(lj.RANGES)
+    for name, make in makers.items():
+        low, high = lj.RANGES[name]
+        for value in (low, high, np.float32(low), np.float32(high)):
+            make(value)
+        for value in (low - 0.01 * (1 + abs(low)), high * 1.01):
+            with pytest.raises(ValueError, match=name.replace(".", r"\.")):
+                make(value)
+
+
+def test_a_transport_names_the_layer_that_it_cannot_carry():
+    stack = lj.Stack([lj.Medium(1.0), lj.Interface(1.5, 0.1)])
+    with pytest.raises(ValueError, match=r"layers\[1\]: SingleScattering carries no Interface"):
+        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0))
+    with pytest.raises(ValueError, match="transport: 'fast' is not a Transport"):
+        lj.evaluate(lj.Stack([]), lj.direction(0.5, 0.0), lj.direction(0.5, 1.0), transport="fast")
+
+
+def test_placeholders_pass_the_constructor_and_are_refused_on_evaluation():
+    class Unknown:
+        __layerjax_placeholder__ = True
+
+    stack = lj.Stack([lj.Medium(Unknown(), phase=lj.SGGX("fiber", Unknown()))], lj.Lambertian(0.5))
+    with pytest.raises(ValueError, match=r"layers\[0\]\.thickness, layers\[0\]\.phase\.alpha not given a value"):
+        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0))
+
+
+def make(p):
+    layers = [
+        lj.Medium(p["thickness"], [0.9, 0.8, p["albedo"]], lj.SGGX("surface", p["alpha"], p["axis"]), p["f0"]),
+        lj.Medium(0.5, 0.7, lj.HenyeyGreenstein(p["g"])),
+    ]
+    return lj.Stack(layers, lj.Conductor([0.2, 0.9, 1.1], p["k"], 0.3))
+
+
+PARAMETERS = {"thickness": 0.8, "albedo": 0.6, "alpha": 0.3, "f0": 0.1, "g": 0.4, "k": 2.5}
+PARAMETERS = {name: jnp.asarray(value) for name, value in PARAMETERS.items()} | {"axis": jnp.array([0.2, 0.1, 0.9])}
+WI, WO = lj.direction(0.6, 0.2), lj.direction(0.9, 2.4)
+
+
+def test_gradients_agree_with_central_differences():
+    def value(p, wi, wo):
+        return jnp.sum(lj.evaluate(make(p), wi, wo) * jnp.array([1.0, 2.0, 3.0]))
+
+    arguments = (PARAMETERS, WI, WO)
+    reverse = jax.jit(jax.grad(value, (0, 1, 2)))(*arguments)
+    forward = jax.jit(jax.jacfwd(value, (0, 1, 2)))(*arguments)
+    flat, unflatten = ravel_pytree(arguments)
+    step = 1e-6
+    at = jax.jit(jax.vmap(lambda x: value(*unflatten(x))))
+    shifts = step * jnp.eye(flat.size)
+    numeric = (at(flat + shifts) - at(flat - shifts)) / (2 * step)
+    scale = float(jnp.max(jnp.abs(numeric)))
+    # central differences at 1e-6 are good to 1e-10 / 1e-6 of the value, and to step^2
+    for gradient in (reverse, forward):
+        np.testing.assert_allclose(ravel_pytree(gradient)[0], numeric, rtol=1e-6, atol=1e-8 * scale)
+
+
+def test_a_parameter_map_runs_under_vmap():
+    alphas = jnp.linspace(0.1, 0.9, 5)
+    stacks = eqx.filter_vmap(lambda alpha: make({**PARAMETERS, "alpha": alpha}))(alphas)
+    together = jax.vmap(lambda stack: lj.evaluate(stack, WI, WO))(stacks)
+    alone = [lj.evaluate(make({**PARAMETERS, "alpha": alpha}), WI, WO) for alpha in alphas]
+    np.testing.assert_allclose(together, jnp.stack(alone), rtol=1e-13)

@@ -1,0 +1,82 @@
+"""Imports point downward, and importing the library loads nothing heavy."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# lowest first; a module may import only from lines above its own
+LAYERS = [
+    "layerjax._numerics",
+    "layerjax._parameters",
+    "layerjax.channels",
+    "layerjax.directions",
+    "layerjax.quadrature",
+    "layerjax.fresnel",
+    "layerjax.distributions",
+    "layerjax.phase",
+    "layerjax.surfaces._surface",
+    "layerjax.surfaces.lambertian",
+    "layerjax.surfaces.oren_nayar",
+    "layerjax.surfaces.microfacet",
+    "layerjax.surfaces",
+    "layerjax.stack",
+    "layerjax.transport._transport",
+    "layerjax.transport.single_scattering",
+    "layerjax.transport",
+    "layerjax.evaluate",
+    "layerjax",
+]
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from (name if name in LAYERS else node.module for name in names)
+
+
+def sources(package):
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", sources("layerjax"), ids=module_name)
+def test_layerjax_imports_point_downward(path):
+    name = module_name(path)
+    assert name in LAYERS, f"{name} has no place in LAYERS"
+    for other in imported(path):
+        root = other.split(".")[0]
+        assert root in {*sys.stdlib_module_names, "jax", "equinox", "numpy", "layerjax"}
+        if root == "layerjax":
+            assert LAYERS.index(other) < LAYERS.index(name), f"{name} imports {other}"
+
+
+@pytest.mark.parametrize("path", sources("fits"), ids=module_name)
+def test_fits_does_not_import_benchmarks_or_tests(path):
+    assert not {other.split(".")[0] for other in imported(path)} & {"benchmarks", "tests"}
+
+
+def loaded_by(statement):
+    code = f"import sys; {statement}; print(*sorted(name.split('.')[0] for name in sys.modules))"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    return set(output.split())
+
+
+def test_importing_layerjax_loads_only_jax_equinox_numpy():
+    assert loaded_by("import layerjax") - loaded_by("import jax, equinox, numpy") == {"layerjax"}
+
+
+def test_importing_fits_pays_for_nothing_unused():
+    assert not loaded_by("import fits") & {"arviz", "matplotlib", "jaxopt", "h5py", "rich", "emcee", "optimistix"}
