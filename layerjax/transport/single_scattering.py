@@ -31,6 +31,9 @@ from layerjax.transport._transport import Side, Transport
 BASE = -1
 """Stands for the base among the indices of layers."""
 
+WEIGHT_FLOOR = 1e-14
+"""Below any sigma(wi) co + sigma(wo) ci of unit vectors in the box: vectors that are not keep finite derivatives."""
+
 
 class Media(eqx.Module):
     """A stack that holds media alone, without what is known to be absent."""
@@ -127,6 +130,7 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     through: Channels | None = None
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
+        weight = jnp.maximum(weight, WEIGHT_FLOOR)
         depths = tuple(tau * (weight / (wi[2] * wo[2])) for tau in per_channel(medium.thickness))
         shares = [absorb(depth) for depth in depths]
         if half is not None and k in scattering:
