@@ -80,3 +80,9 @@ def test_importing_layerjax_loads_only_jax_equinox_numpy():
 
 def test_importing_fits_pays_for_nothing_unused():
     assert not loaded_by("import fits") & {"arviz", "matplotlib", "jaxopt", "h5py", "rich", "emcee", "optimistix"}
+
+
+def test_public_names_stay_functions_whatever_is_imported_first():
+    code = "import fits.compare, fits.report, fits.simulate; print(*(callable(getattr(fits, n)) for n in fits.__all__))"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert set(output.split()) == {"True"}

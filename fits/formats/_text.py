@@ -1,0 +1,61 @@
+"""What the text readers share: numbered lines, numbers, and one-line errors that say where."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+ANY_NUMBER = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a file: its number (from 1) and its text."""
+
+    path: Path
+    number: int
+    text: str
+
+    def error(self, problem: str, column: str | int | None = None) -> ValueError:
+        """A ValueError that names file, line and, where given, column."""
+        place = "" if column is None else f", column {column!r}"
+        return ValueError(f"{self.path}, line {self.number}{place}: {problem}")
+
+    def parse(self, cell: str, column: str | int, allowed: tuple[float, float] = ANY_NUMBER) -> float:
+        """The finite number in a cell, inside the closed range `allowed`."""
+        low, high = allowed
+        wanted = "a finite number" if allowed == ANY_NUMBER else f"a number in [{low:g}, {high:g}]"
+        try:
+            value = float(cell)
+        except ValueError:
+            raise self.error(f"{cell.strip()!r} is not a number, must be {wanted}", column) from None
+        if not math.isfinite(value) or not low <= value <= high:
+            raise self.error(f"{cell.strip()} is not allowed, must be {wanted}", column)
+        return value
+
+    def numbers(self, allowed: tuple[float, float] = ANY_NUMBER) -> list[float]:
+        """All whitespace-separated numbers of the line; columns count from 1 in errors."""
+        return [self.parse(cell, column, allowed) for column, cell in enumerate(self.text.split(), start=1)]
+
+
+def read_lines(path: Path) -> list[Line]:
+    """All lines of a UTF-8 text file; ValueError for an empty file or one that is not text."""
+    raw = path.read_bytes()
+    if not raw.strip():
+        raise ValueError(f"{path}: the file is empty")
+    try:
+        text = raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+    if "\0" in text:
+        raise ValueError(f"{path}: not a text file (it holds a zero byte at {text.index(chr(0))})")
+    return [Line(path, number, line) for number, line in enumerate(text.splitlines(), start=1)]
+
+
+def content(lines: list[Line]) -> list[Line]:
+    """The lines that are neither blank nor a # comment."""
+    return [line for line in lines if line.text.strip() and not line.text.lstrip().startswith("#")]
+
+
+def plural(count: int, noun: str) -> str:
+    """'1 sample', '2 samples'."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,285 @@
+"""Stacks and fitting problems as TOML: a table for each layer and the base, and a table where a number is free.
+
+    transport = "SingleScattering"             # optional, "auto" if left out
+    objective = "likelihood"                   # optional
+
+    [[layers]]                                 # from top to bottom
+    kind = "Medium"
+    thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
+    phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
+
+    [base]
+    kind = "Lambertian"
+    albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
+
+    [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom
+    [scale]                                    # optional common calibration factor: start, low, high, prior
+
+Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
+ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.
+"""
+
+import difflib
+import inspect
+import math
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
+
+import numpy as np
+import tomli_w
+
+import layerjax as lj
+from fits._files import write_text
+from fits.likelihood import Noise, Objective
+from fits.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
+
+_Kinds = Mapping[str, type]
+_LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
+_BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.Conductor)}
+_PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.SGGX)}
+_TRANSPORTS: _Kinds = {kind.__name__: kind for kind in (lj.SingleScattering,)}
+_PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
+_FREE_KEYS = ("start", "low", "high", "prior")
+_ANY = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemFile:
+    """What a TOML file says: the arguments of `fits.fit` other than the data, and the text as it was."""
+
+    stack: lj.Stack
+    transport: lj.Transport | Literal["auto"]
+    noise: Noise
+    scale: Free | None
+    objective: Objective
+    text: str
+
+
+def read_problem(path: str | Path) -> ProblemFile:
+    """Read a stack, and what else the file says about fitting it. ValueError, on one line, for bad input."""
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        text = path.read_bytes().decode("utf-8")
+        tables = tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: not valid TOML: {error}") from None
+    try:
+        _check_keys("the file", tables, ("transport", "objective", "layers", "base", "noise", "scale"))
+        return ProblemFile(
+            stack=stack_from_dict({key: tables[key] for key in ("layers", "base") if key in tables}),
+            transport=_transport(tables.get("transport", "auto")),
+            noise=_noise(tables.get("noise", {})),
+            scale=_scale(tables["scale"]) if "scale" in tables else None,
+            objective=cast(Objective, _choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
+            text=text,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def write_problem(
+    path: str | Path,
+    stack: lj.Stack,
+    *,
+    transport: lj.Transport | Literal["auto"] = "auto",
+    noise: Noise | None = None,
+    scale: Free | None = None,
+    objective: Objective = "likelihood",
+    force: bool = False,
+) -> None:
+    """Write a file that `read_problem` reads back to the same. An existing file is a ValueError unless `force`."""
+    tables: dict[str, Any] = {}
+    if not isinstance(transport, str):
+        table = _module_to_dict(transport)
+        tables["transport"] = table if len(table) > 1 else table["kind"]
+    if objective != "likelihood":
+        tables["objective"] = objective
+    tables |= stack_to_dict(stack)
+    if noise is not None:
+        tables["noise"] = {
+            entry.name: _to_plain(getattr(noise, entry.name))
+            for entry in fields(noise)
+            if getattr(noise, entry.name) != entry.default
+        }
+    if scale is not None:
+        tables["scale"] = _to_plain(scale)
+    write_text(path, tomli_w.dumps(tables), force)
+
+
+def stack_from_dict(tables: Mapping[str, Any]) -> lj.Stack:
+    """A stack, with `Free` parameters where a number is given as a table, from the `layers` and `base` of a file."""
+    _check_keys("the stack", tables, ("layers", "base"))
+    layers = tables.get("layers", [])
+    if not isinstance(layers, list):
+        raise ValueError("layers is not a list of tables, must be written as [[layers]]")
+    if not layers and "base" not in tables:
+        raise ValueError("there is neither a layer nor a base, must be at least one: [[layers]] or [base]")
+    return lj.Stack(
+        [_build(f"layers[{index}]", layer, _LAYERS) for index, layer in enumerate(layers)],
+        base=_build("base", tables["base"], _BASES) if "base" in tables else None,
+    )
+
+
+def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
+    """The inverse of `stack_from_dict`, of plain numbers, strings, lists and dictionaries."""
+    tables: dict[str, Any] = {}
+    if stack.layers:
+        tables["layers"] = [_module_to_dict(layer) for layer in stack.layers]
+    if stack.base is not None:
+        tables["base"] = _module_to_dict(stack.base)
+    return tables
+
+
+def _build(where: str, table: Any, kinds: _Kinds) -> Any:
+    """The object that a table with a `kind` describes."""
+    table = _require_table(where, table)
+    if "kind" not in table:
+        raise ValueError(f"{where} has no kind, must be one of {', '.join(kinds)}")
+    kind = kinds[_choice(f"{where}.kind", table["kind"], kinds)]
+    known = {_key(name): (name, parameter) for name, parameter in inspect.signature(kind).parameters.items()}
+    _check_keys(where, table, ("kind", *known))
+    hints = get_type_hints(kind)
+    given = {}
+    for key, (name, parameter) in known.items():
+        if key in table:
+            given[name] = _value(f"{where}.{key}", table[key], hints[name], f"{kind.__name__}.{name}")
+        elif parameter.default is inspect.Parameter.empty:
+            raise ValueError(f"{where} ({kind.__name__}) has no {key}")
+    try:
+        return kind(**given)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _value(where: str, value: Any, hint: Any, name: str) -> Any:
+    """One parameter, read as what its type hint says."""
+    if get_origin(hint) is Literal:
+        return _choice(where, value, get_args(hint))
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"{where} is {value!r}, must be true or false")
+        return value
+    if hint is float:
+        number = _numbers(where, value, _ANY)
+        if isinstance(number, tuple):
+            raise ValueError(f"{where} is {value!r}, must be one number")
+        return number
+    if name.endswith(".phase"):
+        return _build(where, value, _PHASES)
+    return _number_or_free(where, value, lj.RANGES.get(name, _ANY))
+
+
+def _number_or_free(where: str, value: Any, allowed: tuple[float, float]) -> float | tuple[float, ...] | Free:
+    return _free(where, value, allowed) if isinstance(value, dict) else _numbers(where, value, allowed)
+
+
+def _free(where: str, table: Any, allowed: tuple[float, float] = _ANY) -> Free:
+    table = _require_table(where, table)
+    _check_keys(where, table, _FREE_KEYS)
+    for key in ("start", "low", "high"):
+        if key not in table:
+            raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
+    bounds = {key: _numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
+    try:
+        return Free(**bounds, prior=_prior(f"{where}.prior", table["prior"]) if "prior" in table else None)
+    except ValueError as error:
+        raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
+
+
+def _prior(where: str, table: Any) -> Prior:
+    return cast(Prior, _build(where, table, _PRIORS))
+
+
+def _noise(table: Any) -> Noise:
+    table = _require_table("noise", table)
+    hints = get_type_hints(Noise)
+    _check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
+    return Noise(**{key: _value(f"noise.{key}", value, hints[key], f"Noise.{key}") for key, value in table.items()})
+
+
+def _scale(table: Any) -> Free:
+    scale = _free("scale", table)
+    if scale.shape != () or cast(float, scale.low) <= 0:
+        raise ValueError(f"scale.low is {scale.low}, must be one number above 0")
+    return scale
+
+
+def _transport(value: Any) -> lj.Transport | Literal["auto"]:
+    if value == "auto":
+        return "auto"
+    if isinstance(value, str):
+        value = {"kind": _choice("transport", value, ("auto", *_TRANSPORTS))}
+    return cast(lj.Transport, _build("transport", value, _TRANSPORTS))
+
+
+def _numbers(where: str, value: Any, allowed: tuple[float, float]) -> float | tuple[float, ...]:
+    """One finite number, or a list of them, within the closed range `allowed`."""
+    low, high = allowed
+    wanted = "a finite number" if allowed == _ANY else f"a number in [{low:g}, {high:g}]"
+    numbers = value if isinstance(value, list) else [value]
+    for number in numbers:
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            raise ValueError(f"{where} is {number!r}, must be {wanted}")
+        if not math.isfinite(number) or not low <= number <= high:
+            raise ValueError(f"{where} is {number:g}, must be {wanted}")
+    if not numbers:
+        raise ValueError(f"{where} is an empty list, must be {wanted} or one a channel")
+    return tuple(float(number) for number in numbers) if isinstance(value, list) else float(value)
+
+
+def _choice(where: str, value: Any, allowed: Iterable[str]) -> str:
+    allowed = tuple(allowed)
+    if value not in allowed:
+        raise ValueError(f"{where} is {value!r}{_suggestion(value, allowed)}, must be one of {', '.join(allowed)}")
+    return cast(str, value)
+
+
+def _check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+    for key in table:
+        if key not in allowed:
+            raise ValueError(
+                f"{where} has an unknown key {key!r}{_suggestion(key, allowed)}; allowed: {', '.join(allowed)}"
+            )
+
+
+def _suggestion(value: Any, allowed: Iterable[str]) -> str:
+    close = difflib.get_close_matches(str(value), allowed, n=1)
+    return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def _require_table(where: str, table: Any) -> dict[str, Any]:
+    if not isinstance(table, dict):
+        raise ValueError(f"{where} is {table!r}, must be a table")
+    return table
+
+
+def _module_to_dict(module: Any) -> dict[str, Any]:
+    """The table of a layer, base, phase function, transport or prior; what is None is left out."""
+    names = inspect.signature(type(module)).parameters
+    entries = {_key(name): _to_plain(getattr(module, name)) for name in names if getattr(module, name) is not None}
+    return {"kind": type(module).__name__, **entries}
+
+
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, Free):
+        table = {key: _to_plain(getattr(value, key)) for key in _FREE_KEYS}
+        return {key: entry for key, entry in table.items() if value.prior != Uniform() or key != "prior"}
+    if isinstance(value, str | bool):
+        return value
+    if isinstance(value, lj.HenyeyGreenstein | lj.SGGX | Prior):
+        return _module_to_dict(value)
+    array = np.asarray(value)
+    # the shortest decimal that a float32 reads back from, not its digits in float64
+    numbers = [float(str(number)) if array.dtype == np.float32 else float(number) for number in array.ravel()]
+    return numbers if array.ndim else numbers[0]
+
+
+def _key(name: str) -> str:
+    return "shape" if name == "kind" else name  # SGGX.kind: `kind` names the class here

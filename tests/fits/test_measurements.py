@@ -1,0 +1,142 @@
+"""Measurements: validation, conversion at the door, masks; and the geometry they are taken in."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from fits.geometry import azimuth, direction, polar, slices
+from fits.measurements import Measurements, channel_names, check_quantity, to_bsdf
+
+
+def _measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes) -> Measurements:
+    count = len(theta_i)
+    arguments = {
+        "wi": direction(theta_i, 180.0),
+        "wo": direction(theta_o, 0.0),
+        "values": np.arange(1.0, count + 1)[:, None],
+        "sigma": np.full((count, 1), 0.1),
+        "mask": np.ones(count, bool),
+        "channels": ("value",),
+    }
+    return Measurements(**{**arguments, **changes})
+
+
+def test_angles_follow_the_conventions():
+    data = _measurements()
+    np.testing.assert_array_equal(data.theta_i, [30, 30, 60])
+    np.testing.assert_array_equal(data.theta_o, [30, 0, 45])
+    np.testing.assert_array_equal(data.phi_i, 180)
+    np.testing.assert_array_equal(data.phi_o, 0)
+    # phi_o = phi_i + pi is the mirror direction: wi + wo lies along the normal there
+    np.testing.assert_allclose((data.wi + data.wo)[0], [0, 0, np.sqrt(3)], atol=1e-15)
+
+
+def test_direction_against_hand_written_vectors():
+    np.testing.assert_allclose(direction(90, 90), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(direction(-45, 0), [-np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-15)
+    np.testing.assert_allclose(direction(180, 0), [0, 0, -1], atol=1e-15)
+    theta, phi = np.array([0.0, 1e-7, 33.3, 89.9999999, 120.0, 180.0]), np.array([0.0, 350.0, 12.5, 180.0, 270.0, 0.0])
+    np.testing.assert_allclose(polar(direction(theta, phi)), theta, atol=1e-10)
+    np.testing.assert_allclose(azimuth(direction(theta, phi)), phi, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"values": np.ones((3, 2))}, r"values has shape \(3, 2\), must be \(3, 1\)"),
+        ({"wi": np.ones((2, 3))}, r"wi has shape"),
+        ({"wo": 2 * direction([1, 2, 3], 0)}, "wo has length 2, must be 1"),
+        ({"values": np.array([[1.0], [np.nan], [1.0]])}, "values holds nan, must be finite"),
+        ({"sigma": np.array([[1.0], [-0.5], [1.0]])}, "sigma is -0.5, must be >= 0"),
+        ({"sigma": np.zeros((3, 1))}, "sigma is 0 in a sample that is used"),
+    ],
+)
+def test_bad_arrays_are_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        _measurements(**change)
+
+
+def test_zero_sigma_is_allowed_where_masked():
+    data = _measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
+    assert len(data.used()) == 2
+
+
+def test_arrays_are_copies_that_cannot_be_written():
+    values = np.ones((3, 1))
+    data = _measurements(values=values)
+    values[:] = 7
+    assert data.values.max() == 1
+    with pytest.raises(ValueError, match="read-only"):
+        data.values[0] = 2
+
+
+def test_conversion_by_hand():
+    wo = direction([60.0, 120.0, 90.0], 0.0)  # cosines 1/2, -1/2 (transmission), 0
+    values = np.full((3, 1), 0.5)
+    np.testing.assert_array_equal(to_bsdf(values, wo, "brdf"), values)
+    np.testing.assert_allclose(to_bsdf(values, wo, "brdf_cos"), [[1.0], [1.0], [0.0]], rtol=1e-14)
+    np.testing.assert_allclose(to_bsdf(values, wo, "reflectance_factor"), 0.5 / np.pi, rtol=1e-15)
+    with pytest.raises(ValueError, match="quantity is 'radiance', must be one of brdf, brdf_cos, reflectance_factor"):
+        check_quantity("radiance")
+
+
+def test_masks_narrow_and_are_noted():
+    data = _measurements(theta_i=(30.0, 30.0, 80.0), theta_o=(30.0, -33.0, 45.0))
+    retro = data.without_retro(8)
+    np.testing.assert_array_equal(retro.mask, [True, False, True])
+    np.testing.assert_array_equal(data.without_retro(2.9).mask, [True, True, True])
+    np.testing.assert_array_equal(data.without_retro(3.1).mask, [True, False, True])
+    np.testing.assert_array_equal(retro.without_grazing(75).mask, [True, False, False])
+    assert retro.without_grazing(75).source.notes == (
+        "masked: within 8 degrees of retro-reflection",
+        "masked: more than 75 degrees from the normal",
+    )
+    assert len(retro.used()) == 2
+    assert retro.used().values.ravel().tolist() == [1, 3]
+    with pytest.raises(ValueError, match="keep has shape"):
+        data.where(np.ones(2, bool))
+    with pytest.raises(ValueError, match=r"degrees is 91, must be in \[0, 90\]"):
+        data.without_grazing(91)
+
+
+def test_grazing_counts_transmission_from_its_own_side():
+    data = _measurements(theta_i=(30.0, 30.0), theta_o=(100.0, 170.0))
+    np.testing.assert_array_equal(data.without_grazing(75).mask, [False, True])
+
+
+def test_slices_are_where_they_say():
+    geometry = slices(incidence=[10, 40], outgoing=[-20, 0, 20], azimuth=[0, 90])
+    theta_i = np.degrees(np.arccos(geometry.wi[:, 2]))
+    assert len(geometry) == 2 * 5  # the normal once for each incidence
+    np.testing.assert_allclose(theta_i, [10] * 5 + [40] * 5)
+    sine = np.sin(np.radians(20))
+    expected = [[-sine, 0], [0, 0], [sine, 0], [0, -sine], [0, sine]]
+    np.testing.assert_allclose(geometry.wo[:5, :2], expected, atol=1e-15)
+    assert len(slices()) == 4 * 35
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"incidence": [200]}, r"incidence is 200, must be in \[0, 180\] degrees"),
+        ({"outgoing": []}, "outgoing is empty"),
+        ({"outgoing": [np.nan]}, "outgoing is nan"),
+        ({"azimuth": 400}, "azimuth is 400"),
+    ],
+)
+def test_slices_refuse_bad_angles(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        slices(**arguments)
+
+
+def test_channel_names():
+    assert channel_names(1) == ("value",)
+    assert channel_names(3) == ("red", "green", "blue")
+    assert channel_names(2) == ("channel1", "channel2")
+
+
+def test_reading_needs_no_jax():
+    code = "import sys, fits.formats; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
