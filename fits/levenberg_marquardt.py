@@ -1,0 +1,177 @@
+"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver.
+
+optimistix has no bounds, and a transform to an unconstrained space sends a parameter whose best value lies on its bound
+to infinity, where gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held
+there, the others take a damped Gauss-Newton step, and what would leave the box is put on its face (projected
+Levenberg-Marquardt, Kanzow, Yamashita and Fukushima 2004). The few columns of the Jacobian are carried forward together
+and only J'J and J'r are kept, which is several times faster than a QR decomposition of J when there are many more
+residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
+Marquardt 1963; its update after Nielsen 1999).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jax import Array
+
+FIRST_DAMPING = 1e-2
+FIRST_GROWTH = 4.0
+SMALLEST_DAMPING = 128.0  # units of rounding: keeps a singular matrix positive definite
+LARGEST_DAMPING = 1e12
+SMALLEST_RATIO = 1e-4
+PASSES = 3
+
+
+class _State(eqx.Module):
+    first: Array
+    trial: Array
+    cost: Array
+    gradient: Array
+    normal: Array
+    predicted: Array
+    damping: Array
+    growth: Array
+    terminate: Array
+    failed: Array
+
+
+class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
+    """Minimises half the sum of squared residuals over vectors in [0, 1]^P.
+
+    The residuals are a tree of arrays. Those whose place among its leaves is in `options["logarithmic"]` have
+    logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
+    Fisher information (J'J alone would overshoot up to twofold at every step).
+
+    It stops when a full Gauss-Newton step promises less than `atol + rtol cost`, or when rounding ends all progress. A
+    start whose residuals are not finite, or a stall away from a minimum, gives `optx.RESULTS.nonlinear_divergence`.
+    """
+
+    rtol: float = 1e-10
+    atol: float = 0.0
+    norm: Callable[[Any], Array] = optx.max_norm
+
+    def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
+        """State before the first evaluation."""
+        zero = jnp.zeros((), y.dtype)
+        return _State(
+            first=jnp.array(True),
+            trial=y,
+            cost=zero + jnp.inf,
+            gradient=jnp.zeros_like(y),
+            normal=jnp.eye(y.size, dtype=y.dtype),
+            predicted=zero,
+            damping=zero + FIRST_DAMPING,
+            growth=zero + FIRST_GROWTH,
+            terminate=jnp.array(False),
+            failed=jnp.array(False),
+        )
+
+    def step(self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, _State, Any]:
+        """Evaluate the trial, accept or refuse it, and propose the next one."""
+        logarithmic = options.get("logarithmic", ())
+        cost, gradient, normal, aux = _normal_equations(fn, state.trial, args, logarithmic)
+        finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
+        ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
+        accept = finite & (state.first | (ratio > SMALLEST_RATIO))
+
+        shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+        step_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
+        epsilon = jnp.finfo(y.dtype).eps
+        least = jnp.asarray(SMALLEST_DAMPING * epsilon, y.dtype)
+        damping = jnp.maximum(jnp.where(state.first, state.damping, step_damping), least)
+        growth = jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth)
+
+        y = jnp.where(accept, state.trial, y)
+        cost, gradient, normal = (
+            jnp.where(accept, new, old)
+            for new, old in ((cost, state.cost), (gradient, state.gradient), (normal, state.normal))
+        )
+        trial, predicted, promise = _projected_step(y, gradient, normal, damping, least)
+
+        converged = promise <= self.atol + jnp.maximum(self.rtol, 4 * epsilon) * cost
+        lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
+        stalled = lost & (promise > jnp.sqrt(epsilon) * cost)
+        hopeless = stalled | (damping > LARGEST_DAMPING) | (state.first & ~finite)
+        new_state = _State(
+            first=jnp.array(False),
+            trial=trial,
+            cost=cost,
+            gradient=gradient,
+            normal=normal,
+            predicted=predicted,
+            damping=damping,
+            growth=growth,
+            terminate=converged | lost | hopeless,
+            failed=hopeless & ~converged,
+        )
+        return y, new_state, aux
+
+    def terminate(
+        self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any
+    ) -> tuple[Array, optx.RESULTS]:
+        """Whether to stop, and why."""
+        failure = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
+        return state.terminate, failure
+
+    def postprocess(
+        self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
+    ) -> tuple[Array, Any, dict[str, Any]]:
+        """The cost at the solution goes with it."""
+        return y, aux, {"cost": state.cost}
+
+
+def _normal_equations(fn: Any, y: Array, args: Any, logarithmic: Sequence[int] = ()) -> tuple[Array, Array, Array, Any]:
+    """Cost, J'r and J'J at y, with J'J replaced for the `logarithmic` arrays of residuals."""
+
+    def push(tangent: Array) -> tuple[Any, Any, Any]:
+        residuals, tangents, aux = jax.jvp(lambda z: fn(z, args), (y,), (tangent,), has_aux=True)
+        return residuals, tangents, aux
+
+    residuals, columns, aux = jax.vmap(push, out_axes=(None, 0, None))(jnp.eye(y.size, dtype=y.dtype))
+    cost, gradient, normal = jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
+    for index, (residual, column) in enumerate(zip(jax.tree.leaves(residuals), jax.tree.leaves(columns), strict=True)):
+        flat, rows = residual.reshape(-1), column.reshape(y.size, -1)
+        cost += 0.5 * jnp.vdot(flat, flat)
+        gradient += rows @ flat
+        if index in logarithmic:  # half the square of r is a logarithm L, whose derivative is r dr
+            rows = rows * flat
+        normal += rows @ rows.T
+    return cost, gradient, normal, aux
+
+
+def _projected_step(
+    y: Array, gradient: Array, normal: Array, damping: Array, least: Array
+) -> tuple[Array, Array, Array]:
+    """The next trial in the box, the decrease that the quadratic model promises there, and the most it could promise.
+
+    The last belongs to the undamped step of all parameters that are not held, as if there were no box: it bounds what
+    is left to gain.
+    """
+    length = jnp.sqrt(jnp.diagonal(normal))
+    scale = jnp.where(length > 0, 1.0 / jnp.where(length > 0, length, 1.0), 1.0)
+    matrix = normal * scale[:, None] * scale[None, :]
+    slope = gradient * scale
+    held = ((y <= 0) & (gradient >= 0)) | ((y >= 1) & (gradient <= 0))
+    none = jnp.zeros_like(y)
+    promise = -0.5 * jnp.vdot(jnp.where(held, 0.0, slope), _damped_solve(matrix, slope, none, held, least))
+    stopped, inside = held, none
+    for _ in range(PASSES):  # what leaves the box stops at its face; the others are solved for again with that known
+        step = _damped_solve(matrix, slope, inside / scale, stopped, damping) * scale
+        inside = jnp.clip(y + step, 0.0, 1.0) - y
+        stopped = stopped | (inside != step)
+    step = jnp.clip(y + step, 0.0, 1.0) - y
+    return y + step, -(jnp.vdot(gradient, step) + 0.5 * step @ normal @ step), promise
+
+
+def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, damping: Array) -> Array:
+    """Minimiser of the damped quadratic model over the entries that are not fixed; the fixed ones are `known`."""
+    known = jnp.where(fixed, known, 0.0)
+    free = ~fixed
+    reduced = jnp.where(free[:, None] & free[None, :], matrix, 0.0)
+    reduced = reduced + jnp.diag(jnp.where(fixed, 1.0, damping + jnp.where(jnp.diagonal(matrix) > 0, 0.0, 1.0)))
+    target = jnp.where(free, -(slope + matrix @ known), known)
+    return jax.scipy.linalg.solve(reduced, target, assume_a="pos")

@@ -1,0 +1,63 @@
+"""What a long step shows while it runs: a bar on a terminal, an occasional plain line elsewhere."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol, TextIO
+
+SECONDS_BETWEEN_LINES = 10.0
+
+
+class Progress(Protocol):
+    """What long steps call as they go: the stage, steps done, steps in all (None: not known), a note."""
+
+    def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None: ...
+
+
+class _Lines:
+    """At most one line per `SECONDS_BETWEEN_LINES`, plus one when a stage begins and one when it is complete."""
+
+    def __init__(self, stream: TextIO, name: str):
+        self.stream, self.name = stream, name
+        self.stage, self.written = "", 0.0
+
+    def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        now = time.monotonic()
+        complete = total is not None and done >= total
+        if stage == self.stage and not complete and now - self.written < SECONDS_BETWEEN_LINES:
+            return
+        self.stage, self.written = stage, now
+        count = f"{done}/{total}" if total is not None else str(done)
+        print(f"{self.name}: {stage} {count}{f' ({info})' if info else ''}", file=self.stream, flush=True)
+
+
+@contextmanager
+def show_progress(stream: TextIO | None = None, name: str = "layerjax") -> Iterator[Progress]:
+    """Yields the callback for `progress=`; the bar is drawn on `stream` (stderr) and goes away when the block ends."""
+    stream = sys.stderr if stream is None else stream
+    if not stream.isatty():
+        yield _Lines(stream, name)
+        return
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bars
+
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=30),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[info]}"),
+    )
+    with Bars(*columns, console=Console(file=stream), transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def update(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total, info=info)
+            bars.update(tasks[stage], completed=done, total=total, info=info)
+
+        yield update

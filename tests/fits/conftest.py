@@ -1,0 +1,50 @@
+"""One small fit of simulated data that the tests of results, reports and the command line share."""
+
+from pathlib import Path
+
+import pytest
+
+import layerjax as lj
+from fits.fit_result import Fit
+from fits.geometry import slices
+from fits.measurements import Measurements
+from fits.optimise import fit
+from fits.simulate import simulate
+from fits.stack_file import read_problem
+
+TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
+PROBLEM = """\
+# a hazy coat over paint
+[[layers]]
+kind = "Medium"
+thickness = { start = 1.0, low = 0.05, high = 5.0 }
+albedo = 0.8
+
+[base]
+kind = "Lambertian"
+albedo = { start = 0.5, low = 0.0, high = 1.0 }
+"""
+
+
+@pytest.fixture(scope="session")
+def coat_toml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stack file with two free parameters."""
+    path = tmp_path_factory.mktemp("stack") / "coat.toml"
+    path.write_text(PROBLEM)
+    return path
+
+
+@pytest.fixture(scope="session")
+def coat_data() -> Measurements:
+    """Noisy slices of that stack with known parameters; the last ten readings are masked."""
+    truth = lj.Stack([lj.Medium(thickness=TRUE_THICKNESS, albedo=0.8)], base=lj.Lambertian(albedo=TRUE_ALBEDO))
+    data = simulate(truth, slices(incidence=(10, 50), azimuth=(0, 60)), noise=0.03, seed=1)
+    keep = [True] * (len(data) - 10) + [False] * 10
+    return data.where(keep, "the last ten readings are left out")
+
+
+@pytest.fixture(scope="session")
+def coat_fit(coat_toml: Path, coat_data: Measurements) -> Fit:
+    """The fit of that stack to those slices."""
+    given = read_problem(coat_toml)
+    return fit(given.stack, coat_data, transport=given.transport, noise=given.noise, starts=4, seed=0)

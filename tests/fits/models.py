@@ -1,0 +1,64 @@
+"""Small models with known answers: data at given directions, and functions that stand in for a transport."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fits.measurements import Measurements
+
+
+def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:
+    """Random unit vectors above the surface, (count, 3)."""
+    generator = np.random.default_rng(seed)
+    cosine, azimuth = generator.uniform(lowest_cosine, 1.0, count), generator.uniform(0, 2 * np.pi, count)
+    sine = np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
+
+
+def measured(values: ArrayLike, sigma: ArrayLike | None = None, mask: ArrayLike | None = None) -> Measurements:
+    """Values (N, C) at N fixed random directions."""
+    values = np.asarray(values, float)
+    count, channels = values.shape
+    return Measurements(
+        wi=directions(count, 1),
+        wo=directions(count, 2),
+        values=values,
+        sigma=None if sigma is None else np.broadcast_to(sigma, values.shape),
+        mask=np.ones(count, bool) if mask is None else np.asarray(mask),
+        channels=tuple(f"c{channel}" for channel in range(channels)),
+    )
+
+
+def line(stack: Any, wi: Any, wo: Any) -> Any:
+    """a + b cos(theta_o), one channel: linear in its parameters, so that every answer is known."""
+    return (stack["a"] + stack["b"] * wo[:, 2])[:, None]
+
+
+def design(count: int) -> np.ndarray:
+    """The columns of `line` at the directions of `measured`."""
+    return np.stack([np.ones(count), directions(count, 2)[:, 2]], axis=-1)
+
+
+def lobe(stack: Any, wi: Any, wo: Any) -> Any:
+    """Six parameters: a GGX coat, a diffuse base seen through an absorber, and single scattering in it."""
+    xp = np if isinstance(wi, np.ndarray) else jnp
+    cos_i, cos_o = wi[:, 2], wo[:, 2]
+    half = wi + wo
+    half = half / xp.sqrt(xp.sum(half * half, axis=-1, keepdims=True))
+    cos_h, cos_d = half[:, 2], xp.sum(wi * half, axis=-1)
+    alpha2 = stack["alpha"] ** 2
+    density = alpha2 / (np.pi * (cos_h**2 * (alpha2 - 1) + 1) ** 2)
+    masking = [2 / (1 + xp.sqrt(1 + alpha2 * (1 - c * c) / (c * c))) for c in (cos_i, cos_o)]
+    g = xp.sqrt(stack["ior"] ** 2 - 1 + cos_d**2)
+    fresnel = 0.5 * ((g - cos_d) / (g + cos_d)) ** 2
+    fresnel = fresnel * (1 + ((cos_d * (g + cos_d) - 1) / (cos_d * (g - cos_d) + 1)) ** 2)
+    coat = stack["gain"] * fresnel * density * masking[0] * masking[1] / (4 * cos_i * cos_o)
+    passed = xp.exp(-stack["depth"] * (1 / cos_i + 1 / cos_o))
+    cos_s, asymmetry = -xp.sum(wi * wo, axis=-1), stack["g"]
+    phase = (1 - asymmetry**2) / (4 * np.pi * (1 + asymmetry**2 - 2 * asymmetry * cos_s) ** 1.5)
+    return (coat + passed * stack["albedo"] / np.pi + phase * (1 - passed) / (cos_i + cos_o))[:, None]
+
+
+LOBE = {"alpha": 0.2, "gain": 0.9, "ior": 1.5, "albedo": 0.3, "depth": 0.3, "g": 0.4}

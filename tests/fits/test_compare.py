@@ -1,0 +1,79 @@
+"""Comparison of fits: the criteria written out, and which stack wins."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fits.compare import compare
+from fits.optimise import fit
+from fits.parameters import Free
+from fits.posterior import sample
+from tests.fits.models import design, line, measured
+
+COUNT = 120
+LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
+FLAT = {"a": Free(0.9, -1.0, 3.0), "b": 0.0}
+NOISE = 0.05 * np.random.default_rng(0).standard_normal((COUNT, 1))
+DATA = measured((design(COUNT) @ [1.0, 0.2])[:, None] + NOISE, 0.05)
+
+
+@pytest.fixture(scope="module")
+def fits() -> dict:
+    return {name: fit(stack, DATA, transport=line, starts=2) for name, stack in (("flat", FLAT), ("line", LINE))}
+
+
+def test_criteria_are_those_of_the_books(fits: dict) -> None:
+    comparison = compare(fits)
+    assert comparison.sorted_by == "aic"
+    assert [row.name for row in comparison.rows] == ["line", "flat"]
+    for row, columns in zip(comparison.rows, (2, 1), strict=True):
+        x = design(COUNT)[:, :columns]
+        rest = DATA.values[:, 0] - x @ np.linalg.lstsq(x, DATA.values[:, 0], rcond=None)[0]
+        likelihood = stats.norm.logpdf(rest, 0, 0.05).sum()
+        assert row.chi_square == pytest.approx(np.sum(rest**2) / 0.05**2, rel=1e-8)
+        assert row.degrees_of_freedom == COUNT - columns
+        assert row.log_likelihood == pytest.approx(likelihood, rel=1e-8)
+        assert row.aic == pytest.approx(2 * columns - 2 * likelihood, rel=1e-8)
+        assert row.bic == pytest.approx(columns * math.log(COUNT) - 2 * likelihood, rel=1e-8)
+        assert math.isnan(row.loo)
+
+
+def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
+    """Exact leave-one-out of a linear model with known noise; flat priors are wide enough to be left out."""
+    comparison = compare({name: sample(entry, walkers=16, seed=0) for name, entry in fits.items()})
+    assert comparison.sorted_by == "loo"
+    assert [row.name for row in comparison.rows] == ["line", "flat"]
+    for row, columns in zip(comparison.rows, (2, 1), strict=True):
+        x, y = design(COUNT)[:, :columns], DATA.values[:, 0]
+        leverage = np.einsum("ij,jk,ik->i", x, np.linalg.inv(x.T @ x), x)
+        rest = (y - x @ np.linalg.lstsq(x, y, rcond=None)[0]) / (1 - leverage)
+        exact = stats.norm.logpdf(rest, 0, 0.05 / np.sqrt(1 - leverage)).sum()
+        assert row.loo == pytest.approx(exact, abs=0.1)  # 2,000 draws know each of P parameters' part to a few per cent
+        assert row.unreliable == 0
+    assert comparison.rows[0].loo_behind == 0
+    assert comparison.rows[1].loo_behind > 3 * comparison.rows[1].loo_behind_error
+
+
+def test_what_differs_is_said(fits: dict) -> None:
+    scaled = fit(LINE, DATA, transport=line, scale=1.1, starts=2)
+    notes = compare({"line": fits["line"], "scaled": scaled}).notes
+    assert any(note.startswith("the fits differ in scale") for note in notes)
+    poor = measured(DATA.values, 0.005)
+    notes = compare({"one": fit(FLAT, poor, transport=line, starts=1), "two": fit(FLAT, poor, transport=line)}).notes
+    assert any("no candidate explains the data" in note for note in notes)
+
+
+def test_different_data_or_objectives_are_refused(fits: dict) -> None:
+    other = fit(LINE, measured(DATA.values + 0.01, 0.05), transport=line, starts=1)
+    with pytest.raises(ValueError, match="'line' and 'other' were fitted to different data"):
+        compare({"line": fits["line"], "other": other})
+    named = fit(LINE, DATA, transport=line, objective="log1p_cos", starts=1)
+    with pytest.raises(ValueError, match="only fits of one objective"):
+        compare({"line": fits["line"], "named": named})
+    with pytest.raises(ValueError, match="at least 2"):
+        compare({"line": fits["line"]})
+    both = compare({"a": named, "b": named})
+    assert both.sorted_by == "chi_square"
+    assert math.isnan(both.rows[0].aic)
