@@ -8,6 +8,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
@@ -37,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def build_parser() -> argparse.ArgumentParser:
     """All commands and options; it imports nothing beyond the standard library."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="layerjax", description="Fit layered materials to measured reflectance, with honest uncertainty."
     )
     parser.add_argument("--version", action=_Version, help="print the version and exit")
@@ -48,7 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_fit(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "fit",
@@ -77,7 +78,7 @@ def _add_fit(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") ->
     _add_force(parser, "replace DIR if it holds an earlier result")
 
 
-def _add_sample(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_sample(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "sample",
@@ -90,7 +91,7 @@ def _add_sample(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     _add_force(parser, "throw an earlier chain away and start again")
 
 
-def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "report",
@@ -103,7 +104,7 @@ def _add_report(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
     )
 
 
-def _add_compare(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "compare",
@@ -115,7 +116,7 @@ def _add_compare(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     _add_force(parser, "overwrite the file")
 
 
-def _add_info(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "info",
@@ -123,12 +124,14 @@ def _add_info(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -
         "layerjax info slices.csv",
     )
     parser.add_argument("data", metavar="FILE", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
-    parser.add_argument("--out", metavar="PNG", help="draw the data to this file (default: FILE's name, as .png, in the current directory)")
+    parser.add_argument(
+        "--out", metavar="PNG", help="picture to draw (default: FILE's name as .png, in the current directory)"
+    )
     _add_reading(parser)
     _add_force(parser, "overwrite the picture")
 
 
-def _add_convert(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "convert",
@@ -141,7 +144,7 @@ def _add_convert(commands: "argparse._SubParsersAction[argparse.ArgumentParser]"
     _add_force(parser, "overwrite the file")
 
 
-def _add_simulate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = _command(
         commands,
         "simulate",
@@ -165,7 +168,7 @@ def _add_simulate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]
 
 
 def _command(
-    commands: "argparse._SubParsersAction[argparse.ArgumentParser]", name: str, what: str, example: str
+    commands: "argparse._SubParsersAction[_Parser]", name: str, what: str, example: str
 ) -> argparse.ArgumentParser:
     return commands.add_parser(
         name, help=what, description=f"{what[0].upper()}{what[1:]}.", epilog=f"example: {example}"
@@ -195,6 +198,13 @@ def _add_sampling(parser: argparse.ArgumentParser) -> None:
 
 def _add_force(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--force", action="store_true", help=what)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as every other error of the command."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 
 class _Version(argparse.Action):
