@@ -1,5 +1,7 @@
 """Fitting: many starts through one compiled program, then what the best minimum is worth."""
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -149,7 +151,20 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     expected = problem.model.values.shape
     if values.ndim != 3 or values.shape[1:] != expected:
         raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")
-    return Repeats(*map(np.asarray, problem.call(_solve_repeats, start_points(problem, starts, seed), values)))
+    points = start_points(problem, starts, seed)
+    # a fit keeps one core busy: equal shares (the last one padded) of one program, the first of which compiles it
+    workers = max(1, min(os.cpu_count() or 1, len(values)))
+    share = -(-len(values) // (4 * workers)) if workers > 1 else len(values)
+    firsts = range(0, len(values), share)
+
+    def solve(first: int) -> list[NDArray[Any]]:
+        part = values[first : first + share]
+        padded = np.concatenate([part, np.repeat(part[-1:], share - len(part), axis=0)])
+        return [np.asarray(result)[: len(part)] for result in problem.call(_solve_repeats, points, padded)]
+
+    with ThreadPoolExecutor(workers) as pool:
+        shares = [solve(firsts[0]), *pool.map(solve, firsts[1:])]
+    return Repeats(*map(np.concatenate, zip(*shares, strict=True)))
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> Floats:

@@ -4,6 +4,7 @@ Every guard here sanitises the *input* of the branch that is not taken (with an 
 selects: a clamp or a ``where`` after the fact still gives NaN gradients.
 """
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -25,16 +26,17 @@ def safe_div(numerator: Array, denominator: Array, otherwise: float = 0.0) -> Ar
 
 def exprel(x: Array) -> Array:
     """(1 - exp(-x)) / x for x >= 0, equal to 1 at x = 0; relative error of a few units of rounding."""
-    small, tame, inner = _split(x)
+    small = x < SERIES_LIMIT
+    tame, inner = jnp.where(small, 1.0, x), jnp.where(small, x, 0.5 * SERIES_LIMIT)
     return jnp.where(small, _series(inner), (1.0 - jnp.exp(-tame)) / tame)
 
 
 def one_minus_exp(x: Array) -> Array:
     """1 - exp(-x) for x >= 0, to a few units of rounding at any x."""
-    small, tame, inner = _split(x)
-    return jnp.where(small, inner * _series(inner), 1.0 - jnp.exp(-tame))
+    return absorb(x)[1]
 
 
+@jax.custom_jvp
 def absorb(x: Array) -> tuple[Array, Array]:
     """(exp(-x), 1 - exp(-x)) for x >= 0, both to a few units of rounding, with one exponential."""
     small = x < SERIES_LIMIT
@@ -43,14 +45,17 @@ def absorb(x: Array) -> tuple[Array, Array]:
     return transmitted, jnp.where(small, inner * _series(inner), 1.0 - transmitted)
 
 
+@absorb.defjvp
+def _absorb_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    # the derivative is the exponential that is there already: no need to differentiate the series
+    shares = absorb(*primals)
+    change = shares[0] * tangents[0]
+    return shares, (-change, change)
+
+
 def horizon(dtype: jnp.dtype) -> float:
     """Cosines below this count as lying in the tangent plane: their squares must not overflow when divided by."""
     return 1e-9 if jnp.finfo(dtype).bits >= 32 else 1e-3
-
-
-def _split(x: Array) -> tuple[Array, Array, Array]:
-    small = x < SERIES_LIMIT
-    return small, jnp.where(small, 1.0, x), jnp.where(small, x, 0.5 * SERIES_LIMIT)
 
 
 def _series(x: Array) -> Array:

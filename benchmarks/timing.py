@@ -1,0 +1,30 @@
+"""Wall times by interleaved repeats: every round runs each way once, so that a busy machine slows all of them alike."""
+
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+Work = Callable[[], object]
+
+
+def interleaved(ways: Mapping[str, Work], rounds: int) -> dict[str, np.ndarray]:
+    """Seconds of each way, (rounds,), after one run to warm up. A way returns when its work is done."""
+    for work in ways.values():
+        work()
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    order = list(ways)
+    for index in range(rounds):
+        turn = index % len(order)  # nobody always runs after the same neighbour, whose data would be in the cache
+        for name in order[turn:] + order[:turn]:
+            began = time.perf_counter()
+            ways[name]()
+            seconds[name].append(time.perf_counter() - began)
+    return {name: np.array(times) for name, times in seconds.items()}
+
+
+def once(work: Work) -> float:
+    """Seconds of a single run."""
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began

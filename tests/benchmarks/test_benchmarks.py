@@ -1,0 +1,119 @@
+"""The benchmarks' own models agree with layerjax, and their runs leave whole files behind."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from benchmarks import environment, fitting, forward_models, peers, plain_numpy, recovery, results, throughput
+from benchmarks.scenes import CONDUCTOR, SCENES, Scene, pairs
+
+COUNT = 200
+BY_NAME = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
+
+
+def ours(scene: Scene, wi, wo):
+    return np.asarray(lj.evaluate(scene.build(scene.arrays("float64")), wi, wo, side=scene.side))
+
+
+@BY_NAME
+def test_plain_numpy_agrees_with_layerjax(scene: Scene) -> None:
+    """Tolerance: the plain form of exp(-a) - exp(-b) loses up to 5 digits where a and b agree to 1e-5."""
+    wi, wo = pairs(COUNT, scene.side)
+    plain = np.stack(plain_numpy.model_of(scene.parameters)(scene.parameters, wi.T, wo.T, scene.side), axis=-1)
+    np.testing.assert_allclose(plain, ours(scene, wi, wo), rtol=1e-10 if scene.side == "all" else 1e-13)
+
+
+@BY_NAME
+def test_finite_differences_agree_with_layerjax(scene: Scene) -> None:
+    """Tolerance: forward differences with a step of sqrt(eps) keep some 7 digits of slopes of the size of the loss."""
+    wi, wo = pairs(COUNT, scene.side)
+    target = 1.1 * ours(scene, wi, wo)
+
+    def loss(p):
+        return jnp.sum(jnp.mean((lj.evaluate(scene.build(p), wi, wo, side=scene.side) - target) ** 2, axis=0))
+
+    value, slopes = jax.jit(jax.value_and_grad(loss))(scene.arrays("float64"))
+    parameters = {name: np.asarray(number) for name, number in scene.parameters.items()}
+    plain, differences = plain_numpy.gradient(parameters, wi.T, wo.T, target.T, scene.side)
+    assert plain == pytest.approx(float(value), rel=1e-10)
+    assert scene.count == sum(slope.size for slope in slopes.values()) in (7, 20)
+    for name, slope in slopes.items():
+        np.testing.assert_allclose(differences[name], slope, rtol=1e-3, atol=1e-5 * plain, err_msg=name)
+
+
+@BY_NAME
+@pytest.mark.peers
+def test_the_peers_agree_with_plain_numpy(scene: Scene) -> None:
+    """Tolerance: float32, through about a hundred operations."""
+    reason = peers.why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    wi, wo = pairs(COUNT, scene.side)
+    plain = np.stack(plain_numpy.model_of(scene.parameters)(scene.parameters, wi.T, wo.T, scene.side), axis=-1)
+    peer = peers.of(scene, *(array.astype("float32") for array in (wi, wo, 1.1 * plain)))
+    np.testing.assert_allclose(np.stack([np.array(v) for v in peer.value()], axis=-1), plain, rtol=1e-4)
+    ways = peer.gradient, peer.tuned_gradient
+    slopes, tuned = (np.concatenate([np.ravel(np.array(slope)) for slope in way()[1]]) for way in ways)
+    np.testing.assert_allclose(slopes, tuned, rtol=1e-3)
+
+
+def test_the_material_that_is_fitted_agrees_with_its_numpy_model() -> None:
+    wi, wo = pairs(COUNT, "reflection")
+    values = lj.evaluate(fitting.stack_of(fitting.TRUTH), wi, wo)
+    np.testing.assert_allclose(fitting.model(fitting.TRUTH, wi, wo), values[:, 0], rtol=1e-13)
+
+
+def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
+    text, paths = throughput.study(
+        with_peers=False,
+        directory=tmp_path / "new",
+        forward_size=forward_models.Size(pairs=64, rounds=1, scenes=(CONDUCTOR,), precisions=("float32",)),
+        fitting_size=fitting.Size(rounds=1, many=2, few=1, numpy_steps=20, chain_steps=100),
+    )
+    assert sorted(paths) == sorted((tmp_path / "new").iterdir())  # and no temporary file is left
+    content = json.loads(paths[0].read_text())
+    assert paths[1].read_text() == text
+    assert content["environment"].keys() == environment.describe().keys()
+    assert [row["work"] for row in content["forward_models"]] == ["value", "value and gradient"]
+    assert all(row["layerjax"] > 0 and row["numpy"] > 0 and row["peer"] is None for row in content["forward_models"])
+    assert {row["verdict"] for row in content["forward_models"]} == {"no peer"}
+    assert all(row["ours"] > 0 and row["theirs"] > 0 for row in content["inference"])
+
+
+def test_a_tiny_recovery_run_writes_whole_files(tmp_path: Path) -> None:
+    text, paths = recovery.study(directory=tmp_path, size=recovery.Size(repeats=2, many=4))
+    content = json.loads(paths[0].read_text())
+    assert paths[1].read_text() == text
+    assert [row["parameter"] for row in content["parameters"]] == list(recovery.TRUTH)
+    assert all(0 <= row["within"] <= 2 and 0 <= row["covered"] <= 2 for row in content["parameters"])
+
+
+def test_results_are_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    results.write("x", {"a": 1}, "first\n", tmp_path)
+    results.write("x", {"a": 2}, "second\n", tmp_path)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        results.write("x", {"a": float("nan")}, "third\n", tmp_path)
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": 2}
+    assert (tmp_path / "x.md").read_text() == "second\n"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_tables_line_up() -> None:
+    lines = results.table(("work", "ns"), [("a", "1"), ("longer", "1,234.5")]).splitlines()
+    assert lines == ["| work   |      ns |", "|--------|--------:|", "| a      |       1 |", "| longer | 1,234.5 |"]
+
+
+def test_figures_have_three_digits() -> None:
+    numbers = (None, 0.0, 0.012345, 1.2345, 12.345, 1234.5, 1.2e-5)
+    assert [results.figure(x) for x in numbers] == ["-", "0", "0.0123", "1.23", "12.3", "1,234", "1.20e-05"]
+
+
+@pytest.mark.parametrize(("ratio", "verdict"), [(0.1, "aim met"), (0.3, "met"), (0.5, "**not met**")])
+def test_the_bar(ratio: float, verdict: str) -> None:
+    assert results.Bar(0.35, 0.2).verdict(ratio) == verdict
+    assert results.Bar(1 / 0.35, 1 / 0.2, rate=True).verdict(1 / ratio) == verdict
