@@ -54,7 +54,7 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     smaller = safe_div(product * product, larger)
     a2, b2 = jnp.where(real > 0, larger, smaller), jnp.where(real > 0, smaller, larger)
     a = safe_sqrt(a2)
-    perpendicular = ((a - cosine) ** 2 + b2) / ((a + cosine) ** 2 + b2)
+    perpendicular, below = (a - cosine) ** 2 + b2, (a + cosine) ** 2 + b2
+    ratio, under = (a * cosine - sin2) ** 2 + b2 * cos2, (a * cosine + sin2) ** 2 + b2 * cos2
     tiny = jnp.finfo(modulus.dtype).tiny
-    ratio = ((a * cosine - sin2) ** 2 + b2 * cos2) / ((a * cosine + sin2) ** 2 + b2 * cos2 + tiny)
-    return 0.5 * perpendicular * (1.0 + ratio)
+    return 0.5 * perpendicular * (under + ratio) / (below * under + tiny)  # one division for both polarisations

@@ -123,25 +123,26 @@ def _lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channel
 
 def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     """wi and wo above: each layer is seen through those over it, exp(-sum (a_j + b_j)), as a running product."""
+    if not slab.media:
+        return {} if slab.base is None else {BASE: slab.base.evaluate(wi, wo)}
     lobes: dict[int, Channels] = {}
     scattering = _scattering(slab)
     last = len(slab.media) - 1
     half = half_vector(wi, wo, same_side=True) if scattering else None
+    inverse = 1.0 / (wi[2] * wo[2])
     through: Channels | None = None
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
         weight = jnp.maximum(weight, WEIGHT_FLOOR)
-        depths = tuple(tau * (weight / (wi[2] * wo[2])) for tau in per_channel(medium.thickness))
-        shares = [absorb(depth) for depth in depths]
+        shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if half is not None and k in scattering:
             lost = tuple(share / weight for _, share in shares)
             lobes[k] = _times(_collision(medium, wi, wo, half), lost if through is None else _times(through, lost))
         if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
             through = transmitted if through is None else _times(through, transmitted)
-    if slab.base is not None:
-        values = slab.base.evaluate(wi, wo)
-        lobes[BASE] = values if through is None else _times(through, values)
+    if slab.base is not None and through is not None:
+        lobes[BASE] = _times(through, slab.base.evaluate(wi, wo))
     return lobes
 
 
