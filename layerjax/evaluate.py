@@ -6,7 +6,7 @@ that a gradient holds no more than one chunk in memory and accumulates as it goe
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -24,6 +24,9 @@ from layerjax.transport import Side, SingleScattering, Transport
 
 CHUNK_BYTES = 20_000
 """Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
+
+BLOCK_CHUNKS = 4
+"""Chunks that are transposed together."""
 
 
 class Prepared(eqx.Module):
@@ -135,7 +138,7 @@ def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side) -> Array:
         channels = prepared.transport.evaluate(prepared.state, wi, wo, side)
         return tuple(pick(channels, c) for c in range(prepared.channels))
 
-    return _stack(_in_chunks(values, wi, wo))
+    return _in_chunks(values, wi, wo)
 
 
 @eqx.filter_jit
@@ -150,8 +153,8 @@ def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Ar
         return (*wo, density, *weights)
 
     uniforms = jax.random.uniform(key, wi.shape, dtype=wi.dtype)
-    x, y, z, density, *weights = _in_chunks(draw, wi, uniforms)
-    return _stack((x, y, z)), density, _stack(weights)
+    drawn = _in_chunks(draw, wi, uniforms)
+    return drawn[..., :3], drawn[..., 3], drawn[..., 4:]
 
 
 @eqx.filter_jit
@@ -159,7 +162,7 @@ def _pdf(prepared: Prepared, wi: Array, wo: Array) -> Array:
     def density(wi: Vector, wo: Vector) -> tuple[Array, ...]:
         return (prepared.transport.pdf(prepared.state, wi, wo),)
 
-    return _in_chunks(density, wi, wo)[0]
+    return _in_chunks(density, wi, wo)[..., 0]
 
 
 @eqx.filter_jit
@@ -186,29 +189,42 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
-def _in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> tuple[Array, ...]:
-    """function over directions given as arrays of shape ``(..., 3)``, in cache-sized chunks when there are many."""
+def _in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:
+    """function over arrays of shape ``(..., 3)`` as components, its results along a new last axis.
+
+    Many pairs run in blocks, which are transposed to components and back (a loop that reads every third number takes
+    several times as long as the arithmetic), and these in chunks that stay in the cache. A gradient keeps the
+    directions alone and computes each block, and each chunk of it, again on the way back.
+    """
     batch = jnp.broadcast_shapes(*(array.shape for array in inputs))[:-1]
     pairs = math.prod(batch)
     chunk = CHUNK_BYTES // inputs[0].dtype.itemsize
     if pairs <= 2 * chunk:
-        return tuple(jnp.broadcast_to(result, batch) for result in function(*map(split, inputs)))
-    # one transposition up front: a loop that reads every third number runs several times slower than the arithmetic
-    flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3).T for array in inputs]
-    vectors = [tuple(array) for array in jax.lax.optimization_barrier(flat)]
-    whole = pairs // chunk * chunk
-    step = jax.checkpoint(lambda _, rows: (None, function(*rows)))
-    _, results = jax.lax.scan(step, None, jax.tree.map(lambda x: x[:whole].reshape(-1, chunk), vectors))
-    results = tuple(result.reshape(whole) for result in results)
+        return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
+    flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]
+    size = BLOCK_CHUNKS * chunk
+    whole = pairs // size * size
+    run = partial(_block, function, chunk)
+    parts = []
+    if whole:
+        blocks = [array[:whole].reshape(-1, size, 3) for array in flat]
+        step = jax.checkpoint(lambda _, rows: (None, run(*rows)))
+        _, results = jax.lax.scan(step, None, blocks)
+        parts.append(results.reshape(whole, -1))
     if whole < pairs:
-        rest = function(*jax.tree.map(lambda x: x[whole:], vectors))
-        results = tuple(jnp.concatenate(parts) for parts in zip(results, rest, strict=True))
-    return tuple(result.reshape(batch) for result in results)
+        missing = -(pairs - whole) % chunk  # a vector of zeros is no direction: it gives 0
+        rest = [jnp.pad(array[whole:], ((0, missing), (0, 0))) for array in flat]
+        parts.append(run(*rest)[: pairs - whole])
+    return jnp.concatenate(parts).reshape(*batch, -1)
 
 
-def _stack(components: Sequence[Array]) -> Array:
-    """Components along a new last axis; built along the first and transposed, which XLA does several times faster."""
-    return jnp.moveaxis(jax.lax.optimization_barrier(jnp.stack(components)), 0, -1)
+def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:
+    """function over a whole number of chunks, (n, 3) each."""
+    vectors = [tuple(array.T.reshape(3, -1, chunk)) for array in jax.lax.optimization_barrier(rows)]
+    step = jax.checkpoint(lambda _, vectors: (None, function(*vectors)))
+    _, results = jax.lax.scan(step, None, jax.lax.optimization_barrier(vectors))
+    together = jax.lax.optimization_barrier(jnp.stack([result.reshape(-1) for result in results]))
+    return together.T
 
 
 def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
