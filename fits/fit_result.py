@@ -27,9 +27,8 @@ class Fit:
     """The best minimum of a `Problem` with P parameters, N used samples and C channels.
 
     vector: (P,) values in the problem's order. errors: (P,) standard errors, NaN for a parameter at a bound, infinite
-    where the data leave it open; those of the others hold with the parameters in `at_bound` kept there. covariance: (P,
-    P).
-    cost: half the sum of squared residuals. iterations: steps of the solver to this minimum.
+    where the data leave it open; those of the others hold with the parameters in `at_bound` kept there.
+    covariance: (P, P). cost: half the sum of squared residuals. iterations: steps of the solver to this minimum.
     condition_number: of the information about the parameters, each scaled to unit length.
     open_directions: (singular value relative to the largest, {name: weight in units of the box}).
     minima: best first. alternatives: those among them, other than the best, that explain the data equally well.

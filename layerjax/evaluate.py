@@ -115,8 +115,9 @@ def albedo(
 ) -> tuple[Array, Array]:
     """Directional albedo: the shares of light along wi scattered to wi's own side and to the other, ``(..., C)`` each.
 
-    The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe,
-    with `nodes` Gauss points a dimension and panel.
+    The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe, with
+    `nodes` Gauss points a dimension and panel: 32 give 1e-6 as a rule, and 4e-3 at worst over the documented box, where
+    light grazes lobes of alpha 1e-4.
     """
     (wi,) = _directions(wi=wi)
     return _albedo(_prepared(stack, transport, wi.dtype), wi, nodes)

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -278,13 +277,11 @@ def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> 
     np.testing.assert_array_equal(read(work / "new.csv").values, first.values)
 
 
-def test_help_is_quick_and_imports_no_jax() -> None:
+def test_help_imports_no_jax() -> None:
     script = "import sys; from fits.cli import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
-    started = time.monotonic()
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "simulate" in done.stdout
-    assert time.monotonic() - started < 2.0  # 0.1 s on an idle core; jax alone takes a second
 
 
 def test_an_interrupted_fit_exits_with_130_and_leaves_nothing(work: Path, coat_fit: Fit) -> None:
