@@ -30,7 +30,7 @@ BLOCK_CHUNKS = 4
 
 
 class Prepared(eqx.Module):
-    """A stack made ready for a transport by `prepare`: pass it wherever a stack is taken."""
+    """A stack made ready for a transport by `prepare`: `evaluate`, `sample`, `pdf` and `albedo` take it for a stack."""
 
     state: Any
     transport: Transport

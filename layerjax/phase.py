@@ -3,7 +3,7 @@
 Each offers the same few functions of directions as components (see `layerjax.directions`):
 
 - ``cross_section(w)``: extinction along w per unit of thickness, sigma(w);
-- ``kernel(wi, wo, ...)``: sigma(wi) p(wi, wo), symmetric in its arguments, 1/sr, before albedo and Fresnel;
+- ``kernel(wi, wo, h)``: sigma(wi) p(wi, wo), symmetric, 1/sr, before albedo and Fresnel; h is the half vector if known;
 - ``sample(wi, u1, u2)`` and ``pdf(wi, wo)``: exact sampling of p, and p itself;
 - ``rule(wi, nodes)``: quadrature nodes that resolve the lobe (see `layerjax.quadrature`).
 """
@@ -37,7 +37,7 @@ class HenyeyGreenstein(eqx.Module):
     def cross_section(self, w: Vector) -> Array:
         return jnp.ones_like(w[2])
 
-    def kernel(self, wi: Vector, wo: Vector, h: Vector) -> Array:
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
         return self.pdf(wi, wo)
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
@@ -85,12 +85,13 @@ class SGGX(eqx.Module):
     def cross_section(self, w: Vector) -> Array:
         return sggx_area(w, self.kind, self.alpha, self._axis())
 
-    def kernel(self, wi: Vector, wo: Vector, h: Vector) -> Array:
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
+        if h is None:
+            h, _ = half_vector(wi, wo)
         return 0.25 * sggx_density(h, self.kind, self.alpha, self._axis())  # Eq. (4) times sigma(wi)
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
-        h, _ = half_vector(wi, wo)
-        return self.kernel(wi, wo, h) / self.cross_section(wi)
+        return self.kernel(wi, wo, None) / self.cross_section(wi)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, sggx_sample(wi, self.kind, self.alpha, self._axis(), u1, u2))

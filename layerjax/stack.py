@@ -56,7 +56,7 @@ class Medium(eqx.Module):
     f0: Parameter = parameter("Medium.f0", default=None, optional=True)
 
     def __check_init__(self) -> None:
-        if not isinstance(self.phase, HenyeyGreenstein | PhaseFunction):
+        if not isinstance(self.phase, PhaseFunction):
             raise ValueError(f"Medium.phase: {self.phase!r} is not a HenyeyGreenstein or an SGGX")
 
 

@@ -6,7 +6,7 @@ from layerjax import fresnel
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import count, per_channel, pick
 from layerjax.directions import Vector, half_vector, reflect
-from layerjax.distributions import ggx_density, ggx_masking, ggx_sample, sggx_area
+from layerjax.distributions import ggx_density, ggx_masking, ggx_sample, radii, sggx_area
 from layerjax.quadrature import Nodes, flake_rule
 from layerjax.surfaces._surface import Surface
 
@@ -44,5 +44,5 @@ class Conductor(Surface):
         return ggx_density(h, self.alpha) * ggx_masking(wi, self.alpha) / (4.0 * wi[2])
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
-        upper, _ = flake_rule(wi, self.alpha, self.alpha * 0.0 + 1.0, None, nodes)
+        upper, _ = flake_rule(wi, *radii("surface", self.alpha), None, nodes)
         return upper

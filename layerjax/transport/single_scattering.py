@@ -23,6 +23,7 @@ from layerjax import fresnel
 from layerjax._numerics import absorb, exprel, horizon, one_minus_exp, safe_div
 from layerjax.channels import Channels, count, largest, mean, per_channel, pick
 from layerjax.directions import Vector, half_vector, select
+from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Surface
@@ -128,14 +129,14 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     lobes: dict[int, Channels] = {}
     scattering = _scattering(slab)
     last = len(slab.media) - 1
-    half = half_vector(wi, wo, same_side=True) if scattering else None
+    half = half_vector(wi, wo, same_side=True) if _uses_half_vector(slab) else None
     inverse = 1.0 / (wi[2] * wo[2])
     through: Channels | None = None
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
         weight = jnp.maximum(weight, WEIGHT_FLOOR)
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
-        if half is not None and k in scattering:
+        if k in scattering:
             lost = tuple(share / weight for _, share in shares)
             lobes[k] = _times(_collision(medium, wi, wo, half), lost if through is None else _times(through, lost))
         if k < last or slab.base is not None:
@@ -152,7 +153,7 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
     scattering = _scattering(slab)
     if not scattering:
         return lobes
-    half = half_vector(wi, wo)
+    half = half_vector(wi, wo) if _uses_half_vector(slab) else None
     inverse = 1.0 / jnp.abs(wi[2] * wo[2])
     depths_i, depths_o = optical_depths(slab.media, wi), optical_depths(slab.media, wo)
     paths_i, paths_o = _paths(depths_i, wi), _paths(depths_o, wo)
@@ -185,15 +186,18 @@ def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
     return list(zip(*per_channel_paths, strict=True)) if depths else []
 
 
-def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array]) -> Channels:
+def _uses_half_vector(slab: Media) -> bool:
+    """Whether any collision needs one: flakes do, and so does a Fresnel term."""
+    scattering = (slab.media[k] for k in _scattering(slab))
+    return any(isinstance(medium.phase, SGGX) or medium.f0 is not None for medium in scattering)
+
+
+def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array] | None) -> Channels:
     """gamma F D/4 (Eq. 4), or gamma times the phase function: what a collision sends from wi to wo."""
-    h, cosine = half
-    kernel = medium.phase.kernel(wi, wo, h)
-    strength: Channels = (kernel,)
-    if is_known(medium.f0, 0.0):
-        strength = (kernel * fresnel.schlick(cosine, 0.0),)
-    elif medium.f0 is not None:
-        strength = tuple(kernel * fresnel.schlick(cosine, f0) for f0 in per_channel(medium.f0))
+    strength: Channels = (medium.phase.kernel(wi, wo, None if half is None else half[0]),)
+    if half is not None and medium.f0 is not None:
+        levels = (0.0,) if is_known(medium.f0, 0.0) else per_channel(medium.f0)
+        strength = tuple(strength[0] * fresnel.schlick(half[1], f0) for f0 in levels)
     return strength if is_known(medium.albedo, 1.0) else _times(per_channel(medium.albedo), strength)
 
 

@@ -80,6 +80,14 @@ def test_no_fresnel_term(absent):
     assert operations(lj.Stack([medium()])) < zero < some
 
 
+def test_haze_alone_needs_no_half_vector():
+    haze = medium(phase=lj.HenyeyGreenstein(0.5))
+    plain, fresnel = (program(lj.Stack([layer]), "reflection") for layer in (haze, medium(phase=haze.phase, f0=0.04)))
+    flakes = program(lj.Stack([medium()]), "reflection")
+    assert plain["sqrt"] == 1 < fresnel["sqrt"]  # that of the phase function itself
+    assert sum(plain.values()) < sum(flakes.values())
+
+
 def test_an_upright_axis():
     upright = operations(lj.Stack([medium()]))
     tilted = operations(lj.Stack([medium(phase=lj.SGGX("surface", 0.3, (0.3, 0.0, 1.0)))]))
