@@ -1,4 +1,6 @@
-"""Benchmarks: ``throughput`` (times, beside numpy and peers) and ``recovery`` (are errors and intervals honest?)."""
+"""Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
+``error-vs-time`` (every model against the truth, over the suite of stacks) and ``references`` (the solver and the walk
+beside PythonicDISORT and Mitsuba)."""
 
 import argparse
 import importlib
@@ -13,11 +15,17 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="benchmark", required=True)
-    for name in ("throughput", "recovery"):
+    for name in ("throughput", "recovery", "error-vs-time", "references"):
         command = commands.add_parser(name)
         command.add_argument("--quick", action="store_true", help="fewer repeats: a look, no result to quote")
         command.add_argument("--out", type=Path, help="directory to write into (default: benchmarks/results)")
-    commands.choices["throughput"].add_argument("--no-peers", action="store_true", help="without Mitsuba and Dr.Jit")
+    for name, named_peers in (("throughput", "Mitsuba and Dr.Jit"), ("references", "Mitsuba and PythonicDISORT")):
+        commands.choices[name].add_argument("--no-peers", action="store_true", help=f"without {named_peers}")
+    compared = commands.choices["error-vs-time"]
+    families = sorted(path.name for path in (Path(__file__).parent / "suite").iterdir())
+    compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
+    compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
+    compared.add_argument("--add", action="store_true", help="keep what the directory holds of other stacks")
     given = parser.parse_args(arguments)
 
     # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
@@ -33,9 +41,17 @@ def main(arguments: list[str] | None = None) -> int:
     options: dict[str, Any] = {"quick": given.quick, "report": report}
     if given.out is not None:
         options["directory"] = given.out
-    if given.benchmark == "throughput":
+    if given.benchmark in ("throughput", "references"):
         options["with_peers"] = not given.no_peers
-    text, paths = importlib.import_module(f"benchmarks.{given.benchmark}").study(**options)
+    if given.benchmark == "error-vs-time":
+        from benchmarks.models import named
+
+        try:
+            options |= {"families": given.families, "models": named(given.models), "add": given.add}
+        except ValueError as error:
+            parser.error(str(error))
+    study = importlib.import_module(f"benchmarks.{given.benchmark.replace('-', '_')}").study
+    text, paths = study(**options)
     print(text)
     report(f"written: {', '.join(map(str, paths))}")
     return 0

@@ -1,7 +1,8 @@
 """Stacks and fitting problems as TOML: a table for each layer and the base, and a table where a number is free.
 
-    transport = "SingleScattering"             # optional, "auto" if left out
+    transport = "SingleScattering"             # optional, "auto" if left out; { kind = "AddingDoubling", nodes = 16 }
     objective = "likelihood"                   # optional
+    about = { source = "..." }                 # optional: a table of texts that are kept and not looked at
 
     [[layers]]                                 # from top to bottom
     kind = "Medium"
@@ -26,6 +27,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import NoneType, UnionType
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -40,7 +42,11 @@ _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
 _BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.Conductor)}
 _PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.SGGX)}
-_TRANSPORTS: _Kinds = {kind.__name__: kind for kind in (lj.SingleScattering,)}
+_TRANSPORTS: _Kinds = {
+    name: kind
+    for name, kind in vars(lj).items()
+    if inspect.isclass(kind) and issubclass(kind, lj.Transport) and not inspect.isabstract(kind)
+}
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
 _FREE_KEYS = ("start", "low", "high", "prior")
 _ANY = (-math.inf, math.inf)
@@ -48,13 +54,14 @@ _ANY = (-math.inf, math.inf)
 
 @dataclass(frozen=True, eq=False)
 class ProblemFile:
-    """What a TOML file says: the arguments of `fits.fit` other than the data, and the text as it was."""
+    """What a TOML file says: the arguments of `fits.fit` other than the data, what it says of itself, and the text."""
 
     stack: lj.Stack
     transport: lj.Transport | Literal["auto"]
     noise: Noise
     scale: Free | None
     objective: Objective
+    about: Mapping[str, str]
     text: str
 
 
@@ -71,13 +78,14 @@ def read_problem(path: str | Path) -> ProblemFile:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
     try:
-        _check_keys("the file", tables, ("transport", "objective", "layers", "base", "noise", "scale"))
+        _check_keys("the file", tables, ("about", "transport", "objective", "layers", "base", "noise", "scale"))
         return ProblemFile(
             stack=stack_from_dict({key: tables[key] for key in ("layers", "base") if key in tables}),
             transport=_transport(tables.get("transport", "auto")),
             noise=_noise(tables.get("noise", {})),
             scale=_scale(tables["scale"]) if "scale" in tables else None,
             objective=cast(Objective, _choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
+            about=_about(tables.get("about", {})),
             text=text,
         )
     except ValueError as error:
@@ -162,9 +170,16 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
     """One parameter, read as what its type hint says."""
     if get_origin(hint) is Literal:
         return _choice(where, value, get_args(hint))
+    alternatives = [kind for kind in get_args(hint) if kind is not NoneType]
+    if isinstance(hint, UnionType) and len(alternatives) == 1:  # an option that may be left out
+        (hint,) = alternatives
     if hint is bool:
         if not isinstance(value, bool):
             raise ValueError(f"{where} is {value!r}, must be true or false")
+        return value
+    if hint is int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ValueError(f"{where} is {value!r}, must be a whole number")
         return value
     if hint is float:
         number = _numbers(where, value, _ANY)
@@ -202,6 +217,13 @@ def _noise(table: Any) -> Noise:
     hints = get_type_hints(Noise)
     _check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
     return Noise(**{key: _value(f"noise.{key}", value, hints[key], f"Noise.{key}") for key, value in table.items()})
+
+
+def _about(table: Any) -> dict[str, str]:
+    for key, text in _require_table("about", table).items():
+        if not isinstance(text, str):
+            raise ValueError(f"about.{key} is {text!r}, must be a text")
+    return dict(table)
 
 
 def _scale(table: Any) -> Free:
@@ -271,7 +293,7 @@ def _to_plain(value: Any) -> Any:
     if isinstance(value, Free):
         table = {key: _to_plain(getattr(value, key)) for key in _FREE_KEYS}
         return {key: entry for key, entry in table.items() if value.prior != Uniform() or key != "prior"}
-    if isinstance(value, str | bool):
+    if isinstance(value, str | bool | int):
         return value
     if isinstance(value, lj.HenyeyGreenstein | lj.SGGX | Prior):
         return _module_to_dict(value)

@@ -6,10 +6,13 @@ from layerjax.directions import direction as direction
 from layerjax.evaluate import Prepared as Prepared
 from layerjax.evaluate import albedo as albedo
 from layerjax.evaluate import evaluate as evaluate
+from layerjax.evaluate import evaluate_with_error as evaluate_with_error
 from layerjax.evaluate import pdf as pdf
 from layerjax.evaluate import prepare as prepare
 from layerjax.evaluate import sample as sample
 from layerjax.evaluate import unscattered as unscattered
+from layerjax.goniophotometer import Goniogram as Goniogram
+from layerjax.goniophotometer import goniophotometer as goniophotometer
 from layerjax.phase import SGGX as SGGX
 from layerjax.phase import HenyeyGreenstein as HenyeyGreenstein
 from layerjax.stack import Interface as Interface
@@ -18,6 +21,8 @@ from layerjax.stack import Stack as Stack
 from layerjax.surfaces import Conductor as Conductor
 from layerjax.surfaces import Lambertian as Lambertian
 from layerjax.surfaces import OrenNayar as OrenNayar
+from layerjax.transport import AddingDoubling as AddingDoubling
+from layerjax.transport import RandomWalk as RandomWalk
 from layerjax.transport import SingleScattering as SingleScattering
 from layerjax.transport import Transport as Transport
 

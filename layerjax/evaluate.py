@@ -1,4 +1,4 @@
-"""The public way in: evaluate, sample, pdf, albedo, unscattered, prepare.
+"""The public way in: evaluate, evaluate_with_error, sample, pdf, albedo, unscattered, prepare.
 
 Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``,
 ``vmap`` and ``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so
@@ -62,6 +62,7 @@ def evaluate(
     transport: Transport | Literal["auto"] = "auto",
     *,
     side: Side = "all",
+    key: Array | None = None,
 ) -> Array:
     """BSDF in 1/sr, without the cosine.
 
@@ -73,15 +74,52 @@ def evaluate(
         side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
         one below.
             Other pairs give 0, and what only they need is left out of the program.
+        key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)`` in the floating type of the directions, the channel axis
         last. A direction in the tangent plane gives 0.
     """
-    if side not in get_args(Side):
-        raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
-    wi, wo = _directions(wi=wi, wo=wo)
-    return _evaluate(_prepared(stack, transport, wi.dtype), wi, wo, side)
+    _check_side(side)
+    wi, wo = read_directions(wi=wi, wo=wo)
+    prepared = _prepared(stack, transport, wi.dtype)
+    if prepared.transport.random:
+        return _estimate(prepared, wi, wo, side, _needed(key, "evaluate"))[0]
+    return _evaluate(prepared, wi, wo, side)
+
+
+def evaluate_with_error(
+    stack: Stack | Prepared,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    transport: Transport | Literal["auto"] = "auto",
+    *,
+    side: Side = "all",
+    key: Array | None = None,
+) -> tuple[Array, Array]:
+    """BSDF as `evaluate` gives it, and an estimate of its error, of the same shape.
+
+    For `RandomWalk` (which needs a `key`) that is the standard error of each value; for a transport of finite
+    resolution the distance to its value at the next coarser one, for which the stack itself must be given.
+
+    Raises:
+        ValueError: the transport has neither, or a prepared stack is given to one that needs a second resolution.
+    """
+    _check_side(side)
+    wi, wo = read_directions(wi=wi, wo=wo)
+    prepared = _prepared(stack, transport, wi.dtype)
+    if prepared.transport.random:
+        return _estimate(prepared, wi, wo, side, _needed(key, "evaluate_with_error"))
+    coarser = prepared.transport.coarser()
+    name = type(prepared.transport).__name__
+    if coarser is None:
+        raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
+    if isinstance(stack, Prepared):
+        raise ValueError(
+            f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
+        )
+    values = _evaluate(prepared, wi, wo, side)
+    return values, jnp.abs(values - _evaluate(_prepared(stack, coarser, wi.dtype), wi, wo, side))
 
 
 def sample(
@@ -94,7 +132,7 @@ def sample(
         of shape ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have
         weight 0.
     """
-    (wi,) = _directions(wi=wi)
+    (wi,) = read_directions(wi=wi)
     return _sample(_prepared(stack, transport, wi.dtype), wi, key)
 
 
@@ -102,7 +140,7 @@ def pdf(
     stack: Stack | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
 ) -> Array:
     """Density in solid angle, 1/sr, with which `sample` draws wo for wi; shape ``broadcast(wi, wo)[:-1]``."""
-    wi, wo = _directions(wi=wi, wo=wo)
+    wi, wo = read_directions(wi=wi, wo=wo)
     return _pdf(_prepared(stack, transport, wi.dtype), wi, wo)
 
 
@@ -112,15 +150,19 @@ def albedo(
     transport: Transport | Literal["auto"] = "auto",
     *,
     nodes: int = 32,
+    key: Array | None = None,
 ) -> tuple[Array, Array]:
     """Directional albedo: the shares of light along wi scattered to wi's own side and to the other, ``(..., C)`` each.
 
     The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe, with
     `nodes` Gauss points a dimension and panel: 32 give 1e-6 as a rule, and 4e-3 at worst over the documented box, where
-    light grazes lobes of alpha 1e-4.
+    light grazes lobes of alpha 1e-4. `RandomWalk` follows light instead of that, and needs a `key`.
     """
-    (wi,) = _directions(wi=wi)
-    return _albedo(_prepared(stack, transport, wi.dtype), wi, nodes)
+    (wi,) = read_directions(wi=wi)
+    prepared = _prepared(stack, transport, wi.dtype)
+    if prepared.transport.random:
+        return _estimate_albedo(prepared, wi, _needed(key, "albedo"))
+    return _albedo(prepared, wi, nodes)
 
 
 def unscattered(stack: Stack, wi: ArrayLike) -> Array:
@@ -129,8 +171,8 @@ def unscattered(stack: Stack, wi: ArrayLike) -> Array:
     The delta part of the BSDF: 0 over an opaque base and through rough interfaces.
     """
     require_numbers(stack)
-    (wi,) = _directions(wi=wi)
-    return _unscattered(_cast(simplify(stack), wi.dtype), wi, channel_count(stack))
+    (wi,) = read_directions(wi=wi)
+    return _unscattered(in_precision(simplify(stack), wi.dtype), wi, channel_count(stack))
 
 
 @eqx.filter_jit
@@ -143,19 +185,41 @@ def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side) -> Array:
 
 
 @eqx.filter_jit
+def _estimate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array) -> tuple[Array, Array]:
+    batch = jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]
+    pairs = (jnp.broadcast_to(w, (*batch, 3)).reshape(-1, 3) for w in (wi, wo))
+    i, o = map(split, pairs)
+    values, errors = prepared.transport.estimate(prepared.state, i, o, side, prepared.channels, key)
+    return values.reshape(*batch, -1), errors.reshape(*batch, -1)
+
+
+@eqx.filter_jit
+def _estimate_albedo(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array]:
+    values, _ = prepared.transport.estimate_albedo(prepared.state, split(wi.reshape(-1, 3)), prepared.channels, key)
+    near, far = jnp.split(values, 2, axis=-1)
+    return near.reshape(*wi.shape[:-1], -1), far.reshape(*wi.shape[:-1], -1)
+
+
+@eqx.filter_jit
 def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Array]:
     transport, state = prepared.transport, prepared.state
 
     def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
         wo = transport.sample(state, wi, uniforms)
         density = transport.pdf(state, wi, wo)
+        if transport.random:
+            return (*wo, density)
         values = transport.evaluate(state, wi, wo, "all")
         weights = [safe_div(pick(values, c) * jnp.abs(wo[2]), density) for c in range(prepared.channels)]
         return (*wo, density, *weights)
 
     uniforms = jax.random.uniform(key, wi.shape, dtype=wi.dtype)
     drawn = _in_chunks(draw, wi, uniforms)
-    return drawn[..., :3], drawn[..., 3], drawn[..., 4:]
+    wo, density, weights = drawn[..., :3], drawn[..., 3], drawn[..., 4:]
+    if transport.random:
+        values, _ = _estimate(prepared, wi, wo, "all", jax.random.fold_in(key, 1))
+        weights = safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
+    return wo, density, weights
 
 
 @eqx.filter_jit
@@ -228,18 +292,29 @@ def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array)
     return together.T
 
 
+def _check_side(side: Side) -> None:
+    if side not in get_args(Side):
+        raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
+
+
+def _needed(key: Array | None, function: str) -> Array:
+    if key is None:
+        raise ValueError(f"key: RandomWalk draws random numbers: {function}(..., key=jax.random.key(seed))")
+    return key
+
+
 def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
     prepared = stack if isinstance(stack, Prepared) else prepare(stack, transport)
-    return _cast(prepared, dtype)
+    return in_precision(prepared, dtype)
 
 
-def _cast(tree: Any, dtype: jnp.dtype) -> Any:
+def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
     """Arrays of the tree in the floating type of the directions, which decide the precision of the computation."""
     cast = partial(jax.lax.convert_element_type, new_dtype=dtype)
     return jax.tree.map(lambda leaf: cast(leaf) if eqx.is_inexact_array(leaf) and leaf.dtype != dtype else leaf, tree)
 
 
-def _directions(**named: ArrayLike) -> list[Array]:
+def read_directions(**named: ArrayLike) -> list[Array]:
     arrays = []
     for name, value in named.items():
         array = jnp.asarray(value)

@@ -1,7 +1,7 @@
 """The contract that every transport keeps."""
 
 import abc
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 from jax import Array
@@ -18,7 +18,12 @@ class Transport(eqx.Module):
 
     Directions come as components, already broadcast against each other; results are one array a channel. `state` is
     what `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
+
+    A transport that draws random numbers says so in `random` and offers `estimate` and `estimate_albedo`, which take a
+    key and return standard errors too, in place of `evaluate` and `albedo`.
     """
+
+    random: ClassVar[bool] = False
 
     @abc.abstractmethod
     def check(self, stack: Stack) -> None:
@@ -43,3 +48,17 @@ class Transport(eqx.Module):
     @abc.abstractmethod
     def albedo(self, state: Any, wi: Vector, nodes: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""
+
+    def estimate(
+        self, state: Any, wi: Vector, wo: Vector, side: Side, channels: int, key: Array
+    ) -> tuple[Array, Array]:
+        """Values of n pairs and their standard errors, shape (n, channels) each; of a random transport."""
+        raise NotImplementedError
+
+    def estimate_albedo(self, state: Any, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
+        """Shares scattered to wi's side, then to the other, and standard errors: (n, 2 channels) each; if random."""
+        raise NotImplementedError
+
+    def coarser(self) -> "Transport | None":
+        """The same transport at a lower resolution, to estimate the error from the difference; None if it has none."""
+        return None

@@ -14,6 +14,7 @@ from fits.stack_file import read_problem, stack_from_dict, stack_to_dict, write_
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.toml"))
 
 FULL = """
+about = { source = "a paper", remark = "kept as it is" }
 transport = "SingleScattering"
 objective = "cube_root"
 [[layers]]
@@ -74,6 +75,7 @@ def test_everything_in_a_file_arrives(tmp_path):
     assert problem.scale == Free(1.0, 0.8, 1.25, LogNormal(1.0, 0.05))
     assert isinstance(problem.transport, lj.SingleScattering)
     assert problem.objective == "cube_root"
+    assert problem.about == {"source": "a paper", "remark": "kept as it is"}
     assert problem.text == FULL
 
 
@@ -99,6 +101,14 @@ def test_file_round_trip(tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["again.toml", "problem.toml"]
 
 
+def test_options_of_a_transport(tmp_path):
+    problem = _read(tmp_path, "transport = { kind = 'AddingDoubling', nodes = 16, tolerance = 0.01 }\n" + BASE)
+    assert problem.transport == lj.AddingDoubling(nodes=16, tolerance=0.01)
+    path = tmp_path / "again.toml"
+    write_problem(path, problem.stack, transport=problem.transport)
+    assert read_problem(path).transport == problem.transport
+
+
 @pytest.mark.parametrize(
     "stack",
     [
@@ -119,6 +129,7 @@ def test_single_precision_numbers_stay_short():
     assert stack_to_dict(stack) == {"base": {"kind": "Lambertian", "albedo": 0.9}}
 
 
+BASE = "[base]\nkind = 'Lambertian'\nalbedo = 0.5\n"
 LAYER = "[[layers]]\nkind = 'Medium'\n"
 
 
@@ -131,6 +142,7 @@ LAYER = "[[layers]]\nkind = 'Medium'\n"
             LAYER + "thickness = 1\nalbdo = 0.5\n",
             r"layers\[0\] has an unknown key 'albdo' \(did you mean 'albedo'\?\); allowed: kind, th",
         ),
+        ("about = { year = 2022 }\n[base]\nkind = 'Lambertian'\nalbedo = 1\n", "about.year is 2022, must be a text"),
         ("bse = 3\n[base]\nkind = 'Lambertian'\nalbedo = 1\n", "the file has an unknown key 'bse'"),
         (LAYER + "thickness = 'thick'\n", r"layers\[0\].thickness is 'thick', must be a number in \[0, 10000\]"),
         (LAYER + "thickness = true\n", r"layers\[0\].thickness is True"),
@@ -199,6 +211,10 @@ LAYER = "[[layers]]\nkind = 'Medium'\n"
         (
             "transport = 'Singlescattering'\n[base]\nkind = 'Lambertian'\nalbedo = 0.5\n",
             "transport is 'Singlescattering' .did you mean 'SingleScattering'",
+        ),
+        (
+            "transport = { kind = 'AddingDoubling', nodes = 1.5 }\n" + BASE,
+            "transport.nodes is 1.5, must be a whole number",
         ),
         (
             "objective = 'best'\n[base]\nkind = 'Lambertian'\nalbedo = 0.5\n",

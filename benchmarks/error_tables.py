@@ -1,0 +1,217 @@
+"""The tables of the error-against-time benchmark."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+import layerjax as lj
+from benchmarks import accuracy
+from benchmarks.models import Model, Row, Size
+from benchmarks.results import environment_lines, figure, table
+from benchmarks.suite import FAMILIES
+from benchmarks.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
+
+VALUES = 10_000
+"""Values of one stack over which the preparation is spread."""
+
+TEXT = """\
+# Error against run time
+
+{environment}
+{stacks} stacks ({files}); what the pairs of directions are: `benchmarks/suite.py`.
+{untold}
+![Error against time per value, a panel a family](error-vs-time.png)
+
+{words}
+
+A value is a pair of directions with all its channels. *ns a value* is the median of up to {rounds} repeats, everything
+compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {transmitting} if light passes);
+*prepare* is what a stack costs once, and *all, ns* is both when {values:,} values of a stack are asked for. *compile*
+is the first call less a later one, of both; stacks that differ in numbers alone share it. *operations* counts those of
+the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are left out.
+
+The truth is {truth}. Its uncertainty is its distance from its next coarser resolution,
+and {check} must not find it further off than noise explains: the larger of the two is its limit.
+An error below it is printed as `<=` the limit: there the truth, not the model, is measured.
+
+## Summary
+
+Medians over the *stacks* of a family that the model carries (of all there are); *worst* and *albedo* are the largest of
+any of them. `<=`: the truth is the limit, for a median at half of the stacks or more.
+
+{summary}
+## Do the references agree?
+
+{solver} against {walk}, in both hemispheres: every value within {errors:g} standard errors
+or {tolerance:g} % of its scale (that of the worst error, above), whichever is larger.
+**{agree} of {stacks} stacks agree in every value.**{disagree}
+
+{agreement}
+## Relative L2 error, stack by stack
+
+{details}"""
+
+
+def markdown(
+    environment: Mapping[str, Any],
+    models: Sequence[Model],
+    judged: Sequence[Judged],
+    rows: Sequence[Row],
+    size: Size,
+    references: References,
+    untold: Sequence[str],
+) -> str:
+    """The whole results file."""
+    failing = [judgement for judgement in judged if not judgement.agrees]
+    return TEXT.format(
+        environment=environment_lines(environment),
+        stacks=len(judged),
+        files="`benchmarks/suite/FAMILY/NAME.toml`",
+        untold=f"Left out, for want of a truth: {', '.join(untold)}.\n" if untold else "",
+        words=accuracy.WORDS,
+        rounds=size.rounds,
+        batch=size.batch,
+        opaque=size.walked_opaque,
+        transmitting=size.walked_transmitting,
+        values=VALUES,
+        longest=size.longest,
+        truth=_name(references.truth),
+        check=_name(references.check),
+        solver=_name(references.solver),
+        walk=_name(references.walk),
+        summary=_summary(models, judged, rows),
+        errors=STANDARD_ERRORS,
+        tolerance=100 * TOLERANCE,
+        agree=len(judged) - len(failing),
+        disagree=" Those that do not:" if failing else "",
+        agreement=_agreement(failing) if failing else "",
+        details=_details(models, judged, rows),
+    )
+
+
+def amortised(row: Row) -> float:
+    """Nanoseconds a value, the preparation spread over `VALUES` of them."""
+    return row.nanoseconds_per_value + 1e9 * row.prepare_seconds / VALUES
+
+
+def steps(models: Sequence[Model]) -> list[tuple[str, str]]:
+    """Every model with every step of it, in the order of registration."""
+    return [(model.name, step) for model in models for step in model.steps]
+
+
+def floored(row: Row, judged: Mapping[str, Judged]) -> float:
+    """Relative L2 error, not below what the truth can tell; NaN where the model's values were not finite."""
+    return float("nan") if row.l2 is None else max(row.l2, judged[row.stack].limit)
+
+
+def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:
+    by_name = {judgement.stack: judgement for judgement in judged}
+    header = ("model", "stacks", "L2 error, %", "worst, %", "albedo, %", "ns a value", "prepare, ms", "all, ns",
+              "compile, s", "operations")  # fmt: skip
+    parts = []
+    for family, title in FAMILIES.items():
+        limits = [judgement.limit for judgement in judged if judgement.family == family]
+        whole = len(limits)
+        if not whole:
+            continue
+        lines = []
+        for model, step in steps(models):
+            found = [row for row in rows if (row.family, row.model, row.step) == (family, model, step)]
+            if not found:
+                lines.append([f"{model}, {step}", f"0/{whole}", *["-"] * 8])
+                continue
+            limited = "<= " if np.mean([row.truth_limits for row in found]) >= 0.5 else ""
+            lines.append(
+                [
+                    f"{model}, {step}",
+                    f"{len(found)}/{whole}",
+                    limited + _percent(_median(floored(row, by_name) for row in found)),
+                    _largest((row.worst, by_name[row.stack].worst_uncertainty) for row in found),
+                    _largest((row.albedo, by_name[row.stack].albedo_uncertainty) for row in found),
+                    figure(_median(row.nanoseconds_per_value for row in found)),
+                    figure(1e3 * _median(row.prepare_seconds for row in found)),
+                    figure(_median(map(amortised, found))),
+                    figure(_median(row.compile_seconds for row in found), digits=2),
+                    f"{np.median([row.operations for row in found]):,.0f}",
+                ]
+            )
+        parts.append(
+            f"### {title.capitalize()}\n\n{table(header, lines)}\n"
+            f"Limit of the truth: median {_percent(float(np.median(limits)))} %, at most {_percent(max(limits))} %.\n"
+        )
+    return "\n".join(parts)
+
+
+def _agreement(failing: Sequence[Judged]) -> str:
+    header = ("stack", "values", "beyond, same side", "beyond, other side", "largest, %", "truth to, %", "truth z rms")
+    return table(
+        header,
+        [
+            (
+                judgement.stack,
+                str(judgement.compared),
+                *map(str, judgement.failures),
+                _percent(judgement.worst),
+                _percent(judgement.limit),
+                f"{judgement.z_root_mean_square:.2f}",
+            )
+            for judgement in failing
+        ],
+    )
+
+
+def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:
+    by_name = {judgement.stack: judgement for judgement in judged}
+    cells = {(row.stack, row.model, row.step): row for row in rows}
+    columns = steps(models)
+    header = ("%", "limit of truth", "truth z rms", "agree", *(f"{_short(model)} {step}" for model, step in columns))
+    parts = []
+    for family, title in FAMILIES.items():
+        lines = []
+        for judgement in judged:
+            if judgement.family != family:
+                continue
+            line = [judgement.stack, _percent(judgement.limit), f"{judgement.z_root_mean_square:.2f}"]
+            line.append("yes" if judgement.agrees else "no")
+            for model, step in columns:
+                row = cells.get((judgement.stack, model, step))
+                if row is None:
+                    line.append("-")
+                elif row.l2 is None:
+                    line.append("not finite")
+                else:
+                    line.append(("<= " if row.truth_limits else "") + _percent(floored(row, by_name)))
+            lines.append(line)
+        if lines:
+            parts.append(f"### {title.capitalize()}, stack by stack\n\n{table(header, lines)}")
+    return "\n".join(parts)
+
+
+def _name(transport: lj.Transport) -> str:
+    """The transport as code."""
+    return f"`{transport!r}`"
+
+
+def _short(name: str) -> str:
+    """The initials of a model whose name has several words."""
+    words = name.replace("-", " ").split()
+    return "".join(word[0].upper() for word in words) if len(words) > 1 else name
+
+
+def _percent(value: float) -> str:
+    return figure(100.0 * value, digits=2) if np.isfinite(value) else "-"
+
+
+def _median(values: Iterable[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float("nan")
+
+
+def _largest(errors: Iterable[tuple[float | None, float]]) -> str:
+    """The largest of errors given with what the truth can tell of each, in percent."""
+    finite = [(max(error, limit), error <= limit) for error, limit in errors if error is not None]
+    if not finite:
+        return "-"
+    error, limited = max(finite)
+    return ("<= " if limited and error > 0 else "") + _percent(error)

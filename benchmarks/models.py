@@ -1,0 +1,226 @@
+"""The models that are set against each other, and the measurement of one of them on one stack."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+import layerjax as lj
+from benchmarks import operations, timing
+from benchmarks.accuracy import relative_l2, scale, worst
+from benchmarks.suite import Case
+from benchmarks.truth import Truth, albedos, key_of
+from layerjax.stack import simplify
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Model:
+    """A way of solving a stack, at one resolution or at several, from coarse to fine, each with a label."""
+
+    name: str
+    steps: Mapping[str, lj.Transport]
+
+
+MODELS = (
+    Model("single scattering", {"first order": lj.SingleScattering()}),
+    Model(
+        "adding-doubling",
+        {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (8, 16, 32, 48)},
+    ),
+    Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14, 16)}),
+)
+"""What is compared. A model joins by a line here."""
+
+
+STEP = 8.0
+"""A step of a model costs up to so many times the one before."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured.
+
+    batch: pairs that one timed evaluation has (those of the stack, repeated), `walked` for walks. rounds: repeats, of
+    which the median counts. longest: seconds; a model's steps end before one that would take longer, as far as the last
+    one tells.
+    """
+
+    batch: int = 2048
+    walked_opaque: int = 15
+    walked_transmitting: int = 20
+    rounds: int = 5
+    longest: float = 30.0
+
+    def walked(self, case: Case) -> int:
+        """Pairs that a walk is asked for."""
+        return self.walked_opaque if case.stack.base is not None else self.walked_transmitting
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a model gave at one resolution, and what it cost. indices: the pairs of the stack that it was asked for."""
+
+    model: str
+    step: str
+    indices: NDArray[np.intp]
+    values: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    nanoseconds_per_value: float
+    prepare_seconds: float
+    compile_seconds: float
+    operations: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Row:
+    """One model at one resolution on one stack. Errors are None where a value was not finite."""
+
+    stack: str
+    family: str
+    model: str
+    step: str
+    pairs: int
+    l2: float | None
+    worst: float | None
+    albedo: float | None
+    nanoseconds_per_value: float
+    prepare_seconds: float
+    compile_seconds: float
+    operations: int
+    truth_limits: bool
+
+
+def named(names: Sequence[str] | None) -> list[Model]:
+    """The registered models of these names, all if None. ValueError for a name that is none."""
+    known = {model.name: model for model in MODELS}
+    for name in names or ():
+        if name not in known:
+            raise ValueError(f"model {name!r} is not one of {', '.join(map(repr, known))}")
+    return [model for model in MODELS if names is None or model.name in names]
+
+
+class Programs:
+    """Compile times and operation counts, by structure: stacks that differ in numbers alone share their programs."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, tuple[float, int]] = {}
+
+    def of(self, key: Any, seconds: float, count: Callable[[], int]) -> tuple[float, int]:
+        """The figures of this structure; those given, if it is the first time that it is met."""
+        if key not in self._known:
+            self._known[key] = (seconds, count())
+        return self._known[key]
+
+
+def supports(transport: lj.Transport, stack: lj.Stack) -> bool:
+    """Whether the transport carries this stack."""
+    try:
+        transport.check(stack)
+    except ValueError:
+        return False
+    return True
+
+
+def run(case: Case, model: Model, size: Size, programs: Programs) -> list[Run]:
+    """Every step of a model on a stack, as far as time allows."""
+    runs: list[Run] = []
+    for label, transport in model.steps.items():
+        if not supports(transport, case.stack):
+            break
+        runs.append(_run(case, model.name, label, transport, size, programs))
+        if STEP * runs[-1].seconds > size.longest:
+            break
+    return runs
+
+
+def _run(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+    directions = case.directions
+    if transport.random:
+        indices = turns = directions.some(size.walked(case))
+        key = key_of(case.name, 2)
+    else:
+        indices = np.arange(len(directions.wi))
+        turns = np.arange(max(size.batch, len(indices))) % len(indices)
+        key = None
+    wi, wo = jnp.asarray(directions.wi[turns]), jnp.asarray(directions.wo[turns])
+
+    def prepare() -> lj.Prepared:
+        return jax.block_until_ready(lj.prepare(case.stack, transport))
+
+    def evaluate() -> jax.Array:
+        return jax.block_until_ready(lj.evaluate(prepared, wi, wo, key=key))
+
+    prepared, preparing, prepare_seconds = _first_and_again(prepare, size.rounds)
+    values, evaluating, seconds = _first_and_again(evaluate, size.rounds)
+    compiling = max(preparing - prepare_seconds, 0.0) + max(evaluating - seconds, 0.0)
+    compile_seconds, counted = programs.of(
+        _structure(case.stack, label, name, len(turns)), compiling, lambda: _operations(prepared, wi, wo, key)
+    )
+    return Run(
+        model=name,
+        step=label,
+        indices=indices,
+        values=np.asarray(values)[: len(indices)],
+        albedo=albedos(prepared, directions, transport, key),
+        nanoseconds_per_value=1e9 * seconds / len(turns),
+        prepare_seconds=prepare_seconds,
+        compile_seconds=compile_seconds,
+        operations=counted,
+        seconds=prepare_seconds + seconds,
+    )
+
+
+def row(case: Case, run: Run, truth: Truth, limit: float) -> Row:
+    """The errors of a run beside its times. limit: relative L2 that the truth can tell."""
+    directions, values = case.directions.take(run.indices), truth.values[run.indices]
+    error = run.values - values
+    l2 = _finite(relative_l2(error, values, directions.weights))
+    return Row(
+        stack=case.name,
+        family=case.family,
+        model=run.model,
+        step=run.step,
+        pairs=len(run.indices),
+        l2=l2,
+        worst=_finite(worst(error, scale(values, truth.albedo, directions))),
+        albedo=_finite(float(np.max(np.abs(run.albedo - truth.albedo)))),
+        nanoseconds_per_value=run.nanoseconds_per_value,
+        prepare_seconds=run.prepare_seconds,
+        compile_seconds=run.compile_seconds,
+        operations=run.operations,
+        truth_limits=l2 is not None and l2 <= limit,
+    )
+
+
+def _first_and_again(work: Callable[[], Result], rounds: int) -> tuple[Result, float, float]:
+    """What the work gives, seconds of its first run, and the median of later ones (one, if it takes a second)."""
+    found: list[Result] = []
+    first = timing.once(lambda: found.append(work()))
+    again = [timing.once(work)]
+    while len(again) < rounds and sum(again) < 1.0:
+        again.append(timing.once(work))
+    return found[0], first, float(np.median(again))
+
+
+def _operations(prepared: lj.Prepared, wi: jax.Array, wo: jax.Array, key: jax.Array | None) -> int:
+    arrays, others = eqx.partition(prepared, eqx.is_array)
+    return operations.total(lambda arrays: lj.evaluate(eqx.combine(arrays, others), wi, wo, key=key), arrays)
+
+
+def _structure(stack: lj.Stack, label: str, name: str, pairs: int) -> Any:
+    """What decides which program is compiled: everything but the numbers."""
+    leaves, tree = jax.tree.flatten(simplify(stack))
+    return name, label, pairs, str(tree), tuple(leaf if isinstance(leaf, float) else leaf.shape for leaf in leaves)
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

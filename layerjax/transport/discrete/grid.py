@@ -1,0 +1,189 @@
+"""Cosine nodes that suit every region of a stack at once.
+
+Between smooth interfaces s = n sin(theta) does not change (Snell), and neither does the measure of flux
+n^2 mu dmu = -s ds. One set of nodes in s therefore serves all regions, with one set of weights: refraction sends nodes
+to nodes, and a rough interface spreads light around them. Regions of other index end at other s, so the range of s is
+cut into panels at the indices that occur, 0 = n_0 < n_1 < n_2 < ..., where functions kink (the critical angles). Panel
+k has the coordinate x in (0, 1), the cosine in the region of index n_k over its largest value there:
+
+    s^2 = n_k^2 - x^2 (n_k^2 - n_{k-1}^2),   n^2 mu dmu = (n_k^2 - n_{k-1}^2) x dx.
+
+A stack without interfaces has one panel, on which x is the cosine itself: Gauss nodes on (0, 1).
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import safe_sqrt
+from layerjax.quadrature import gauss_legendre
+
+COSINE_FLOOR = 1e-7
+"""Stands for the cosines of a panel without extent (two equal indices), whose nodes have no weight."""
+
+TABLE_DENSITY = 2
+"""Points of the table of a panel for each of its nodes."""
+
+
+class Region(eqx.Module):
+    """The nodes as one region sees them, each (panels * nodes,).
+
+    cosine and sine of theta there (stand-ins where no such direction exists), the weight of the measure n^2 mu dmu (0
+    where no such direction exists), and that of dmu.
+    """
+
+    ior: Array
+    cosine: Array
+    sine: Array
+    weight: Array
+    solid: Array
+
+
+class Grid(eqx.Module):
+    """Nodes of all panels in s, and the regions from top to bottom."""
+
+    edges: Array
+    squared: Array
+    regions: tuple[Region, ...]
+    nodes: int = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number of nodes of all panels."""
+        return self.squared.shape[0]
+
+
+def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any) -> Grid:
+    """Grid for regions of these refractive indices.
+
+    Args:
+        indices: index of each region, from top to bottom, relative to the surroundings.
+        ranks: the place of each region's index among the distinct ones, if that is known; None: found by sorting.
+        nodes: nodes a panel.
+    """
+    squares = jnp.stack([jnp.asarray(n, dtype) ** 2 for n in indices])
+    if ranks is None:
+        edges = jnp.sort(squares)
+    else:
+        edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
+    x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
+    width = jnp.diff(edges, prepend=0.0)[:, None]
+    x2 = (x * x)[None]
+    squared = edges[:, None] - x2 * width
+    weight = (x * w)[None] * width
+    regions = []
+    for n2 in squares:
+        exists = (edges <= n2)[:, None] & (width > 0)
+        cosine2 = jnp.where(exists, (n2 - edges[:, None] + x2 * width) / n2, 0.25)
+        cosine = jnp.sqrt(jnp.maximum(cosine2, COSINE_FLOOR**2))
+        sine = jnp.sqrt(jnp.where(exists, squared / n2, 0.75))
+        here = jnp.where(exists, weight, 0.0)
+        flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel())
+        regions.append(Region(jnp.sqrt(n2), *flat))
+    return Grid(edges, squared.ravel(), tuple(regions), nodes)
+
+
+def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> Array:
+    """Interpolation weights of directions on the nodes, shape ``cosine.shape + (grid.size,)``: they sum to 1.
+
+    Polynomials of the panel's coordinate. Summed against a distribution of directions they *deposit* it on the nodes,
+    with its total and its moments kept.
+
+    Args:
+        ior: index of the region in which the directions are.
+        cosine: their |cos theta|.
+        sine2: their sin(theta)^2.
+    """
+    low, high = _bounds(grid)
+    panel = _panel(grid, ior * ior * sine2)
+    parts = []
+    for k in range(grid.edges.shape[0]):
+        inside = (panel == k) & (high[k] > low[k])
+        x2, _ = _coordinate(ior, cosine, sine2, low[k], high[k])
+        x = safe_sqrt(jnp.where(inside, x2, 0.25))
+        parts.append(jnp.where(inside[..., None], lagrange(x, grid.nodes), 0.0))
+    return jnp.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
+
+
+def _bounds(grid: Grid) -> tuple[Array, Array]:
+    return jnp.concatenate([jnp.zeros(1, grid.edges.dtype), grid.edges[:-1]]), grid.edges
+
+
+def _panel(grid: Grid, squared: Array) -> Array:
+    inner = grid.edges[:-1]
+    return jnp.sum(squared[..., None] >= inner, axis=-1)
+
+
+def _coordinate(ior: Array, cosine: Array, sine2: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """x^2 and 1 - x^2, each from what it vanishes with."""
+    n2 = ior * ior
+    width = jnp.where(high > low, high - low, 1.0)
+    x2 = ((high - n2) + n2 * cosine * cosine) / width
+    return jnp.clip(x2, 0.0, 1.0), jnp.clip((n2 * sine2 - low) / width, 0.0, 1.0)
+
+
+def lagrange(x: Array, nodes: int) -> Array:
+    """Lagrange polynomials of the Gauss nodes on [0, 1] at x, along a new last axis."""
+    basis = legendre(x, nodes)
+    return basis @ jnp.asarray(_projection(nodes), basis.dtype)
+
+
+def legendre(x: Array, count: int) -> Array:
+    """Legendre polynomials P_0 ... P_(count-1) shifted to [0, 1], along a new last axis (a loop: XLA would unroll)."""
+    y = 2.0 * x - 1.0
+
+    def step(pair: tuple[Array, Array], factors: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
+        before, last = pair
+        rise, fall = factors
+        return (last, rise * y * last - fall * before), before
+
+    degree = np.arange(count)
+    factors = tuple(jnp.asarray(f, y.dtype) for f in ((2 * degree + 3) / (degree + 2), (degree + 1) / (degree + 2)))
+    _, polynomials = jax.lax.scan(step, (jnp.ones_like(y), y), factors)
+    return jnp.moveaxis(polynomials, 0, -1)
+
+
+@functools.cache
+def _projection(nodes: int) -> np.ndarray:
+    """Values at the nodes to Legendre coefficients, (degree, node): exact, by discrete orthogonality."""
+    x, w = gauss_legendre(nodes)
+    polynomials = np.polynomial.legendre.legvander(2.0 * x - 1.0, nodes - 1)
+    return ((2.0 * np.arange(nodes) + 1.0)[:, None] * polynomials.T) * w
+
+
+@functools.cache
+def table_matrix(nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points x of a panel's table, (points,), and the matrix from values at the nodes to values there.
+
+    The points are uniform in t, x = (1 + cos(pi t)) / 2: crowded at both ends like the nodes themselves.
+    """
+    points = TABLE_DENSITY * nodes
+    x = 0.5 * (1.0 + np.cos(np.pi * np.arange(points) / (points - 1)))
+    vander = np.polynomial.legendre.legvander(2.0 * x - 1.0, nodes - 1)
+    return x, vander @ _projection(nodes)
+
+
+def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, tuple[Array, ...]]:
+    """First index and the four weights of the cubic that interpolates a table (panel by panel) at directions."""
+    points = TABLE_DENSITY * grid.nodes
+    low, high = _bounds(grid)
+    panel = _panel(grid, ior * ior * sine2)
+    x2, rest2 = _coordinate(ior, cosine, sine2, low[panel], high[panel])
+    x = safe_sqrt(x2)
+    # t by a half-angle tangent: steep at neither end, as arccos would be
+    t = (2.0 / jnp.pi) * jnp.arctan2(safe_sqrt(rest2 / (1.0 + x)), safe_sqrt(x))
+    place = t * (points - 1)
+    first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)) - 1.0, 0.0, points - 4.0)
+    return first.astype(jnp.int32) + panel * points, cubic(place - first)
+
+
+def cubic(place: Array) -> tuple[Array, Array, Array, Array]:
+    """Weights of values at 0, 1, 2, 3 in the cubic through them."""
+    a, b, c, d = place, place - 1.0, place - 2.0, place - 3.0
+    return b * c * d * (-1 / 6), a * c * d * 0.5, a * b * d * -0.5, a * b * c * (1 / 6)

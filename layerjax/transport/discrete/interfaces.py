@@ -1,0 +1,186 @@
+"""Rough interfaces and bases on the grid.
+
+What a face reflects is its BRDF at the nodes, scaled to the energy that its visible facets reflect. What it refracts
+is found facet by facet: those visible from a node are integrated over by quadrature, and what each passes is put
+(*deposited*) on the nodes around (see `grid.spread`). The energy is that of the quadrature at any roughness.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._numerics import safe_div, safe_sqrt
+from layerjax.channels import per_channel, pick
+from layerjax.directions import Vector, dot, normalize, reflect, refract
+from layerjax.distributions import ggx_masking
+from layerjax.quadrature import gauss_legendre
+from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.transport.discrete.grid import Grid, Region, spread
+from layerjax.transport.discrete.operators import Layer, Parts
+from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straight_on
+
+Microfacets = Literal["single", "multiple"]
+
+POLAR_FACETS = 16
+"""Quadrature of the visible normals: points from the pole of the cap to its rim."""
+
+AZIMUTH_FACETS = 16
+"""The same, points over half a turn (the other half is its mirror image)."""
+
+
+def interface_layer(
+    grid: Grid, above: Region, below: Region, alpha: Array, modes: int, microfacets: Microfacets, *, enters: bool = True
+) -> Layer:
+    """Rough dielectric interface between two regions, as Fourier modes (Walter 2007).
+
+    Light that enters the stack is deposited on the inner nodes; light that leaves is *gathered* from them (the adjoint,
+    by reciprocity), which gives radiance at the outer nodes as exact as it is smooth inside. `enters`: whether light
+    from above counts as entering.
+    """
+    near, far = (above, below) if enters else (below, above)
+    reflected, refracted, lost_outside = _shares(near, far, alpha)
+    through = _deposit(grid, *refracted, far, near, modes)
+    outer = _face(near, jnp.sum(reflected, axis=-1), far.ior / near.ior, alpha, modes)
+    reflected, _, lost_inside = _shares(far, near, alpha)
+    inner = _face(far, jnp.sum(reflected, axis=-1), near.ior / far.ior, alpha, modes)
+    operators = [outer, through, _adjoint(through, near, far), inner]
+    if microfacets == "multiple":
+        operators = _returned(operators, (lost_outside, lost_inside), (near.weight, far.weight))
+    reflect_near, into, out, reflect_far = (Parts(operator[None]) for operator in operators)
+    if enters:
+        return Layer(reflect_near, reflect_far, into, out)
+    return Layer(reflect_far, reflect_near, out, into)
+
+
+def base_layer(region: Region, base: Surface, modes: int, microfacets: Microfacets) -> Layer:
+    """An opaque base under a region, as Fourier modes."""
+    weight = _weight(region)
+    kernels = modes_at_nodes(base.evaluate, region, region, modes)
+    if isinstance(base, Conductor):
+        return Layer(Parts(_conductor(region, base, kernels, microfacets)))
+    return Layer(Parts(jnp.stack(kernels) * weight[:, None]))
+
+
+def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Array:
+    normals, weight, wi = _visible_normals(region, base.alpha)
+    cosine = dot(wi, normals)
+    seen = weight * _masking(reflect(wi, normals), base.alpha)
+    ior, k = per_channel(base.ior), per_channel(base.k)
+    operators = []
+    for c, kernel in enumerate(kernels):
+        energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
+        operator = _scaled(region, kernel, energy)
+        if microfacets == "multiple":
+            operator = operator.at[0].add(_coloured_return(energy, jnp.sum(seen, axis=-1), region.weight))
+        operators.append(operator)
+    return jnp.stack(operators)
+
+
+def _face(region: Region, energy: Array, ior: Array, alpha: Array, modes: int) -> Array:
+    """Reflection at an interface, seen from one side."""
+    (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, alpha)], region, region, modes)
+    return _scaled(region, kernel, energy)
+
+
+def _scaled(region: Region, kernel: Array, energy: Array) -> Array:
+    """Flux operator of a face from its BRDF at the nodes and its albedo, which decides."""
+    weight = _weight(region)
+    scale, missing = balance([(kernel[0], lambda d: d)], weight, jnp.where(region.weight > 0, energy, 0.0))
+    return weight[:, None] * (scale[:, None] * kernel * scale + straight_on(missing, weight))
+
+
+def _weight(region: Region) -> Array:
+    """Weight of the measure cos dw over nodes and azimuth, in the region's own solid angle."""
+    return 2.0 * jnp.pi * region.solid * region.cosine
+
+
+def _adjoint(flux: Array, near: Region, far: Region) -> Array:
+    """The operator for the opposite way, by reciprocity: kernels F / W are transposes of each other."""
+    kernel = safe_div(flux, jnp.broadcast_to(far.weight[:, None], flux.shape))
+    return near.weight[:, None] * jnp.swapaxes(kernel, -1, -2)
+
+
+def _shares(near: Region, far: Region, alpha: Array) -> tuple[Array, tuple[Vector, Array], Array]:
+    """Of light from every near node, by facets: the share reflected; where to and how much is refracted; the loss."""
+    ratio = far.ior / near.ior
+    normals, weight, wi = _visible_normals(near, alpha)
+    level = fresnel.dielectric(dot(wi, normals), ratio)
+    reflected = weight * level * _masking(reflect(wi, normals), alpha)
+    down, exists = refract(wi, normals, ratio)
+    wo: Vector = (down[0], down[1], -down[2])  # z counted on the far side
+    refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, alpha), 0.0)
+    lost = jnp.maximum(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
+    return reflected, (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
+
+
+def _visible_normals(region: Region, alpha: Array) -> tuple[Vector, Array, Vector]:
+    """Normals visible from every node, (nodes, points), their weights, and the nodes' wi: a spherical cap, stretched.
+
+    The quadrature of Dupuy & Benyoub 2023 in the cap's polar angle, dense where facets are seen at a glance.
+    """
+    alpha = jnp.asarray(alpha, region.cosine.dtype)
+    wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
+    v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
+    s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(POLAR_FACETS))
+    rim = jnp.arctan2(safe_sqrt(v[0] * v[0]), -v[2])  # cosine -v_z
+    polar = (rim * s)[:, :, None]
+    phi = jnp.asarray((np.arange(AZIMUTH_FACETS) + 0.5) * np.pi / AZIMUTH_FACETS, alpha.dtype)
+    weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / AZIMUTH_FACETS)
+    sine, cosine = jnp.sin(polar), jnp.cos(polar)
+    x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
+    z = jnp.maximum(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
+    nodes = region.cosine.shape[0]
+    flat = tuple(jnp.reshape(part, (nodes, -1)) for part in (alpha * x, alpha * y, z))
+    return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi
+
+
+def _masking(wo: Vector, alpha: Array) -> Array:
+    """Smith masking of the outgoing direction, 0 below the horizon."""
+    above = wo[2] > 0
+    return jnp.where(above, ggx_masking((wo[0], wo[1], jnp.where(above, wo[2], 0.5)), alpha), 0.0)
+
+
+def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int) -> Array:
+    """Flux operator (modes, out, in) of light that goes from node j to the directions wo_jq, a share of it each.
+
+    Odd modes vanish at the pole like the sine: there the quotient by the sine is what polynomials interpolate.
+    """
+    planar = safe_sqrt(wo[0] * wo[0] + wo[1] * wo[1])
+    turn = jnp.arctan2(wo[1], jnp.where(planar > 0, wo[0], 1.0))
+    stencil = spread(grid, far.ior, jnp.abs(wo[2]), jnp.minimum(planar * planar, 1.0))
+    share = jnp.where(near.weight[:, None] > 0, share, 0.0)
+    angle = turn[..., None] * np.arange(modes)
+    odd = np.arange(modes) % 2 == 1
+    spun = jnp.cos(angle) * jnp.where(odd, (share * planar)[..., None], share[..., None])
+    flux = jnp.einsum("jqi,jqm->mij", stencil, spun)
+    flux = flux / jnp.where(odd[:, None], far.sine, 1.0)[:, :, None]
+    return jnp.where(far.weight[:, None] > 0, flux, 0.0)
+
+
+def _returned(operators: Sequence[Array], lost: tuple[Array, Array], weights: tuple[Array, Array]) -> list[Array]:
+    """The four operators with the energy lost to masking given back (after Kulla & Conty 2017), both sides at a time.
+
+    What is lost, l, comes back diffusely as l l' / <l>, which is reciprocal and conserves energy; the same l decides
+    how much of it crosses.
+    """
+    mean = jnp.sum(weights[0] * lost[0]) + jnp.sum(weights[1] * lost[1])
+    given = []
+    for operator, (out, into) in zip(operators, ((0, 0), (1, 0), (0, 1), (1, 1)), strict=True):
+        given.append(operator.at[0].add(safe_div(jnp.outer(weights[out] * lost[out], lost[into]), mean)))
+    return given
+
+
+def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:
+    """What a conductor returns of the light lost to masking: it loses its Fresnel share at every further facet."""
+    lost = jnp.where(weight > 0, jnp.maximum(1.0 - lossless, 0.0), 0.0)
+    total = jnp.sum(weight * lost)
+    # mean reflectance of a facet, and mean share that escapes at each try (Kulla & Conty 2017)
+    level = safe_div(jnp.sum(weight * energy), jnp.sum(weight * lossless))
+    escapes = 1.0 - safe_div(total, jnp.sum(weight))
+    kept = level * level * escapes / (1.0 - level * (1.0 - escapes))
+    return kept * safe_div(jnp.outer(weight * lost, lost), total)

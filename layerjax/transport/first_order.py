@@ -1,0 +1,145 @@
+"""Paths with exactly one event, in closed form: one collision, reflection or refraction, and straight lines else.
+
+In front of the first interface (or of the base) that is single scattering in the media there, and the face that lies
+behind them; seen from below likewise. Through the stack it is single scattering where no interface is, and refraction
+at the interface where there is one only: through two, every path has two events.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import horizon, one_minus_exp
+from layerjax._parameters import Parameter
+from layerjax.channels import Channels, count, pick
+from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.distributions import ggx_density, ggx_masking, ggx_sample, radii
+from layerjax.phase import SGGX
+from layerjax.quadrature import Nodes, flake_rule
+from layerjax.stack import Interface, Medium, Stack, optical_depths
+from layerjax.surfaces import Surface
+from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.transport._transport import Side
+from layerjax.transport.single_scattering import Media, SingleScattering
+
+
+class Face(Surface):
+    """Reflection at an interface, seen from its upper side. ior: index below over index above."""
+
+    ior: Parameter
+    alpha: Parameter
+
+    def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
+        return (interface_reflection(wi, wo, self.ior, self.alpha),)
+
+    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        return reflect(wi, ggx_sample(wi, self.alpha, u1, u2))
+
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        h, _ = half_vector(wi, wo, same_side=True)
+        return ggx_density(h, self.alpha) * ggx_masking(wi, self.alpha) / (4.0 * wi[2])
+
+    def rule(self, wi: Vector, nodes: int) -> Nodes:
+        upper, _ = flake_rule(wi, *radii("surface", self.alpha), None, nodes)
+        return upper
+
+
+class FirstOrder(eqx.Module):
+    """What a path of one event can meet: from above, from below (mirrored: below is up), and on the way through.
+
+    Without interfaces `upper` is the whole stack, lit from either side.
+    """
+
+    upper: Media
+    lower: Media | None
+    crossing: Face | None
+    opaque: bool = eqx.field(static=True)
+    layered: bool = eqx.field(static=True)
+    """Whether there are interfaces."""
+
+
+def first_order(stack: Stack) -> FirstOrder:
+    """Sort out the layers; `stack` is simplified."""
+    interfaces = [k for k, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
+    if not interfaces:
+        return FirstOrder(Media(_media(stack.layers), stack.base), None, None, stack.base is not None, False)
+    first, last = interfaces[0], interfaces[-1]
+    face = stack.layers[first]
+    assert isinstance(face, Interface)
+    upper = Media(_media(stack.layers[:first]), Face(face.ior, face.alpha))
+    if stack.base is not None:
+        return FirstOrder(upper, None, None, True, True)
+    above: Any = 1.0
+    if len(interfaces) > 1:
+        before = stack.layers[interfaces[-2]]
+        assert isinstance(before, Interface)
+        above = before.ior
+    bottom = stack.layers[last]
+    assert isinstance(bottom, Interface)
+    lower = Media(
+        tuple(map(_mirrored, reversed(_media(stack.layers[last + 1 :])))), Face(above / bottom.ior, bottom.alpha)
+    )
+    crossing = Face(face.ior, face.alpha) if first == last else None
+    return FirstOrder(upper, lower, crossing, False, True)
+
+
+def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Channels:
+    """BSDF of the paths with one event."""
+    single = SingleScattering()
+    if state.opaque or not state.layered:
+        return single.evaluate(state.upper, wi, wo, side)
+    parts: list[Channels] = []
+    if side != "transmission":
+        parts.append(single.evaluate(state.upper, wi, wo, "reflection"))
+    if side == "all" and state.lower is not None:
+        parts.append(single.evaluate(state.lower, mirror(wi), mirror(wo), "reflection"))
+    if side != "reflection" and state.crossing is not None:
+        parts.append(_refracted(state, state.crossing, wi, wo))
+    zero = jnp.zeros_like(wi[2] * wo[2])
+    return tuple(sum((pick(part, c) for part in parts), zero) for c in range(max(1, count(*parts))))
+
+
+def caught(state: FirstOrder, w: Vector) -> Channels | None:
+    """Share of light along w that meets an event at all, per channel; None: all of it."""
+    if state.layered or state.opaque:
+        return None
+    edge = horizon(w[2].dtype)
+    depths = optical_depths(state.upper.media, (w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)))
+    zero = jnp.zeros_like(w[2])
+    return tuple(one_minus_exp(sum((pick(depth, c) for depth in depths), zero)) for c in range(max(1, count(*depths))))
+
+
+def mirror(w: Vector) -> Vector:
+    """The image below of a direction above, and the other way round."""
+    return (w[0], w[1], -w[2])
+
+
+def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channels:
+    assert state.lower is not None
+    downward = wi[2] > 0
+    over, under = select(downward, wi, wo), select(downward, wo, wi)
+    edge = horizon(wi[2].dtype)
+    valid = (over[2] > edge) & (under[2] < -edge)
+    over = (over[0], over[1], jnp.where(valid, over[2], 0.5))
+    under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
+    value = interface_transmission(over, under, face.ior, face.alpha)
+    value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
+    depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, mirror(under))
+    through = []
+    for c in range(max(1, count(*depths))):
+        total = sum((pick(depth, c) for depth in depths), jnp.zeros_like(value))
+        through.append(jnp.where(valid, value * jnp.exp(-total), 0.0))
+    return tuple(through)
+
+
+def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:
+    return tuple(layer for layer in layers if isinstance(layer, Medium))
+
+
+def _mirrored(medium: Medium) -> Medium:
+    if isinstance(medium.phase, SGGX) and medium.phase.axis is not None:
+        flip = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(medium.phase.axis).dtype)
+        return eqx.tree_at(lambda m: m.phase.axis, medium, medium.phase.axis * flip)
+    return medium

@@ -1,0 +1,73 @@
+"""Directions to draw for any stack: the lobes of paths with one event, and cosine lobes for all that is smooth."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax.directions import Vector, select
+from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.surfaces.microfacet import (
+    interface_pdf,
+    interface_reflection,
+    interface_sample,
+    interface_transmission,
+)
+from layerjax.transport.first_order import Face, FirstOrder, mirror
+from layerjax.transport.single_scattering import SingleScattering
+
+BELOW_ONE = 1.0 - 1e-6
+
+
+def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    """Outgoing directions from three uniform numbers each."""
+    u, u1, u2 = uniforms
+    lobes, facets, near, _ = _shares(state)
+    above = wi[2] > 0
+    up = select(above, wi, mirror(wi))
+    x, y, z = sample_cosine(u1, u2)
+    wo = select(u < lobes + facets + near, (x, y, z), (x, y, -z))
+    if state.crossing is not None:
+        again = jnp.clip((u - lobes) / facets, 0.0, BELOW_ONE)
+        refracted, _ = interface_sample(up, _ratio(state.crossing, above), state.crossing.alpha, u1, u2, again)
+        wo = select(u < lobes + facets, refracted, wo)
+    wo = select(above, wo, mirror(wo))
+    inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
+    single = SingleScattering()
+    lobe = single.sample(state.upper, wi, inner)
+    if state.lower is not None:
+        lobe = select(above, lobe, mirror(single.sample(state.lower, mirror(wi), inner)))
+    return select(u < lobes, lobe, wo)
+
+
+def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
+    """Density of `propose` in solid angle, 1/sr."""
+    lobes, facets, near, far = _shares(state)
+    above = wi[2] > 0
+    same = wi[2] * wo[2] > 0
+    single = SingleScattering()
+    lobe = single.pdf(state.upper, wi, wo)
+    if state.lower is not None:
+        lobe = jnp.where(above, lobe, single.pdf(state.lower, mirror(wi), mirror(wo)))
+    density = lobes * lobe + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
+    if state.crossing is not None:
+        up, out = select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
+        ior, alpha = _ratio(state.crossing, above), state.crossing.alpha
+        up, out = _upright(up), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
+        reflected = interface_reflection(up, _upright(out), ior, alpha)
+        passed = interface_transmission(up, mirror(_upright(mirror(out))), ior, alpha)
+        density = density + facets * interface_pdf(jnp.where(same, reflected, passed), out, alpha)
+    return density
+
+
+def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
+    """Of the lobes of media and faces, of a single interface, and of the cosine lobes on wi's side and the other."""
+    if state.opaque:
+        return 0.6, 0.0, 0.4, 0.0
+    return (0.5, 0.0, 0.25, 0.25) if state.crossing is None else (0.3, 0.4, 0.15, 0.15)
+
+
+def _ratio(face: Face, above: Array) -> Array:
+    return jnp.where(above, face.ior, 1.0 / face.ior)
+
+
+def _upright(w: Vector) -> Vector:
+    return (w[0], w[1], jnp.where(w[2] > 0, w[2], 0.5))

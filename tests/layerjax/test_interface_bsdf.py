@@ -1,0 +1,138 @@
+"""The rough dielectric interface: energy against sampled facets, reciprocity, and finite values over the box."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax.directions import split
+from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
+
+DRAWS = 400_000
+
+
+def sampled_energies(wi, ior, alpha, seed):
+    """Reflected and transmitted energy, with standard errors, from facets drawn by slope (Walter 2007, Eq. 35, 41)."""
+    random = np.random.default_rng(seed)
+    u1, phi = random.random(DRAWS), 2 * np.pi * random.random(DRAWS)
+    tangent = alpha * np.sqrt(u1 / (1 - u1))
+    mz = 1 / np.sqrt(1 + tangent**2)
+    m = np.stack([mz * tangent * np.cos(phi), mz * tangent * np.sin(phi), mz], axis=-1)
+    cosine = m @ wi
+    facing = cosine > 0
+    cosine = np.where(facing, cosine, 0.5)
+
+    def masking(z):
+        return 2 / (1 + np.sqrt(1 + alpha**2 * (1 - z**2) / z**2))
+
+    root = 1 - (1 - cosine**2) / ior**2
+    transmits = root > 0
+    refracted = np.sqrt(np.maximum(root, 0))
+    s = (cosine - ior * refracted) / (cosine + ior * refracted)
+    p = (ior * cosine - refracted) / (ior * cosine + refracted)
+    fresnel = np.where(transmits, 0.5 * (s**2 + p**2), 1.0)
+    weight = facing * cosine * masking(wi[2]) / (wi[2] * mz)
+    up = (2 * cosine[:, None] * m - wi)[:, 2]
+    down = ((cosine / ior - refracted)[:, None] * m - wi / ior)[:, 2]
+    reflected = np.where(up > 0, weight * fresnel * masking(np.where(up > 0, up, 0.5)), 0)
+    passed = np.where(down < 0, weight * (1 - fresnel) * masking(np.where(down < 0, down, 0.5)), 0)
+    return [(np.mean(x), np.std(x) / np.sqrt(DRAWS)) for x in (reflected, passed)]
+
+
+@jax.jit
+def integrated_energies(wi, ior, alpha):
+    """The same by a fine product rule over both hemispheres, in cos(theta) and azimuth."""
+    x, w = np.polynomial.legendre.leggauss(300)
+    cosine, weight = 0.5 * (x + 1), 0.5 * w
+    phi = 2 * np.pi * (np.arange(600) + 0.5) / 600
+    z = jnp.asarray(cosine)[:, None] + 0 * phi
+    sine = jnp.sqrt(1 - z * z)
+    above = (sine * np.cos(phi), sine * np.sin(phi), z)
+    below = (above[0], above[1], -z)
+    total = weight[:, None] * z * (2 * np.pi / 600)
+    wi = split(wi)
+    return (
+        jnp.sum(interface_reflection(wi, above, ior, alpha) * total),
+        jnp.sum(interface_transmission(wi, below, ior, alpha) * total),
+    )
+
+
+@pytest.mark.parametrize("ior", [1.5, 1 / 1.5, 4.0, 0.25, 1.1])
+def test_energies(ior):
+    for theta, alpha in itertools.product((0.0, 0.6, 1.2), (0.3, 0.8)):
+        wi = lj.direction(theta, 0.4)
+        found = integrated_energies(wi, jnp.asarray(ior), jnp.asarray(alpha))
+        for value, (mean, error) in zip(found, sampled_energies(np.asarray(wi), ior, alpha, 5), strict=True):
+            assert abs(value - mean) < 4 * error + 2e-4
+
+
+def pairs(count, seed, dtype=np.float64):
+    random = np.random.default_rng(seed)
+
+    def hemisphere():
+        z = random.choice([1.0, 1e-6, 1e-3, 0.3], count) * random.random(count)
+        sine, phi = np.sqrt(1 - z * z), random.choice([0.0, 1.0], count) * random.uniform(-np.pi, np.pi, count)
+        return np.stack([sine * np.cos(phi), sine * np.sin(phi), z])
+
+    wi, wo = hemisphere(), hemisphere()
+    wo[:, ::7] = wi[:, ::7] * np.array([[-1], [-1], [1]])
+    wo[:, 1::7] = wi[:, 1::7]
+    wi[:, 2::31] = np.array([[0], [0], [1]])
+    wo[:, 2::62] = np.array([[0], [0], [1]])
+    ior = random.choice([0.25, 0.67, 1 - 1e-6, 1.0, 1 + 1e-9, 1.001, 1.5, 4.0], count)
+    alpha = 10.0 ** random.choice([-4, -2.5, -1, 0], count)
+    return tuple(wi.astype(dtype)), tuple(wo.astype(dtype)), ior.astype(dtype), alpha.astype(dtype)
+
+
+def test_reciprocity():
+    wi, wo, ior, alpha = pairs(20_000, 3)
+    forth, back = interface_reflection(wi, wo, ior, alpha), interface_reflection(wo, wi, ior, alpha)
+    np.testing.assert_allclose(forth, back, rtol=1e-12)
+    below = (wo[0], wo[1], -wo[2])
+    turned = (wi[0], wi[1], -wi[2])
+    keep = np.abs(ior - 1) > 1e-3  # nearer to 1 the rounding of 1 / ior itself moves the lobe
+    forth = interface_transmission(wi, below, ior, alpha) / ior
+    back = interface_transmission(wo, turned, 1 / ior, alpha) * ior
+    rtol = 1e-14 / (np.abs(ior - 1) + 1e-3) / alpha**2 + 1e-9
+    np.testing.assert_array_less((np.abs(forth - back) - rtol * forth)[keep], 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_values_and_gradients_are_finite(dtype):
+    wi, wo, ior, alpha = pairs(20_000, 8, dtype)
+    below = (wo[0], wo[1], -wo[2])
+    for function, towards in ((interface_reflection, wo), (interface_transmission, below)):
+        one = jax.value_and_grad(function, argnums=(0, 1, 2, 3))
+        for leaf in jax.tree.leaves(jax.jit(jax.vmap(one))(wi, towards, ior, alpha)):
+            assert np.isfinite(leaf).all()
+        assert (function(wi, towards, ior, alpha) >= 0).all()
+
+
+def test_an_interface_that_is_not_there():
+    wi, wo, _, alpha = pairs(1000, 2)
+    one = jnp.ones(1000)
+    assert not interface_reflection(wi, wo, one, alpha).any()
+    assert not interface_transmission(wi, (wo[0], wo[1], -wo[2]), one, alpha).any()
+
+
+@pytest.mark.parametrize("ior", [1.5, 1 / 1.5])
+def test_samples_follow_their_density(ior):
+    alpha = jnp.asarray(0.5)
+    wi = split(jnp.broadcast_to(lj.direction(0.9, 0.3), (DRAWS, 3)))
+    u = jax.random.uniform(jax.random.key(2), (3, DRAWS))
+    wo, leaves = interface_sample(wi, jnp.asarray(ior), alpha, *u)
+    above = wo[2] > 0
+    upper = (wo[0], wo[1], jnp.where(above, wo[2], 0.5))
+    lower = (wo[0], wo[1], jnp.where(above, -0.5, wo[2]))
+    f = jnp.where(
+        above, interface_reflection(wi, upper, ior, alpha), interface_transmission(wi, lower, jnp.asarray(ior), alpha)
+    )
+    density = interface_pdf(f, wo, alpha)
+    weight = jnp.where(leaves & (density > 0), f * jnp.abs(wo[2]) / jnp.where(density > 0, density, 1.0), 0.0)
+    expected = integrated_energies(lj.direction(0.9, 0.3), jnp.asarray(ior), alpha)
+    for side, value in zip((above, ~above), expected, strict=True):
+        x = jnp.where(side, weight, 0.0)
+        assert abs(x.mean() - value) < 4.5 * x.std() / np.sqrt(DRAWS) + 1e-4
