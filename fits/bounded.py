@@ -18,13 +18,14 @@ TOLERANCE = 1e-12
 MOST_STEPS = 500
 
 
+def cost(model: Model, s: Any) -> Any:
+    """Half the sum of squared residuals at `s` in the unit box."""
+    return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(s)))
+
+
 def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:
-    """Half the sum of squared residuals at `s` in the unit box, and its gradient."""
-
-    def cost(at: Any) -> Any:
-        return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(at)))
-
-    return jax.value_and_grad(cost)(s)
+    """That and its gradient."""
+    return jax.value_and_grad(cost, argnums=1)(model, s)
 
 
 def minimise_in_box(problem: Problem, start: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, int, bool]:
@@ -46,5 +47,5 @@ def minimise_in_box(problem: Problem, start: NDArray[np.float64]) -> tuple[NDArr
     )
     inside = jnp.clip(jnp.asarray(start), 0.0, 1.0)
     point, info = solver.run(inside, bounds=(jnp.zeros_like(inside), jnp.ones_like(inside)))
-    cost = float(info.fun_val)
-    return np.asarray(point, float), cost, int(info.iter_num), bool(info.success) and bool(np.isfinite(cost))
+    lowest = float(info.fun_val)
+    return np.asarray(point, float), lowest, int(info.iter_num), bool(info.success) and bool(np.isfinite(lowest))

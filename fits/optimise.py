@@ -204,7 +204,7 @@ def _solve(model: Model, start: Array) -> tuple[Array, Array, Array, Array]:
     solver = BoxLevenbergMarquardt(atol=PROMISE if likelihood else 0.0)
     options = {"logarithmic": (2,)} if varying else {}
 
-    def stage(unit: Array, fixed_sigma: Array) -> tuple[Array, tuple[Array, Array]]:
+    def stage(unit: Array, fixed_sigma: Array) -> tuple[Array, tuple[Array, Array, Array]]:
         solution: Any = optx.least_squares(
             lambda s, fixed: model.residuals(model.box.from_unit(s), fixed if varying else None),
             solver,
@@ -215,7 +215,7 @@ def _solve(model: Model, start: Array) -> tuple[Array, Array, Array, Array]:
             throw=False,
         )
         success = jnp.asarray(solution.result == optx.RESULTS.successful)
-        return solution.value, (success, solution.stats["num_steps"])
+        return solution.value, (success, solution.stats["num_steps"], solution.stats["cost"])
 
     stages = jnp.full((1, 1, 1), jnp.nan)
     if varying:  # far from the data, a noise level grows until everything fits: go near it first, with sigma held
@@ -223,10 +223,14 @@ def _solve(model: Model, start: Array) -> tuple[Array, Array, Array, Array]:
         typical = jnp.mean(jnp.abs(model.values))  # a tenth of it keeps readings near 0 from outweighing all others
         held = total_sigma(jnp.abs(model.values) + 0.1 * typical, model.variance, parts.relative, parts.floor)
         stages = jnp.stack([held, jnp.full_like(held, jnp.nan)])
-    unit, (success, steps) = jax.lax.scan(stage, start, stages)
-    vector = model.box.from_unit(unit)
-    cost = 0.5 * sum(jnp.sum(part**2) for part in model.residuals(vector))
-    return vector, jnp.where(jnp.isfinite(cost), cost, jnp.inf), jnp.sum(steps), success[-1] & jnp.isfinite(cost)
+    unit, (success, steps, costs) = jax.lax.scan(stage, start, stages)
+    cost = costs[-1]
+    return (
+        model.box.from_unit(unit),
+        jnp.where(jnp.isfinite(cost), cost, jnp.inf),
+        jnp.sum(steps),
+        success[-1] & jnp.isfinite(cost),
+    )
 
 
 def _solve_batch(model: Model, starts: Array) -> tuple[Array, Array, Array, Array]:

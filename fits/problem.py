@@ -118,11 +118,10 @@ class Model(eqx.Module):
             jacobian = jax.jacfwd(lambda v: self.residuals(v)[0].reshape(-1))(vector)
             return jacobian, jnp.zeros((vector.size, vector.size), vector.dtype)
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
-        sigma = jax.lax.stop_gradient(self.sigma(vector))
 
         def rows(v: Array) -> Array:
             predicted, level = self._predicted_and_sigma(v)
-            mean = jnp.sqrt(of_mean) * (predicted / sigma).reshape(-1)
+            mean = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(level)).reshape(-1)
             if not self.varying:
                 return mean
             return jnp.concatenate([mean, jnp.sqrt(of_level) * jnp.log(level).reshape(-1)])
@@ -299,10 +298,18 @@ def _run(function: Callable[..., Any], static: _Static, arrays: Any, *arguments:
     return function(eqx.combine(arrays, static.tree), *arguments)
 
 
-def forward(stack: Any, wi: Array, wo: Array, transport: Transport, side: Side = "all") -> Array:
+def forward(
+    stack: Any,
+    wi: Array | NDArray[np.float64],
+    wo: Array | NDArray[np.float64],
+    transport: Transport,
+    side: Side = "all",
+) -> Array:
     """BSDF (N, C) in 1/sr: the one place where inference meets the forward models."""
     if inspect.isfunction(transport):
         return transport(stack, wi, wo)
+    if isinstance(transport, lj.Transport) and transport.random:
+        raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
     return lj.evaluate(stack, wi, wo, transport=transport, side=side)
 
 

@@ -9,6 +9,7 @@ import layerjax as lj
 from fits.geometry import Geometry as Geometry
 from fits.geometry import slices as slices
 from fits.measurements import Measurements, Source, channel_names
+from fits.problem import forward
 
 
 def simulate(
@@ -28,7 +29,7 @@ def simulate(
         if not (math.isfinite(level) and level >= 0):
             raise ValueError(f"{name} is {level}, must be finite and >= 0")
     # evaluate picks the precision of the directions: float64 if the session has it turned on
-    exact = np.asarray(lj.evaluate(stack, geometry.wi, geometry.wo, transport=transport), dtype=np.float64)
+    exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)
     sigma = np.hypot(noise * exact, floor)
     noisy = exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape)
     notes = (f"noise: relative {noise:g}, floor {floor:g} 1/sr, seed {seed}",)

@@ -178,7 +178,7 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
             raise ValueError(f"{where} is {value!r}, must be true or false")
         return value
     if hint is int:
-        if isinstance(value, bool) or not isinstance(value, int):
+        if type(value) is not int:
             raise ValueError(f"{where} is {value!r}, must be a whole number")
         return value
     if hint is float:
@@ -186,6 +186,11 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
         if isinstance(number, tuple):
             raise ValueError(f"{where} is {value!r}, must be one number")
         return number
+    if get_origin(hint) is tuple:
+        count = len(get_args(hint))
+        if not isinstance(value, list) or len(value) != count or any(type(number) is not int for number in value):
+            raise ValueError(f"{where} is {value!r}, must be a list of {count} whole numbers")
+        return tuple(value)
     if name.endswith(".phase"):
         return _build(where, value, _PHASES)
     return _number_or_free(where, value, lj.RANGES.get(name, _ANY))
@@ -298,6 +303,8 @@ def _to_plain(value: Any) -> Any:
     if isinstance(value, lj.HenyeyGreenstein | lj.SGGX | Prior):
         return _module_to_dict(value)
     array = np.asarray(value)
+    if array.dtype.kind == "i":
+        return array.tolist()
     # the shortest decimal that a float32 reads back from, not its digits in float64
     numbers = [float(str(number)) if array.dtype == np.float32 else float(number) for number in array.ravel()]
     return numbers if array.ndim else numbers[0]

@@ -24,6 +24,36 @@ def safe_div(numerator: Array, denominator: Array, otherwise: float = 0.0) -> Ar
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), otherwise)
 
 
+def decay_between(a: Array, b: Array) -> Array:
+    """(exp(-a) - exp(-b)) / (b - a) for a, b >= 0, equal to exp(-a) at a = b; smooth there in both.
+
+    Near a = b it is written without |a - b| and min(a, b), whose derivatives at a tie depend on how a compiler rounds.
+    """
+    difference, middle = a - b, 0.5 * (a + b)
+    near = jnp.abs(difference) < 1.0
+    square = jnp.where(near, 0.25 * difference * difference, 0.25)
+    total = jnp.ones_like(square)
+    for n in range(7, 0, -1):  # sinh(x) / x
+        total = 1.0 + square * total * (1.0 / (2 * n * (2 * n + 1)))
+    smaller, apart = jnp.where(a < b, a, b), jnp.where(near, 2.0, jnp.abs(difference))
+    far = jnp.exp(-jnp.where(near, 0.0, smaller)) * exprel(apart)
+    return jnp.where(near, jnp.exp(-jnp.where(near, middle, 0.0)) * total, far)
+
+
+def at_least(x: Array, low: Array | float) -> Array:
+    """x, or `low` (with derivative 0 in x) where x is smaller.
+
+    In place of jnp.maximum, whose derivative asks which argument *equals* the result: compiled, both may have been
+    computed again and rounded otherwise, and then the derivative is lost.
+    """
+    return jnp.where(x > low, x, low)
+
+
+def at_most(x: Array, high: Array | float) -> Array:
+    """x, or `high` (with derivative 0 in x) where x is larger."""
+    return jnp.where(x < high, x, high)
+
+
 def exprel(x: Array) -> Array:
     """(1 - exp(-x)) / x for x >= 0, equal to 1 at x = 0; relative error of a few units of rounding."""
     small = x < SERIES_LIMIT

@@ -3,12 +3,12 @@
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import safe_div, safe_sqrt
+from layerjax._numerics import at_least, safe_div, safe_sqrt
 
 
 def schlick(cosine: Array, f0: Array | float) -> Array:
     """Schlick's approximation f0 + (1 - f0) (1 - cosine)^5 for |cosine| in [0, 1] (Schlick 1994)."""
-    complement = jnp.maximum(1.0 - cosine, 0.0)  # a cosine may round to just above 1
+    complement = at_least(1.0 - cosine, 0.0)  # a cosine may round to just above 1
     squared = complement * complement
     fifth = squared * squared * complement
     return f0 + (1.0 - f0) * fifth

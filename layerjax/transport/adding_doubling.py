@@ -66,8 +66,8 @@ class AddingDoubling(Transport):
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or is used while tracing.
     """
 
-    nodes: int = eqx.field(static=True, default=24)
-    modes: int = eqx.field(static=True, default=32)
+    nodes: int = eqx.field(static=True, default=32)
+    modes: int = eqx.field(static=True, default=48)
     ordinates: tuple[int, int] = eqx.field(static=True, default=(10, 16))
     tolerance: float | None = eqx.field(static=True, default=None)
     orders: Orders = eqx.field(static=True, default="all")

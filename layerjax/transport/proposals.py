@@ -27,14 +27,15 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
     wo = select(u < lobes + facets + near, (x, y, z), (x, y, -z))
     if state.crossing is not None:
         again = jnp.clip((u - lobes) / facets, 0.0, BELOW_ONE)
-        refracted, _ = interface_sample(up, _ratio(state.crossing, above), state.crossing.alpha, u1, u2, again)
-        wo = select(u < lobes + facets, refracted, wo)
+        refracted, leaves = interface_sample(up, _ratio(state.crossing, above), state.crossing.alpha, u1, u2, again)
+        wo = select(u < lobes + facets, _nowhere_unless(leaves, refracted), wo)
     wo = select(above, wo, mirror(wo))
     inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
     single = SingleScattering()
     lobe = single.sample(state.upper, wi, inner)
     if state.lower is not None:
         lobe = select(above, lobe, mirror(single.sample(state.lower, mirror(wi), inner)))
+        lobe = _nowhere_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
     return select(u < lobes, lobe, wo)
 
 
@@ -47,6 +48,7 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
     lobe = single.pdf(state.upper, wi, wo)
     if state.lower is not None:
         lobe = jnp.where(above, lobe, single.pdf(state.lower, mirror(wi), mirror(wo)))
+        lobe = jnp.where(same, lobe, 0.0)
     density = lobes * lobe + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
     if state.crossing is not None:
         up, out = select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
@@ -63,6 +65,11 @@ def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
     if state.opaque:
         return 0.6, 0.0, 0.4, 0.0
     return (0.5, 0.0, 0.25, 0.25) if state.crossing is None else (0.3, 0.4, 0.15, 0.15)
+
+
+def _nowhere_unless(leaves: Array, w: Vector) -> Vector:
+    """w, or a direction in the tangent plane, where nothing is scattered to."""
+    return (w[0], w[1], jnp.where(leaves, w[2], 0.0))
 
 
 def _ratio(face: Face, above: Array) -> Array:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import absorb, exprel, horizon, one_minus_exp, safe_div
+from layerjax._numerics import absorb, at_least, exprel, horizon, one_minus_exp, safe_div
 from layerjax.channels import Channels, count, largest, mean, per_channel, pick
 from layerjax.directions import Vector, half_vector, select
 from layerjax.phase import SGGX
@@ -134,7 +134,7 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     through: Channels | None = None
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
-        weight = jnp.maximum(weight, WEIGHT_FLOOR)
+        weight = at_least(weight, WEIGHT_FLOOR)
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if k in scattering:
             lost = tuple(share / weight for _, share in shares)

@@ -102,8 +102,10 @@ def test_file_round_trip(tmp_path):
 
 
 def test_options_of_a_transport(tmp_path):
-    problem = _read(tmp_path, "transport = { kind = 'AddingDoubling', nodes = 16, tolerance = 0.01 }\n" + BASE)
-    assert problem.transport == lj.AddingDoubling(nodes=16, tolerance=0.01)
+    problem = _read(
+        tmp_path, "transport = { kind = 'AddingDoubling', nodes = 16, ordinates = [8, 12], tolerance = 0.01 }\n" + BASE
+    )
+    assert problem.transport == lj.AddingDoubling(nodes=16, ordinates=(8, 12), tolerance=0.01)
     path = tmp_path / "again.toml"
     write_problem(path, problem.stack, transport=problem.transport)
     assert read_problem(path).transport == problem.transport
@@ -211,6 +213,10 @@ LAYER = "[[layers]]\nkind = 'Medium'\n"
         (
             "transport = 'Singlescattering'\n[base]\nkind = 'Lambertian'\nalbedo = 0.5\n",
             "transport is 'Singlescattering' .did you mean 'SingleScattering'",
+        ),
+        (
+            "transport = { kind = 'AddingDoubling', ordinates = [8, 12.5] }\n" + BASE,
+            r"transport.ordinates is \[8, 12.5\], must be a list of 2 whole numbers",
         ),
         (
             "transport = { kind = 'AddingDoubling', nodes = 1.5 }\n" + BASE,

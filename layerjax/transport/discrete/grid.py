@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import safe_sqrt
+from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.quadrature import gauss_legendre
 
 COSINE_FLOOR = 1e-7
@@ -81,7 +81,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     for n2 in squares:
         exists = (edges <= n2)[:, None] & (width > 0)
         cosine2 = jnp.where(exists, (n2 - edges[:, None] + x2 * width) / n2, 0.25)
-        cosine = jnp.sqrt(jnp.maximum(cosine2, COSINE_FLOOR**2))
+        cosine = jnp.sqrt(at_least(cosine2, COSINE_FLOOR**2))
         sine = jnp.sqrt(jnp.where(exists, squared / n2, 0.75))
         here = jnp.where(exists, weight, 0.0)
         flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel())
@@ -125,7 +125,7 @@ def _coordinate(ior: Array, cosine: Array, sine2: Array, low: Array, high: Array
     n2 = ior * ior
     width = jnp.where(high > low, high - low, 1.0)
     x2 = ((high - n2) + n2 * cosine * cosine) / width
-    return jnp.clip(x2, 0.0, 1.0), jnp.clip((n2 * sine2 - low) / width, 0.0, 1.0)
+    return at_most(at_least(x2, 0.0), 1.0), at_most(at_least((n2 * sine2 - low) / width, 0.0), 1.0)
 
 
 def lagrange(x: Array, nodes: int) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import safe_div, safe_sqrt
+from layerjax._numerics import at_least, safe_div, safe_sqrt
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, dot, normalize, reflect, refract
 from layerjax.distributions import ggx_masking
@@ -114,7 +114,7 @@ def _shares(near: Region, far: Region, alpha: Array) -> tuple[Array, tuple[Vecto
     down, exists = refract(wi, normals, ratio)
     wo: Vector = (down[0], down[1], -down[2])  # z counted on the far side
     refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, alpha), 0.0)
-    lost = jnp.maximum(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
+    lost = at_least(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
     return reflected, (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
 
 
@@ -133,7 +133,7 @@ def _visible_normals(region: Region, alpha: Array) -> tuple[Vector, Array, Vecto
     weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / AZIMUTH_FACETS)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
-    z = jnp.maximum(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
+    z = at_least(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
     nodes = region.cosine.shape[0]
     flat = tuple(jnp.reshape(part, (nodes, -1)) for part in (alpha * x, alpha * y, z))
     return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi
@@ -152,7 +152,7 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     """
     planar = safe_sqrt(wo[0] * wo[0] + wo[1] * wo[1])
     turn = jnp.arctan2(wo[1], jnp.where(planar > 0, wo[0], 1.0))
-    stencil = spread(grid, far.ior, jnp.abs(wo[2]), jnp.minimum(planar * planar, 1.0))
+    stencil = spread(grid, far.ior, jnp.abs(wo[2]), planar * planar)
     share = jnp.where(near.weight[:, None] > 0, share, 0.0)
     angle = turn[..., None] * np.arange(modes)
     odd = np.arange(modes) % 2 == 1
@@ -177,7 +177,7 @@ def _returned(operators: Sequence[Array], lost: tuple[Array, Array], weights: tu
 
 def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:
     """What a conductor returns of the light lost to masking: it loses its Fresnel share at every further facet."""
-    lost = jnp.where(weight > 0, jnp.maximum(1.0 - lossless, 0.0), 0.0)
+    lost = jnp.where(weight > 0, at_least(1.0 - lossless, 0.0), 0.0)
     total = jnp.sum(weight * lost)
     # mean reflectance of a facet, and mean share that escapes at each try (Kulla & Conty 2017)
     level = safe_div(jnp.sum(weight * energy), jnp.sum(weight * lossless))

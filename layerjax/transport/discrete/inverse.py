@@ -31,15 +31,16 @@ def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, 
 
 
 def _eliminate_block(index: Array, matrix: Array) -> Array:
-    """One round of Gauss-Jordan in place: the block's rows and columns become those of the inverse."""
+    """One round of Gauss-Jordan: the block's rows and columns become those of the inverse."""
     start = index * BLOCK
-    slice_of, put = jax.lax.dynamic_slice_in_dim, jax.lax.dynamic_update_slice_in_dim
-    rows = slice_of(matrix, start, BLOCK, axis=1)
+    slice_of = jax.lax.dynamic_slice_in_dim
+    here = jnp.arange(matrix.shape[-1]) // BLOCK == index
+    rows, columns = slice_of(matrix, start, BLOCK, axis=1), slice_of(matrix, start, BLOCK, axis=2)
     pivot = _inverse_of_block(slice_of(rows, start, BLOCK, axis=2))
-    columns = slice_of(matrix, start, BLOCK, axis=2)
-    rows = put(pivot @ rows, pivot, start, axis=2)
-    matrix = put(matrix, jnp.zeros_like(columns), start, axis=2)
-    return put(matrix - columns @ rows, rows, start, axis=1)
+    spread = jnp.tile(pivot, (1, 1, matrix.shape[-1] // BLOCK))  # the pivot, where its columns are
+    rows = jnp.where(here, spread, pivot @ rows)
+    rest = jnp.where(here, 0.0, matrix) - columns @ rows
+    return jnp.where(here[:, None], jnp.tile(rows, (1, matrix.shape[-1] // BLOCK, 1)), rest)
 
 
 def _inverse_of_block(matrix: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import exprel
+from layerjax._numerics import decay_between, exprel
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
@@ -26,11 +26,11 @@ from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straig
 Pair = tuple[Array, Array]
 """Reflection and transmission, light from above."""
 
-THIN = 0.7e-3
+THIN = 0.7e-5
 """Largest thickness of the slab that doubling starts from (no power of two times a round number: derivatives by
 differences do not straddle a change of the number of steps)."""
 
-MOST_STEPS = 24
+MOST_STEPS = 31
 """Doublings that reach the thickest medium of the box, 1e4."""
 
 
@@ -129,30 +129,30 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
 
-    def step(rest: Pair, depth: Array) -> Pair:
-        slab = thickness * depth
-        once = _once(kernel, strength, slab)
+    @jax.checkpoint
+    def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
         parts = Parts(once[0], rest[0]), Parts(once[1], rest[1])
-        passed = _direct(kernel, slab)
         reflect, transmit = double(*parts, (passed, kernel.turn_row(passed)), kernel.turn)
         assert reflect is not None
         assert transmit is not None
         return reflect, transmit
 
+    def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
+        slab = thickness * depth
+        arguments = rest, _once(kernel, strength, slab), _direct(kernel, slab)
+        if steps is not None:
+            return doubled(*arguments), None
+        return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
+
     most = MOST_STEPS if steps is None else steps
     depths = jnp.asarray(2.0 ** np.arange(-most, 0), thickness.dtype)
+    first = depths[0]
     if steps is None:
         # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
-        wanted = jnp.ceil(jnp.log2(jax.lax.stop_gradient(jnp.max(thickness)) / THIN + 1e-30))
-        first = 2.0 ** -jnp.clip(wanted, 1.0, most)
-        start = _twice(kernel, strength, thickness * first)
-
-        def maybe(rest: Pair, depth: Array) -> Pair:
-            return jax.lax.cond(depth >= first, step, lambda rest, _: rest, rest, depth)
-
-    else:
-        start, maybe = _twice(kernel, strength, thickness * depths[0]), step
-    rest, _ = jax.lax.scan(jax.checkpoint(lambda rest, depth: (maybe(rest, depth), None)), start, depths)
+        largest = jax.lax.stop_gradient(jnp.max(thickness))
+        first = depths[jnp.clip(most - jnp.ceil(jnp.log2(largest / THIN + 1e-30)), 0, most - 1).astype(jnp.int32)]
+    start = _twice(kernel, strength, thickness * first)
+    rest, _ = jax.lax.scan(step, start, depths)
     once = _once(kernel, strength, thickness)
     reflect, transmit = Parts(once[0], rest[0]), Parts(once[1], rest[1])
 
@@ -179,7 +179,7 @@ def _once(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
     gain, depth = _depths(kernel, thickness)
     into, down, up = depth[..., None, :], depth[..., :, None], kernel.turn_row(depth)[..., :, None]
     reflect = gain * exprel(up + into)
-    transmit = gain * jnp.exp(-jnp.minimum(down, into)) * exprel(jnp.abs(down - into))
+    transmit = gain * decay_between(down, into)
     return strength[0] * reflect, strength[1] * transmit
 
 

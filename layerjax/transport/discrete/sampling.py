@@ -11,9 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import safe_div
+from layerjax._numerics import at_least, safe_div
 from layerjax.directions import Vector
 from layerjax.transport.discrete.grid import Region
+
+LEAST_SAMPLES = 96
+"""Azimuths, over half a turn, at which a kernel is sampled at least."""
 
 BALANCING = 5
 """Rounds of `balance`; what is left after them goes straight on."""
@@ -26,7 +29,7 @@ def modes_at_nodes(
 
     phi is the azimuth between the directions of travel. wi and wo are given above the horizon.
     """
-    samples = 2 * modes
+    samples = max(2 * modes, LEAST_SAMPLES)
     phi = (np.arange(samples) + 0.5) * np.pi / samples
     dtype = into.cosine.dtype
     cosines = jnp.asarray(np.cos(np.outer(phi, np.arange(modes))) / samples, dtype)
@@ -54,7 +57,7 @@ def balance(
     scale = jnp.ones_like(energy)
     exists = (energy > 0) & (weight > 0)
     for _ in range(BALANCING):
-        ratio = safe_div(energy, jnp.maximum(scattered(scale), 1e-3 * energy))
+        ratio = safe_div(energy, at_least(scattered(scale), 1e-3 * energy))
         scale = jnp.where(exists, scale * jnp.sqrt(jnp.where(exists, ratio, 1.0)), 1.0)
     return scale, jnp.where(exists, energy - scattered(scale), 0.0)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, safe_div
+from layerjax._numerics import at_least, horizon, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
 from layerjax.transport._transport import Side
@@ -133,7 +133,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         entries = values[rows, columns]
         if cosines is not None:
             entries = jnp.sum(entries * cosines[..., None, None, :], axis=-1)
-        channels.append(factor * jnp.maximum(jnp.sum(weights * entries, axis=(-2, -1)), 0.0))
+        channels.append(factor * at_least(jnp.sum(weights * entries, axis=(-2, -1)), 0.0))
     return tuple(channels)
 
 
@@ -151,7 +151,7 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
         found = []
         for c in range(table.shape[1]):
             total = jnp.sum(points[1] * table[row, c, points[0]], axis=-1)
-            found.append(jnp.where(valid, jnp.maximum(total, 0.0), 0.0))
+            found.append(jnp.where(valid, at_least(total, 0.0), 0.0))
         energies.append(tuple(found))
     return energies[0], energies[1]
 
@@ -171,7 +171,7 @@ def _inside(w: Vector, valid: Array) -> Vector:
 
 def _points(tables: Tables, w: Vector, ior: Array, turn: float) -> tuple[Array, Array]:
     """Indices into a table and weights, along a new last axis."""
-    first, polar = stencil(tables.grid, ior, w[2], jnp.minimum(w[0] * w[0] + w[1] * w[1], 1.0))
+    first, polar = stencil(tables.grid, ior, w[2], w[0] * w[0] + w[1] * w[1])
     index, weight = first[..., None] + np.arange(4), jnp.stack(polar, axis=-1)
     if tables.azimuths is None:
         return index, weight
