@@ -33,9 +33,9 @@ MODELS = (
     Model("single scattering", {"first order": lj.SingleScattering()}),
     Model(
         "adding-doubling",
-        {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (8, 16, 32, 48)},
+        {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (8, 16, 32)},
     ),
-    Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14, 16)}),
+    Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14)}),
 )
 """What is compared. A model joins by a line here."""
 

@@ -34,8 +34,8 @@ class References:
 
 
 REFERENCES = References(
-    truth=lj.AddingDoubling(nodes=64, modes=96),
-    check=lj.RandomWalk(paths=2**16),
+    truth=lj.AddingDoubling(nodes=48, modes=64, ordinates=(14, 24)),
+    check=lj.RandomWalk(paths=2**15),
     solver=lj.AddingDoubling(),
     walk=lj.RandomWalk(),
 )

@@ -19,8 +19,8 @@ from jax.typing import ArrayLike
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, split
-from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
-from layerjax.transport import Side, SingleScattering, Transport
+from layerjax.stack import Interface, Stack, channel_count, media_of, optical_depths, require_numbers, simplify
+from layerjax.transport import AddingDoubling, Side, SingleScattering, Transport
 
 CHUNK_BYTES = 20_000
 """Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
@@ -42,17 +42,23 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
 
     Args:
         stack: the layered material.
-        transport: how light is carried. ``"auto"``: `SingleScattering`, the only transport of this version.
+        transport: how light is carried. ``"auto"``: `SingleScattering` where no `Interface` is, which is exact to the
+            first order and costs least; `AddingDoubling` where one is.
 
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
     require_numbers(stack)
-    chosen = SingleScattering() if transport == "auto" else transport
+    chosen = _automatic(stack) if transport == "auto" else transport
     if not isinstance(chosen, Transport):
         raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
     chosen.check(stack)
     return Prepared(chosen.prepare(stack), chosen, channel_count(stack))
+
+
+def _automatic(stack: Stack) -> Transport:
+    layered = any(isinstance(layer, Interface) for layer in stack.layers)
+    return AddingDoubling() if layered else SingleScattering()
 
 
 def evaluate(

@@ -22,7 +22,8 @@ class Conductor(Surface):
     ========= ====== ============ ======= ===============================================================
     parameter symbol range        default meaning
     ========= ====== ============ ======= ===============================================================
-    ior       n      [0.01, 10]           real part of the index relative to what lies above, per channel
+    ior       n      [0.01, 10]           real part of the index relative to what surrounds the stack, per
+                                          channel
     k         k      [0, 20]              extinction coefficient, per channel
     alpha     alpha  [1e-4, 1]            GGX width
     ========= ====== ============ ======= ===============================================================

@@ -54,7 +54,7 @@ class SingleScattering(Transport):
             if isinstance(layer, Interface):
                 raise ValueError(
                     f"layers[{index}]: SingleScattering carries no Interface (media over a base only); "
-                    "no transport of this version does"
+                    "AddingDoubling and RandomWalk do"
                 )
 
     def prepare(self, stack: Stack) -> Media:

@@ -72,7 +72,7 @@ def test_every_range_is_enforced_at_both_ends():
 def test_a_transport_names_the_layer_that_it_cannot_carry():
     stack = lj.Stack([lj.Medium(1.0), lj.Interface(1.5, 0.1)])
     with pytest.raises(ValueError, match=r"layers\[1\]: SingleScattering carries no Interface"):
-        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0))
+        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0), lj.SingleScattering())
     with pytest.raises(ValueError, match="transport: 'fast' is not a Transport"):
         lj.evaluate(lj.Stack([]), lj.direction(0.5, 0.0), lj.direction(0.5, 1.0), transport="fast")
 
