@@ -68,7 +68,7 @@ class AddingDoubling(Transport):
 
     nodes: int = eqx.field(static=True, default=32)
     modes: int = eqx.field(static=True, default=48)
-    ordinates: tuple[int, int] = eqx.field(static=True, default=(10, 16))
+    ordinates: tuple[int, int] = eqx.field(static=True, default=(10, 24))
     tolerance: float | None = eqx.field(static=True, default=None)
     orders: Orders = eqx.field(static=True, default="all")
     microfacets: Microfacets = eqx.field(static=True, default="single")

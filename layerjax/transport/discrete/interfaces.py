@@ -26,11 +26,8 @@ from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straig
 
 Microfacets = Literal["single", "multiple"]
 
-POLAR_FACETS = 16
-"""Quadrature of the visible normals: points from the pole of the cap to its rim."""
-
-AZIMUTH_FACETS = 16
-"""The same, points over half a turn (the other half is its mirror image)."""
+LEAST_FACETS = 12
+"""Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
 
 
 def interface_layer(
@@ -43,10 +40,10 @@ def interface_layer(
     from above counts as entering.
     """
     near, far = (above, below) if enters else (below, above)
-    reflected, refracted, lost_outside = _shares(near, far, alpha)
+    reflected, refracted, lost_outside = _shares(grid, near, far, alpha, modes)
     through = _deposit(grid, *refracted, far, near, modes)
     outer = _face(near, jnp.sum(reflected, axis=-1), far.ior / near.ior, alpha, modes)
-    reflected, _, lost_inside = _shares(far, near, alpha)
+    reflected, _, lost_inside = _shares(grid, far, near, alpha, modes)
     inner = _face(far, jnp.sum(reflected, axis=-1), near.ior / far.ior, alpha, modes)
     operators = [outer, through, _adjoint(through, near, far), inner]
     if microfacets == "multiple":
@@ -57,17 +54,19 @@ def interface_layer(
     return Layer(reflect_far, reflect_near, out, into)
 
 
-def base_layer(region: Region, base: Surface, modes: int, microfacets: Microfacets) -> Layer:
+def base_layer(grid: Grid, region: Region, base: Surface, modes: int, microfacets: Microfacets) -> Layer:
     """An opaque base under a region, as Fourier modes."""
     weight = _weight(region)
     kernels = modes_at_nodes(base.evaluate, region, region, modes)
     if isinstance(base, Conductor):
-        return Layer(Parts(_conductor(region, base, kernels, microfacets)))
+        return Layer(Parts(_conductor(grid, region, base, kernels, microfacets)))
     return Layer(Parts(jnp.stack(kernels) * weight[:, None]))
 
 
-def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Array:
-    normals, weight, wi = _visible_normals(region, base.alpha)
+def _conductor(
+    grid: Grid, region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets
+) -> Array:
+    normals, weight, wi = _visible_normals(grid, region, base.alpha, kernels[0].shape[0])
     cosine = dot(wi, normals)
     seen = weight * _masking(reflect(wi, normals), base.alpha)
     ior, k = per_channel(base.ior), per_channel(base.k)
@@ -105,10 +104,12 @@ def _adjoint(flux: Array, near: Region, far: Region) -> Array:
     return near.weight[:, None] * jnp.swapaxes(kernel, -1, -2)
 
 
-def _shares(near: Region, far: Region, alpha: Array) -> tuple[Array, tuple[Vector, Array], Array]:
+def _shares(
+    grid: Grid, near: Region, far: Region, alpha: Array, modes: int
+) -> tuple[Array, tuple[Vector, Array], Array]:
     """Of light from every near node, by facets: the share reflected; where to and how much is refracted; the loss."""
     ratio = far.ior / near.ior
-    normals, weight, wi = _visible_normals(near, alpha)
+    normals, weight, wi = _visible_normals(grid, near, alpha, modes)
     level = fresnel.dielectric(dot(wi, normals), ratio)
     reflected = weight * level * _masking(reflect(wi, normals), alpha)
     down, exists = refract(wi, normals, ratio)
@@ -118,19 +119,22 @@ def _shares(near: Region, far: Region, alpha: Array) -> tuple[Array, tuple[Vecto
     return reflected, (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
 
 
-def _visible_normals(region: Region, alpha: Array) -> tuple[Vector, Array, Vector]:
+def _visible_normals(grid: Grid, region: Region, alpha: Array, modes: int) -> tuple[Vector, Array, Vector]:
     """Normals visible from every node, (nodes, points), their weights, and the nodes' wi: a spherical cap, stretched.
 
-    The quadrature of Dupuy & Benyoub 2023 in the cap's polar angle, dense where facets are seen at a glance.
+    The cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over half a turn (the other half is its
+    mirror image). As dense as what it is put on: light that goes straight through two interfaces meets the points of
+    both, and the nodes and modes between must not tell them apart.
     """
+    polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 4), max(LEAST_FACETS, 3 * modes // 4)
     alpha = jnp.asarray(alpha, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
     v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
-    s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(POLAR_FACETS))
+    s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(polar_facets))
     rim = jnp.arctan2(safe_sqrt(v[0] * v[0]), -v[2])  # cosine -v_z
     polar = (rim * s)[:, :, None]
-    phi = jnp.asarray((np.arange(AZIMUTH_FACETS) + 0.5) * np.pi / AZIMUTH_FACETS, alpha.dtype)
-    weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / AZIMUTH_FACETS)
+    phi = jnp.asarray((np.arange(azimuth_facets) + 0.5) * np.pi / azimuth_facets, alpha.dtype)
+    weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / azimuth_facets)
     sine, cosine = jnp.sin(polar), jnp.cos(polar)
     x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
     z = at_least(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)

@@ -71,7 +71,7 @@ def solve(stack: Stack, plan: Plan) -> tuple[Grid, Layer]:
             solved.append((medium_layer(layer, kernel_modes(layer, here, plan.modes), steps.pop(0)), False))
     if stack.base is not None:
         here = grid.regions[region]
-        solved.append((base_layer(here, _relative(stack.base, here.ior), plan.modes, plan.microfacets), False))
+        solved.append((base_layer(grid, here, _relative(stack.base, here.ior), plan.modes, plan.microfacets), False))
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
