@@ -26,7 +26,7 @@ from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straig
 
 Microfacets = Literal["single", "multiple"]
 
-LEAST_FACETS = 12
+LEAST_FACETS = 16
 """Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
 
 
