@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
     families = sorted(path.name for path in (Path(__file__).parent / "suite").iterdir())
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
     compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
-    compared.add_argument("--add", action="store_true", help="keep what the directory holds of other stacks")
+    compared.add_argument("--resume", action="store_true", help="measure only what the directory does not hold yet")
     given = parser.parse_args(arguments)
 
     # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         from benchmarks.models import named
 
         try:
-            options |= {"families": given.families, "models": named(given.models), "add": given.add}
+            options |= {"families": given.families, "models": named(given.models), "resume": given.resume}
         except ValueError as error:
             parser.error(str(error))
     study = importlib.import_module(f"benchmarks.{given.benchmark.replace('-', '_')}").study

@@ -33,7 +33,10 @@ MODELS = (
     Model("single scattering", {"first order": lj.SingleScattering()}),
     Model(
         "adding-doubling",
-        {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (8, 16, 32)},
+        {
+            f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2, ordinates=ordinates)
+            for nodes, ordinates in ((8, (6, 12)), (16, (8, 16)), (32, (10, 24)))
+        },
     ),
     Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14)}),
 )

@@ -1,8 +1,12 @@
 """What the models are compared with, how far it can itself be trusted, and whether the two references agree."""
 
+import io
 import time
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -175,6 +179,26 @@ def compare(
         failures=(int(failed.sum()) - through, through),
         worst=float(np.max(np.where(failed, apart / size, 0.0))),
     )
+
+
+def pack(truths: Mapping[str, Truth]) -> bytes:
+    """Truths by stack as the bytes of an .npz file."""
+    arrays = {f"{name}/{part}": value for name, truth in truths.items() for part, value in vars(truth).items()}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def unpack(path: Path) -> dict[str, Truth]:
+    """What `pack` wrote; nothing where there is no such file."""
+    if not path.exists():
+        return {}
+    parts: dict[str, dict[str, Any]] = {}
+    with np.load(path) as arrays:
+        for key, value in arrays.items():
+            name, part = key.split("/")
+            parts.setdefault(name, {})[part] = value if value.ndim else float(value)
+    return {name: Truth(**part) for name, part in parts.items()}
 
 
 def key_of(name: str, run: int) -> Array:

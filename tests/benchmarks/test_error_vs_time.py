@@ -81,7 +81,7 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     def study(name: str, family: str, stack: lj.Stack) -> tuple[str, tuple[Path, ...]]:
         case = Case(name, family, "here", "A remark.", stack)
         return error_vs_time.study(
-            directory=directory, cases=[case], models=models, references=references, size=size, add=True
+            directory=directory, cases=[case], models=models, references=references, size=size, resume=True
         )
 
     study("thin_haze", "transmitting_slabs", haze)
@@ -100,5 +100,12 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert 0.005 < rows["thin_haze", "single scattering"]["l2"] < 0.2
     assert all(row["nanoseconds_per_value"] > 0 and row["operations"] > 0 for row in rows.values())
     assert rows["thin_haze", "walk"]["pairs"] == 8
+    before = rows["coat", "walk"]
+    models.append(Model("coarse", {"4": lj.AddingDoubling(nodes=4, modes=4)}))
+    study("coat", "plastics_and_paints", coat)  # a model that joins: the rest stands as it was
+    content = json.loads((directory / "error-vs-time.json").read_text())
+    rows = {(row["stack"], row["model"]): row for row in content["rows"]}
+    assert rows["coat", "walk"] == before
+    assert 0 < rows["coat", "coarse"]["l2"] < 0.1
     with pytest.raises(ValueError, match="measured with other settings"):
-        error_vs_time.study(directory=directory, cases=[], models=models[:1], references=references, add=True)
+        error_vs_time.study(directory=directory, cases=[], models=models, references=references, resume=True)

@@ -26,7 +26,7 @@ from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straig
 
 Microfacets = Literal["single", "multiple"]
 
-LEAST_FACETS = 16
+LEAST_FACETS = 24
 """Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
 
 
@@ -123,10 +123,10 @@ def _visible_normals(grid: Grid, region: Region, alpha: Array, modes: int) -> tu
     """Normals visible from every node, (nodes, points), their weights, and the nodes' wi: a spherical cap, stretched.
 
     The cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over half a turn (the other half is its
-    mirror image). As dense as what it is put on: light that goes straight through two interfaces meets the points of
-    both, and the nodes and modes between must not tell them apart.
+    mirror image). Denser than what it is put on: light that goes straight through two interfaces meets the points of
+    both, and the nodes and modes between must not tell them apart. Tails are sparse from pole to rim.
     """
-    polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 4), max(LEAST_FACETS, 3 * modes // 4)
+    polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 2), max(LEAST_FACETS, 3 * modes // 4)
     alpha = jnp.asarray(alpha, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
     v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
