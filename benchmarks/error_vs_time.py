@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from benchmarks import accuracy, environment, error_pictures, error_tables, suite
 from benchmarks.models import MODELS, Model, Programs, Row, Size, row, run, supports
 from benchmarks.results import DIRECTORY, write
@@ -17,6 +19,8 @@ from fits.pictures import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)
+KEPT = 6
+"""Stacks after which compiled programs are dropped: a process may map a limited number of pieces of memory only."""
 QUICK_STEP = 6
 """A quick run takes every so many stacks."""
 
@@ -85,6 +89,8 @@ def study(
         return text, (*paths, truths)
 
     for index, case in enumerate(cases, start=1):
+        if index % KEPT == 0:
+            jax.clear_caches()
         began = time.perf_counter()
         if case.name in held.untold:
             continue

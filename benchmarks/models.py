@@ -31,6 +31,7 @@ class Model:
 
 MODELS = (
     Model("single scattering", {"first order": lj.SingleScattering()}),
+    Model("Weidlich & Wilkie", {"one half vector": lj.WeidlichWilkie()}),
     Model(
         "adding-doubling",
         {
