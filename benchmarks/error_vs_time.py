@@ -105,7 +105,7 @@ def study(
             if not runs:
                 continue
         else:
-            judgement, truth = judge(case, references, size.walked(case))
+            judgement, truth = judge(case, references, size.walked(case), size.longest)
         held.judged[case.name], held.truths[case.name] = judgement, truth
         held.rows.extend(row(case, found, truth, judgement.limit) for found in runs)
         save()

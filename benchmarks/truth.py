@@ -1,5 +1,6 @@
 """What the models are compared with, how far it can itself be trusted, and whether the two references agree."""
 
+import dataclasses
 import io
 import time
 import zlib
@@ -19,6 +20,9 @@ from benchmarks.suite import Case, Directions
 
 STANDARD_ERRORS, TOLERANCE = 4.0, 0.01
 """Two references agree within the larger of so many standard errors and this share of the value."""
+
+PROBED = 256
+"""Paths by which the time of a walk is estimated."""
 
 ROUNDING = 1e-9
 """Relative error of sums in float64 that nothing is told apart below, also where a truth is exact."""
@@ -76,7 +80,7 @@ class Judged:
 
     uncertainty: of the relative L2, of the worst value and of the albedo, by two resolutions. bias: relative L2 that
     the walk finds beyond its noise, at `walked` pairs. z: root mean square and largest, truth against walk. compared,
-    failures, worst: values of the default solver against the default walk (see `Check`).
+    failures, worst: values of the default solver against the default walk of so many paths (see `Check`).
     """
 
     stack: str
@@ -94,6 +98,7 @@ class Judged:
     compared: int
     failures: tuple[int, int]
     worst: float
+    paths: int
     date: str
     seconds: float
 
@@ -108,21 +113,26 @@ class Judged:
         return sum(self.failures) == 0
 
 
-def judge(case: Case, references: References, walked: int) -> tuple[Judged, Truth]:
-    """The truth of a stack, checked with a walk; and the default solver against the default walk. walked: pairs."""
+def judge(case: Case, references: References, walked: int, longest: float = np.inf) -> tuple[Judged, Truth]:
+    """The truth of a stack, checked with a walk; and the default solver against the default walk.
+
+    walked: pairs. longest: seconds; walks that would take longer have fewer paths (light may
+    turn between lossless interfaces for very long).
+    """
     began = time.perf_counter()
     directions = case.directions
     truth = reference(case.stack, directions, references.truth)
     indices = directions.some(walked)
     few = directions.take(indices)
 
-    def against(values: Values, walk: lj.Transport, run: int) -> Check:
+    def against(values: Values, walk: lj.Transport, run: int) -> tuple[Check, lj.Transport]:
+        walk = affordable(walk, case.stack, few, longest)
         estimates, errors = lj.evaluate_with_error(case.stack, few.wi, few.wo, walk, key=key_of(case.name, run))
-        return compare(values, np.asarray(estimates), np.asarray(errors), truth.albedo, few)
+        return compare(values, np.asarray(estimates), np.asarray(errors), truth.albedo, few), walk
 
-    checked = against(truth.values[indices], references.check, 0)
+    checked, _ = against(truth.values[indices], references.check, 0)
     default = np.asarray(lj.evaluate(case.stack, directions.wi, directions.wo, references.solver))
-    agreement = against(default[indices], references.walk, 1)
+    agreement, default_walk = against(default[indices], references.walk, 1)
     return Judged(
         stack=case.name,
         family=case.family,
@@ -139,9 +149,27 @@ def judge(case: Case, references: References, walked: int) -> tuple[Judged, Trut
         compared=agreement.z.size,
         failures=agreement.failures,
         worst=agreement.worst,
+        paths=getattr(default_walk, "paths", 0),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         seconds=time.perf_counter() - began,
     ), truth
+
+
+def affordable(walk: lj.Transport, stack: lj.Stack, directions: Directions, longest: float) -> lj.Transport:
+    """The walk with as many paths as so many seconds allow, at most its own."""
+    if not isinstance(walk, lj.RandomWalk) or walk.paths < 2 * PROBED or not np.isfinite(longest):
+        return walk
+    probe = dataclasses.replace(walk, paths=PROBED)
+    seconds = []
+    for run in range(2):  # the first compiles
+        began = time.perf_counter()
+        found = lj.evaluate(stack, directions.wi, directions.wo, probe, key=jax.random.key(run))
+        jax.block_until_ready(found)
+        seconds.append(time.perf_counter() - began)
+    paths = walk.paths
+    while paths > PROBED and seconds[1] * paths / PROBED > longest:
+        paths //= 2
+    return dataclasses.replace(walk, paths=paths)
 
 
 def reference(stack: lj.Stack, directions: Directions, transport: lj.Transport) -> Truth:
