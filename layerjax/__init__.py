@@ -25,5 +25,6 @@ from layerjax.transport import AddingDoubling as AddingDoubling
 from layerjax.transport import RandomWalk as RandomWalk
 from layerjax.transport import SingleScattering as SingleScattering
 from layerjax.transport import Transport as Transport
+from layerjax.transport import WeidlichWilkie as WeidlichWilkie
 
 __version__ = "0.1.0"

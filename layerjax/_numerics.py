@@ -36,8 +36,8 @@ def decay_between(a: Array, b: Array) -> Array:
     for n in range(7, 0, -1):  # sinh(x) / x
         total = 1.0 + square * total * (1.0 / (2 * n * (2 * n + 1)))
     smaller, apart = jnp.where(a < b, a, b), jnp.where(near, 2.0, jnp.abs(difference))
-    far = jnp.exp(-jnp.where(near, 0.0, smaller)) * exprel(apart)
-    return jnp.where(near, jnp.exp(-jnp.where(near, middle, 0.0)) * total, far)
+    ratio = jnp.where(near, total, (1.0 - jnp.exp(-apart)) / apart)
+    return jnp.exp(-jnp.where(near, middle, smaller)) * ratio
 
 
 def at_least(x: Array, low: Array | float) -> Array:

@@ -118,11 +118,17 @@ def require_numbers(stack: Stack) -> None:
 def simplify(stack: Stack) -> Stack:
     """The same stack without what its concrete values say is not there.
 
-    Media of thickness 0 go; f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
-    Traced values are kept as they are, so derivatives with respect to them are exact.
+    Media of thickness 0 go, and interfaces whose index is that of what lies above them (all light passes straight);
+    f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing. Traced values are kept as
+    they are, so derivatives with respect to them are exact.
     """
     layers = []
+    above: Any = 1.0
     for layer in stack.layers:
+        if isinstance(layer, Interface):
+            if _are_equal(layer.ior, above):
+                continue
+            above = layer.ior
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
@@ -156,6 +162,12 @@ def optical_depths(media: Sequence[Medium], w: Vector) -> list[Channels]:
 def is_known(value: Any, number: float) -> bool:
     """Whether the parameter is known while tracing to be that number (see `simplify`)."""
     return isinstance(value, float) and value == number
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    """Whether both are known to be the same number."""
+    known = not isinstance(one, jax.core.Tracer) and not isinstance(other, jax.core.Tracer)
+    return known and np.array_equal(np.asarray(one), np.asarray(other))
 
 
 def _is_everywhere(value: Any, known: float) -> bool:

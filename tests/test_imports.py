@@ -48,6 +48,7 @@ LAYERS = [
     "layerjax.transport.discrete.solve",
     "layerjax.transport.discrete.tables",
     "layerjax.transport.adding_doubling",
+    "layerjax.transport.weidlich_wilkie",
     "layerjax.transport",
     "layerjax.evaluate",
     "layerjax.goniophotometer",

@@ -6,7 +6,8 @@ the reflection and the transmission of a layer are, in a form without cancellati
     f = gamma F D/4 * tau/(ci co) * exp(-m) * exprel(y),    exprel(y) = (1 - exp(-y)) / y
 
 with (m, y) = (0, a + b) on the same side and (min(a, b), |a - b|) on opposite sides (Eqs. 12 and 16, the sign of Eq. 15
-put right), times the attenuation of the layers that lie between it and wi, and between it and wo.
+put right), times the attenuation of the layers that lie between it and wi, and between it and wo. Where either side is
+asked for it is evaluated as (exp(-p) - exp(-q)) / (q - p), which is smooth at a = b: (p, q) = (0, a + b) or (a, b).
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import absorb, at_least, exprel, horizon, one_minus_exp, safe_div
+from layerjax._numerics import absorb, at_least, decay_between, horizon, one_minus_exp, safe_div
 from layerjax.channels import Channels, count, largest, mean, per_channel, pick
 from layerjax.directions import Vector, half_vector, select
 from layerjax.phase import SGGX
@@ -162,13 +163,13 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
         medium = slab.media[k]
         gains = []
         for c in range(count(*paths_i, depths_i[k])):
-            a, b = pick(depths_i[k], c), pick(depths_o[k], c)
-            m, y = jnp.minimum(a, b), jnp.abs(a - b)
+            into, out = pick(depths_i[k], c), pick(depths_o[k], c)
             if side == "all":
-                m, y = jnp.where(same_side, 0.0, m), jnp.where(same_side, a + b, y)
+                into, out = jnp.where(same_side, 0.0, into), jnp.where(same_side, into + out, out)
             if len(slab.media) > 1:
-                m = m + pick(paths_i[k], c) + pick(paths_o[k], c)
-            gains.append(pick(per_channel(medium.thickness), c) * inverse * jnp.exp(-m) * exprel(y))
+                path = pick(paths_i[k], c) + pick(paths_o[k], c)
+                into, out = into + path, out + path
+            gains.append(pick(per_channel(medium.thickness), c) * inverse * decay_between(into, out))
         lobes[k] = _times(_collision(medium, wi, wo, half), tuple(gains))
     return lobes
 

@@ -8,6 +8,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import layerjax as lj
+from layerjax.stack import simplify
 
 HG = lj.HenyeyGreenstein(0.5)
 
@@ -117,9 +118,53 @@ def test_gradients_agree_with_central_differences():
         np.testing.assert_allclose(ravel_pytree(gradient)[0], numeric, rtol=1e-6, atol=1e-8 * scale)
 
 
+def test_gradients_where_wi_and_wo_are_equally_attenuated():
+    # at the mirror image of wi through the plane; |a - b| and min(a, b) have no derivative there, the value has
+    def value(x):
+        layers = [lj.Medium(x[0], phase=lj.SGGX("surface", 0.4)), lj.Medium(x[1], 0.7, HG)]
+        return lj.evaluate(lj.Stack(layers), lj.direction(x[2], 0.3), lj.direction(jnp.pi - x[3], x[4]))[0]
+
+    random = np.random.default_rng(0)
+    theta, thickness = random.uniform(0.05, 1.4, 500), random.uniform(0.1, 3.0, (2, 500))
+    x = np.stack([*thickness, theta, theta, random.uniform(0.5, 3.0, 500)], axis=-1)
+    step, at = 1e-6, jax.jit(jax.vmap(value))
+    numeric = np.stack([(at(x + step * e) - at(x - step * e)) / (2 * step) for e in np.eye(5)], axis=-1)
+    scale = np.max(np.abs(numeric), axis=1, keepdims=True)
+    for derivative in (jax.grad, jax.jacfwd):
+        found = jax.jit(jax.vmap(derivative(value)))(x)
+        np.testing.assert_array_less(np.abs(found - numeric) / scale, 1e-7)
+
+
 def test_a_parameter_map_runs_under_vmap():
     alphas = jnp.linspace(0.1, 0.9, 5)
     stacks = eqx.filter_vmap(lambda alpha: make({**PARAMETERS, "alpha": alpha}))(alphas)
     together = jax.vmap(lambda stack: lj.evaluate(stack, WI, WO))(stacks)
     alone = [lj.evaluate(make({**PARAMETERS, "alpha": alpha}), WI, WO) for alpha in alphas]
     np.testing.assert_allclose(together, jnp.stack(alone), rtol=1e-13)
+
+
+def test_matched_interfaces_are_dropped():
+    top, medium, base = lj.Interface(1.5, 0.3), lj.Medium(0.4, 0.5), lj.Conductor(0.2, 3.9, 0.1)
+    matched = [lj.Interface(1.0, 0.2), top, lj.Interface(1.5, 0.6), medium, lj.Interface(jnp.float32(1.5), 0.1)]
+    assert simplify(lj.Stack(matched, base)).layers == simplify(lj.Stack([top, medium], base)).layers
+    kept = [top, lj.Interface(1.2, 0.3), lj.Interface(1.5, 0.3), lj.Interface(1.0, 0.3)]  # each differs from the last
+    assert simplify(lj.Stack(kept)).layers == tuple(kept)
+    values = [lj.evaluate(lj.Stack(layers, base), WI, WO, lj.WeidlichWilkie()) for layers in ([top], [top, matched[2]])]
+    np.testing.assert_array_equal(*values)
+    through = lj.unscattered(lj.Stack([lj.Interface(1.0, 0.5), medium]), WI)
+    np.testing.assert_array_equal(through, lj.unscattered(lj.Stack([medium]), WI))
+
+
+def test_interfaces_of_traced_index_are_kept():
+    # the reflectance is 0 at 1, its second derivative is not
+    given = lj.Interface(1.0, 0.2)  # under a traced index it cannot be said to be matched
+
+    def value(ior):
+        stack = lj.Stack([lj.Interface(ior, 0.5), given], lj.Lambertian(0.0))
+        counts.append(len(simplify(stack).layers))
+        return lj.evaluate(stack, WI, WO, lj.WeidlichWilkie())[0]
+
+    counts = []
+    assert value(1.0) == 0.0
+    assert jax.jit(jax.grad(jax.grad(value)))(1.0) > 0.0
+    assert counts == [0, 2]
