@@ -204,23 +204,24 @@ class Walk:
             event = event._replace(density=densities[0], next_density=densities[1])
         share: Array | None = None
         if self.aims:
-            lane, share = self._through_exit(lane, entry, hit.direction, settled)
+            lane, share = self._through_exit(lane, entry, hit, settled)
         return lane, event, settled, share
 
-    def _through_exit(self, lane: Lane, entry: Vector, direction: Vector, settled: Array) -> tuple[Lane, Array]:
+    def _through_exit(self, lane: Lane, entry: Vector, hit: surfaces.Bounce, settled: Array) -> tuple[Lane, Array]:
         """The lane with its aim, if its prelude ends; and the weight of having walked, not aimed, along `entry`."""
         scene, goal = self.scene, self.goal
         assert goal is not None
         assert lane.prelude is not None
         assert lane.aim is not None
-        inside = select(lane.prelude, direction, scale(-1.0, entry))
+        inside = select(lane.prelude, hit.direction, scale(-1.0, entry))
         density, passed = surfaces.exit_density(scene, goal.exit, goal.above, goal.wo, inside, diffuse=self.multiple)
         ready = lane.prelude & settled
-        found = lane.region == goal.inner  # else the draw came back: nothing is aimed on this path
+        # else the draw came back, or was reflected totally and masked: nothing is aimed on this path
+        found = (lane.region == goal.inner) & hit.survives
         ior = scene.surface_ior(goal.exit, goal.above)
         if self.multiple:  # drawn by the walk itself
             passed = 1.0 / jnp.maximum(jnp.abs(inside[2]), jnp.finfo(scene.dtype).tiny * 1e4)
-        travel = scale(-1.0, direction)
+        travel = scale(-1.0, hit.direction)
         fresh = Aim(
             travel,
             scene.rates(travel),

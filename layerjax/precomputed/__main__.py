@@ -1,0 +1,28 @@
+"""python -m layerjax.precomputed NAME [--out DIR] [--coarse]: make a table again."""
+
+import argparse
+import importlib
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from layerjax.precomputed import NAMES
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m layerjax.precomputed", description="Make a table again.")
+    parser.add_argument("name", choices=NAMES)
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder for NAME.npz")
+    parser.add_argument("--coarse", action="store_true", help="a quick, less exact table")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    table = importlib.import_module(f"layerjax.precomputed.{options.name}").make(coarse=options.coarse)
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / f"{options.name}.npz"
+    np.savez_compressed(path, **table)
+    print(f"{path}: {path.stat().st_size / 1024:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""Widths of lobes as variances that add (Belcour 2018, Sec. 4), and how a refracting interface changes them.
+
+A variance here is f(alpha), the "linear variance" of a GGX lobe in the space of roughness: it has no unit, and is not
+the second moment on the disc of directions.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import at_least, at_most, safe_sqrt
+
+EXPONENT = 1.1
+"""Of the map between roughness and variance (Eq. 6)."""
+
+WIDEST = 0.9999
+"""Roughness that stands for all above, where the variance grows without bound."""
+
+NARROWEST = 1e-6
+"""Roughness that stands for all below (interfaces are wider)."""
+
+LEAST_G = 1e-3
+"""Stands for all asymmetries below, backward ones too: the variance of a phase function is that of its forward lobe."""
+
+
+def variance(alpha: Array) -> Array:
+    """f(alpha) = alpha^1.1 / (1 - alpha^1.1) (Belcour 2018, Eq. 6)."""
+    # Eq. (6)
+    log = EXPONENT * jnp.log(at_most(at_least(alpha, NARROWEST), WIDEST))
+    return jnp.exp(log) / -jnp.expm1(log)
+
+
+def roughness(sigma: Array) -> Array:
+    """The roughness of a variance, the inverse of `variance`."""
+    sigma = at_least(sigma, NARROWEST**EXPONENT)
+    return jnp.exp((jnp.log(sigma) - jnp.log1p(sigma)) / EXPONENT)
+
+
+def phase_variance(g: Array) -> Array:
+    """Variance of the forward lobe of a Henyey-Greenstein phase function (Belcour 2018, Eq. 21)."""
+    g = at_least(g, LEAST_G)
+    return jnp.exp(0.8 * (jnp.log1p(-g) - jnp.log(g))) / (1.0 + g)
+
+
+def transmission_scale(cosine: Array, ior: Array, refracted: Array) -> Array:
+    """Roughness of a refracted lobe over that of the interface (Belcour 2018, Eq. 10, with its sign put right).
+
+    Args:
+        cosine: of incidence.
+        ior: index on the far side over that on the side of incidence.
+        refracted: cosine of refraction.
+    """
+    difference = 1.0 - cosine / (ior * refracted)
+    return 0.5 * safe_sqrt(difference * difference + 1e-12)  # |.|, smooth where an interface vanishes
+
+
+def refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tuple[Array, Array]:
+    """Cosine behind an interface, and whether there is one; `steepest` is the largest sine that stands in beyond it."""
+    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
+    floor = 1.0 - steepest * steepest
+    return jnp.sqrt(at_least(squared, floor)), squared > 0

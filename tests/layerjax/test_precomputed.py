@@ -1,0 +1,43 @@
+"""Tables that ship with the library: small, made by the code beside them."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+import layerjax.precomputed
+from layerjax.precomputed import load, microsurface
+from layerjax.transport.statistics.energies import first_event, first_mirror
+from layerjax.transport.statistics.returns import conductor_basis, interface_bases
+
+FOLDER = Path(layerjax.precomputed.__file__).parent
+
+
+def test_tables_are_small_and_are_made_here():
+    tables = list(FOLDER.glob("*.npz"))
+    assert {path.stem for path in tables} <= set(layerjax.precomputed.NAMES)
+    assert all(path.with_suffix(".py").exists() for path in tables)
+    assert sum(path.stat().st_size for path in tables) < 4e6
+    assert (FOLDER / "microsurface.npz").stat().st_size < 2e5
+
+
+def test_a_coarse_table_of_microsurfaces_equals_the_one_that_ships():
+    lines: list[str] = []
+    coarse, fine = microsurface.make(coarse=True, report=lines.append), load("microsurface")
+    assert coarse.keys() == fine.keys()
+    assert len(lines) == 5
+    rng = np.random.default_rng(1)
+    cosine, alpha, lower = jnp.asarray(rng.uniform([[0.1], [0.1], [0.3]], [[1.0], [1.0], [0.9]], (3, 200)))
+    for side, ior in (("below", lower), ("above", 1 / lower)):
+        _, kept, stuck = first_event(cosine, alpha, ior)
+        bases = interface_bases(cosine, alpha, ior)
+        for name, amount in (("reflected", kept), ("refracted", stuck)):
+            assert fine[f"{name}_{side}"].dtype == np.float64
+            change = amount * (bases[name] @ (coarse[f"{name}_{side}"] - fine[f"{name}_{side}"]))
+            # the coarse fit: half as many coefficients as points, whose energies are off by 1e-3 to 1.2e-2 (rms)
+            assert np.sqrt(np.mean(change**2)) < 2e-2
+    ior, k = jnp.asarray(rng.uniform([[0.2], [1.0]], [[3.0], [8.0]], (2, 200)))
+    _, kept = first_mirror(cosine, alpha, ior, k)
+    basis, _ = conductor_basis(cosine, alpha, ior, k)
+    change = kept * (basis @ (coarse["conductor"] - fine["conductor"]))
+    assert np.sqrt(np.mean(change**2)) < 5e-3
