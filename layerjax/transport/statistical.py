@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
 from layerjax.distributions import ggx_density, ggx_sample, sggx_area
@@ -285,6 +285,7 @@ def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
 
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
+    alpha = at_most(at_least(alpha, 1e-4), 1.0)
     area_i, area_o = sggx_area(wi, "surface", alpha, None), sggx_area(wo, "surface", alpha, None)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 
@@ -299,4 +300,6 @@ def _facet(table: Table, wi: Vector, wo: Vector) -> Channels:
 
 
 def _product(scale: Channels, shape: Channels, valid: Array) -> Channels:
+    # a cubic may fall below its points
+    scale = tuple(at_least(value, 0.0) for value in scale)
     return tuple(jnp.where(valid, pick(scale, c) * pick(shape, c), 0.0) for c in range(count(scale, shape)))

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.distributions import ggx_density, ggx_masking, ggx_sample
@@ -47,7 +47,7 @@ def widths(table: Table, wi: Vector) -> tuple[list[Array], list[Array]]:
             assert table.facet is not None
             return jnp.asarray(table.facet[0].alpha) * jnp.ones_like(wi[2])
         alphas = take(row, columns.alpha)
-        return sum(alphas[1:], alphas[0]) / len(alphas)
+        return at_most(at_least(sum(alphas[1:], alphas[0]) / len(alphas), 1e-4), 1.0)
 
     return [width(columns) for columns in table.reflected], [width(columns) for columns in table.transmitted]
 

@@ -190,6 +190,7 @@ def _circle(cap: Cap, t: Array) -> tuple[Array, Array, Array]:
 
 def _arc(a: Array, b: Array) -> tuple[Array, Array]:
     """Azimuths in [0, pi] between which a + b cos(phi) > 0."""
+    a = jnp.where((a == 0) & (b == 0), 1.0, a)  # the boundary itself: on panels without extent
     length = jnp.arctan2(safe_sqrt((b - a) * (b + a)), -a)
     start = jnp.where(b > 0, 0.0, jnp.pi - length)
     return start, start + length
