@@ -8,14 +8,17 @@ from benchmarks.suite import Directions
 FLOOR = 0.01
 """Share of the value of a Lambertian surface of the same albedo below which a value counts as that."""
 
+LEAST = 1e-12
+"""Albedo that stands for all smaller ones: what is less than that of the light is told apart by nobody."""
+
 Values = NDArray[np.float64]
 """BSDF values of pairs, (n, C)."""
 
 WORDS = f"""\
 Relative L2 error: the root of sum w (f - f*)^2 / sum w f*^2 over all pairs and channels, f* the truth, w = cos_i cos_o.
 Worst error: the largest |f - f*| / scale, where scale is the larger of f* and {100 * FLOOR:g} % of the value that a
-Lambertian surface of the same albedo (that light, side and channel) would have. Error of the albedo: the largest
-difference of a directional albedo (any light of the set, side and channel), as a share of the light."""
+Lambertian surface of the same albedo (that light, side and channel; 1e-12 at least) would have. Error of the albedo:
+the largest difference of a directional albedo (any light of the set, side and channel), as a share of the light."""
 
 
 def relative_l2(error: Values, truth: Values, weights: NDArray[np.float64]) -> float:
@@ -32,7 +35,7 @@ def scale(truth: Values, albedo: NDArray[np.float64], directions: Directions) ->
     """
     reflected, transmitted = albedo[:, directions.light]
     same = np.where(directions.transmits[:, None], transmitted, reflected)
-    return np.maximum(np.maximum(np.abs(truth), FLOOR * same / np.pi), np.finfo(float).tiny)
+    return np.maximum(np.abs(truth), FLOOR * np.maximum(same, LEAST) / np.pi)
 
 
 def worst(error: Values, scale: Values) -> float:

@@ -107,7 +107,13 @@ def extreme_stack(kind, generator):
 
 @pytest.mark.parametrize(
     ("kind", "dtype"),
-    [("media", "float32"), ("faces", "float32"), ("metal", "float64"), ("tilted", "float32"), ("media", "float64")],
+    [
+        ("faces", "float32"),
+        ("metal", "float64"),
+        ("tilted", "float32"),
+        pytest.param("media", "float32", marks=pytest.mark.slow),
+        pytest.param("media", "float64", marks=pytest.mark.slow),
+    ],
 )
 def test_finite_over_the_box(kind, dtype):
     generator = np.random.default_rng(3)

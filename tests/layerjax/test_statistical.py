@@ -182,7 +182,12 @@ BOX = {
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"), [("over metal", jnp.float64), ("through", jnp.float32), ("over diffuse", jnp.float32)]
+    ("name", "dtype"),
+    [
+        ("through", jnp.float32),
+        pytest.param("over metal", jnp.float64, marks=pytest.mark.slow),
+        pytest.param("over diffuse", jnp.float32, marks=pytest.mark.slow),
+    ],
 )
 def test_values_and_gradients_are_finite_over_the_box(name, dtype):
     rng = np.random.default_rng(11)
