@@ -225,12 +225,10 @@ class Statistical(Transport):
         for above, below in zip(tables[0].transmitted, tables[1].transmitted, strict=True):
             assert above.alpha is not None
             assert below.alpha is not None
-            scales, alphas = (
-                [jnp.where(downward, x, y) for x, y in zip(take(rows[0], first), take(rows[1], second), strict=True)]
-                for first, second in ((above.scale, below.scale), (above.alpha, below.alpha))
-            )
+            scales = _either(downward, take(rows[0], above.scale), take(rows[1], below.scale))
+            alphas = _either(downward, take(rows[0], above.alpha), take(rows[1], below.alpha))
             shape = tuple(leaving * leaving * _lobe(h, a, b, alpha) for alpha in alphas)  # per solid angle outside
-            lobes.append(_product(tuple(scales), shape, valid))
+            lobes.append(_product(scales, shape, valid))
         return lobes
 
     def _integrated(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
@@ -271,6 +269,10 @@ def _is_diffuse(base: Surface | None) -> bool:
 
 def _same(w: Vector) -> Vector:
     return w
+
+
+def _either(chosen: Array, a: Channels, b: Channels) -> Channels:
+    return tuple(jnp.where(chosen, pick(a, c), pick(b, c)) for c in range(count(a, b)))
 
 
 def _summed(lobes: list[Channels]) -> Channels:
