@@ -15,6 +15,9 @@ from benchmarks.truth import Judged
 from fits.pictures import CYCLE, GREY, INK, STYLE
 
 MARKERS = "osD^vP*"
+HIGHEST = 10.0
+"""Larger errors are drawn as this: they only say that the model is of no use there."""
+
 LOWEST = 1e-6  # errors below it are drawn there: exact models would stretch the axis
 COLUMNS = 4
 
@@ -62,7 +65,7 @@ def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], judged: d
         if not here:
             continue
         times = np.array([amortised(row) for row in here])
-        errors = np.array([max(floored(row, judged), LOWEST) for row in here])
+        errors = np.array([min(max(floored(row, judged), LOWEST), HIGHEST) for row in here])
         panel.plot(times, errors, marker, color=colour, markersize=2.0, markeredgewidth=0, alpha=0.35)
         low, middle, high = np.quantile(errors, [0.25, 0.5, 0.75])
         open_mark = float(np.mean([row.truth_limits for row in here])) >= 0.5
