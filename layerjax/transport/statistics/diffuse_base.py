@@ -24,6 +24,7 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Stack, optical_depths
 from layerjax.surfaces import Lambertian, Surface
 from layerjax.transport.adding_doubling import AddingDoubling, Solved
+from layerjax.transport.statistics.diffuse import closed_form, indirect_energy
 from layerjax.transport.statistics.tables import GRAZING, index_below, look_up, points, precision
 
 NODES = 24
@@ -73,8 +74,10 @@ def _closed_form(bare: Stack, base: Surface, solver: AddingDoubling, state: Solv
     _, arriving = energies(at_least(points(dtype), GRAZING), 1.0)
     back = jnp.sum(2.0 * w * x * energies(x, -1.0)[0], axis=-1)
     leaving = jnp.sum(2.0 * w * x * energies(x, 1.0)[1], axis=-1) / (ior * ior)  # by reciprocity
-    kept = 1.0 - albedo * back
-    return DiffuseBase(arriving.T, albedo / (np.pi * ior * ior * kept), albedo * leaving / kept)
+    one = jnp.ones_like(back)
+    return DiffuseBase(
+        arriving.T, closed_form(one, one, back, albedo, ior), indirect_energy(one, leaving, back, albedo)
+    )
 
 
 def diffuse_value(part: DiffuseBase, wi: Vector, wo: Vector) -> Channels:
