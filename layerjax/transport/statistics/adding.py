@@ -17,8 +17,8 @@ from layerjax._numerics import at_least
 LEAST_ESCAPE = 1e-6
 """Of light between two elements, the share that stands for all smaller ones to leave at a turn."""
 
-LEAST_ENERGY = 1e-9
-"""Added to an energy that a mean of variances is divided by."""
+LEAST_ENERGY = 1e-12
+"""Energy below which a mean of variances is not formed: squares of it are divided by in derivatives."""
 
 
 class Element(NamedTuple):
@@ -75,8 +75,8 @@ def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
     inverse = escapes(between)
     m = times(times(times(above.t0, element.r12), above.ti), inverse)
     # mean number of further turns between the two, and the variance of them
-    total = jnp.sum(between, axis=0)
-    rr = total / at_least(1.0 - total, LEAST_ESCAPE)
+    turned = jnp.sum(between, axis=0)
+    rr = turned / at_least(1.0 - turned, LEAST_ESCAPE)
     turns = rr * (element.widening + above.s_ri)
     lobe = Lobe(m, above.s_ti + above.jacobian * (above.s_t0 + element.widening + turns))  # Eq. (36)
 
@@ -86,8 +86,10 @@ def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
     back = times(times(times(element.t21, above.ri), element.t12), inverse)
     r21, crossed = jnp.sum(element.r21, axis=0), jnp.sum(back, axis=0)
     through = element.down + down * (element.up + above.s_ri + turns)
-    known = r21 + LEAST_ENERGY  # where hardly any light returns, its width is that of the element alone
-    mean = (known * element.widening + crossed * through) / (known + crossed)  # Eq. (51)
+    total = r21 + crossed
+    returns = total > LEAST_ENERGY  # where hardly any light does, its width is that of the element alone
+    share = jnp.where(returns, crossed / jnp.where(returns, total, 1.0), 0.0)
+    mean = element.widening + share * (through - element.widening)  # Eq. (51)
     return lobe, Above(
         t0=times(times(above.t0, element.t12), inverse),  # Eq. (31)
         ri=plus(element.r21, back),  # Eq. (30)
