@@ -109,7 +109,7 @@ def extreme_stack(kind, generator):
     ("kind", "dtype"),
     [
         ("faces", "float32"),
-        ("metal", "float64"),
+        pytest.param("metal", "float64", marks=pytest.mark.slow),
         ("tilted", "float32"),
         pytest.param("media", "float32", marks=pytest.mark.slow),
         pytest.param("media", "float64", marks=pytest.mark.slow),

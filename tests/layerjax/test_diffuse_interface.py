@@ -246,6 +246,7 @@ def test_table_states_its_error():
         assert ranks[8, 8] < 5e-4
 
 
+@pytest.mark.slow
 def test_rebuilding():
     coarse, shipped = diffuse_interface.make(coarse=True, report=lambda line: None), load("diffuse_interface")
     assert set(coarse) == set(shipped)

@@ -43,7 +43,8 @@ ANGLES = np.array([(0.3, 0.1), (1.0, 2.5), (1.2, -1.0), (pi - 0.3, 3.0), (pi - 1
 INCIDENT = {"from above": (0.6, 0.2), "from below": (pi - 0.6, 0.2)}
 
 TRANSPORTS = {
-    "deterministic": lambda paths: lj.AddingDoubling(),
+    # more azimuths than the default, which errs by up to 1.5 % where an axis is tilted
+    "deterministic": lambda paths: lj.AddingDoubling(ordinates=(14, 32)),
     "walk": lambda paths: lj.RandomWalk(paths=paths),
 }
 
