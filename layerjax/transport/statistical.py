@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
+from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
 from layerjax.distributions import ggx_density, ggx_sample, sggx_area
@@ -37,7 +37,7 @@ from layerjax.transport.statistics.drawing import (
     take,
     widths,
 )
-from layerjax.transport.statistics.lobes import Options, Scattering
+from layerjax.transport.statistics.lobes import Options, Scattering, bounded
 from layerjax.transport.statistics.tables import (
     Table,
     folded,
@@ -67,7 +67,7 @@ class Statistical(Transport):
     """Layered statistics: any number of dielectric interfaces and media over a conductor, a diffuse base, or none.
 
     Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
-    followed), and every base.
+    followed), and every base; one that is diffuse, but not Lambertian, counts as a Lambertian of its mean albedo.
 
     Args:
         symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
@@ -75,7 +75,8 @@ class Statistical(Transport):
         microfacets: ``"multiple"``, interfaces conserve energy (FGD-infinity of the paper, by the walk of Heitz et
             al. 2016), or ``"single"``, Walter 2007: light that a facet sends into another is lost.
         scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
-            collision a crossing, as the paper has it (Eqs. 20-24).
+            collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
+            that lobe cannot be told from the light that nothing met, and both are left out.
         diffuse: light that has met a diffuse base: ``"exact"``, closed form with transmittances by adding-doubling; or
             ``"lobe"``, one GGX lobe from tables (2022), for interfaces and absorbing media over a `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
@@ -287,7 +288,7 @@ def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
 
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
-    alpha = at_most(at_least(alpha, 1e-4), 1.0)
+    alpha = bounded(alpha)  # a cubic may leave the range of its points
     area_i, area_o = sggx_area(wi, "surface", alpha, None), sggx_area(wo, "surface", alpha, None)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 

@@ -91,14 +91,22 @@ def test_symmetric_model_is_reciprocal(stack):
     assert np.any(there > 0)
 
 
-def test_forward_model_conserves_energy_in_a_furnace():
-    """A lossless slab: R + T from the lobes themselves, integrated through their samples' weights."""
-    slab = lj.Stack([lj.Interface(1.5, 0.2), lj.Interface(1.0, 0.3)])
-    reflected, transmitted = lj.albedo(slab, LIGHT, FORWARD)
-    np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-3)
-    below = LIGHT * [1, 1, -1]
-    reflected, transmitted = lj.albedo(slab, below, FORWARD)
-    np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-3)
+@pytest.mark.parametrize("theta", [0.0, 1.1, 2.3])
+def test_forward_model_conserves_energy_in_a_furnace(theta):
+    """A lossless slab: the energies of its lobes, and, within 4 standard errors, what its samples carry."""
+    slab = lj.prepare(lj.Stack([lj.Interface(1.5, 0.2), lj.Interface(1.0, 0.3)]), FORWARD)
+    wi = lj.direction(theta, 0.3)
+    np.testing.assert_allclose(sum(lj.albedo(slab, wi)), 1.0, atol=1e-3)
+    _, _, weight = lj.sample(slab, jnp.broadcast_to(wi, (200_000, 3)), jax.random.key(4))
+    assert abs(float(jnp.mean(weight)) - 1.0) < 4 * float(jnp.std(weight)) / 200_000**0.5 + 1e-3
+
+
+def test_what_nothing_meets_is_not_in_the_albedo():
+    """Forward haze alone: its scattered light is what is not absorbed less what passes straight, exp(-tau / cos)."""
+    stack = lj.Stack([lj.Medium(0.5, 0.8, lj.HenyeyGreenstein(0.9))])
+    _, transmitted = lj.albedo(stack, LIGHT, FORWARD)
+    depth = 0.5 / LIGHT[:, 2]
+    np.testing.assert_allclose(transmitted[:, 0], np.exp(-0.2 * depth) - np.exp(-depth), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
+from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.distributions import ggx_density, ggx_masking, ggx_sample
@@ -12,9 +12,8 @@ from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.first_order import mirror
 from layerjax.transport.statistics.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistics.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
+from layerjax.transport.statistics.lobes import bounded
 from layerjax.transport.statistics.tables import Columns, Table, folded, look_up, unfolded
-
-BELOW_ONE = 1.0 - 1e-6
 
 
 def planar(w: Vector) -> Array:
@@ -47,7 +46,7 @@ def widths(table: Table, wi: Vector) -> tuple[list[Array], list[Array]]:
             assert table.facet is not None
             return jnp.asarray(table.facet[0].alpha) * jnp.ones_like(wi[2])
         alphas = take(row, columns.alpha)
-        return at_most(at_least(sum(alphas[1:], alphas[0]) / len(alphas), 1e-4), 1.0)
+        return bounded(sum(alphas[1:], alphas[0]) / len(alphas))
 
     return [width(columns) for columns in table.reflected], [width(columns) for columns in table.transmitted]
 
@@ -74,7 +73,7 @@ def draw(
         alpha = jnp.where(chosen, width, alpha)
         passes = passes | (chosen & (index >= len(reflected)))
         scatters = scatters & ~chosen
-    # what no lobe took is diffuse; without a diffuse base it is rounding, and goes to the last lobe's width 1
+    # what no lobe took is diffuse; where nothing is diffuse that is rounding, and drawn from a lobe of width 1
     light = wi if not transmitted else select(passes, folded(wi, entry), wi)
     wo = reflect(light, ggx_sample(light, alpha, u1, u2))
     if transmitted:

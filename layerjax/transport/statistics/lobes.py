@@ -188,4 +188,9 @@ def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, t
 
 def lobe_roughness(sigma: Array) -> Array:
     """GGX width of a lobe of this variance, within the range that lobes are evaluated in."""
-    return at_most(at_least(roughness(sigma), 1e-4), 1.0)
+    return bounded(roughness(sigma))
+
+
+def bounded(alpha: Array) -> Array:
+    """A GGX width kept within the range that lobes are evaluated in."""
+    return at_most(at_least(alpha, 1e-4), 1.0)

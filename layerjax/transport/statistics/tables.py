@@ -107,8 +107,8 @@ def make_table(stack: Stack, options: Options, upward: bool) -> Table:
     reflecting = len(lobes)
     within: list[Array] = []
     if found.transmitted is not None:
-        far = far + jnp.sum(found.transmitted.energy, axis=0)
         passing, within = _passing(stack, found, cosine, upward)
+        far = sum((energy for energy, _, _ in passing), far)
         lobes += passing
     shares = [jnp.mean(energy, axis=0) for energy, _, _ in lobes]
     reached = _lobe_energies(lobes)
