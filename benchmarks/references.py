@@ -36,11 +36,14 @@ UNLIMITED = 10_000
 
 SLAB = {"thickness": 1.0, "g": 0.7, "albedo": 0.99}
 STREAMS = (8, 12, 16, 24, 32, 48, 64, 96, 128)
-RESOLUTIONS = ((6, 8), (8, 12), (8, 16), (12, 16), (12, 24), (16, 24), (16, 32), (24, 32), (24, 48), (32, 48), (32, 64))
+RESOLUTIONS = (
+    *((6, 8), (6, 10), (8, 8), (8, 10), (8, 12), (10, 12), (10, 16), (12, 16), (14, 16), (16, 16), (16, 20), (16, 24)),
+    *((20, 24), (20, 32), (24, 32), (24, 48), (32, 48), (32, 64)),
+)
 """Nodes and modes of `AddingDoubling` that are tried, and below nodes and azimuths where an axis needs them."""
 FINEST, FINE = (64, 96), (32, 64)
 """What counts as exact: for the full BRDF, and where 1 % is asked for."""
-ANISOTROPIC_RESOLUTIONS = ((4, 8), (6, 12), (8, 16), (10, 16), (12, 24), (16, 24), (16, 32))
+ANISOTROPIC_RESOLUTIONS = ((4, 8), (6, 12), (8, 16), (10, 16), (10, 20), (10, 24), (12, 24), (16, 24), (16, 32))
 
 COAT = lj.Stack([lj.Interface(1.5, 0.3), lj.Medium(1.0, 0.95, lj.HenyeyGreenstein(0.7))], lj.Lambertian(0.5))
 FLAKES = lj.Stack([lj.Medium(2.0, 0.95, lj.SGGX("surface", 0.4)), lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.5))])

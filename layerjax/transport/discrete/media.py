@@ -26,11 +26,14 @@ from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straig
 Pair = tuple[Array, Array]
 """Reflection and transmission, light from above."""
 
-THIN = 0.7e-5
-"""Largest thickness of the slab that doubling starts from (no power of two times a round number: derivatives by
-differences do not straddle a change of the number of steps)."""
+THIN = 0.7e-4
+"""Largest thickness of the slab that doubling starts from: a relative error of 1e-6.
 
-MOST_STEPS = 31
+It is no power of two times a round number, so that derivatives by differences do not straddle a change of the number of
+steps.
+"""
+
+MOST_STEPS = 28
 """Doublings that reach the thickest medium of the box, 1e4."""
 
 

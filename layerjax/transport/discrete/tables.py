@@ -1,7 +1,8 @@
 """Where the several-event part of a solved stack is read off: tables over directions, cubic between their points.
 
 What is tabulated is f / ior_o^2 (mu_i + mu_o), a smooth function down to grazing light on both sides, made reciprocal.
-A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over.
+A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over. Modes are
+summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
 """
 
 from collections.abc import Callable
@@ -22,12 +23,16 @@ from layerjax.transport.discrete.operators import Layer, Operator, turned
 AZIMUTH_DENSITY = 2
 """Azimuths of a table for each ordinate of the grid."""
 
+MODE_DENSITY = 3
+"""Steps of a table from azimuth 0 to pi for each Fourier mode."""
+
 
 class Tables(eqx.Module):
     """The rest of the BSDF, and the energies of all of it.
 
-    values: for each channel an array over (quadrant and direction out, direction in, modes), the modes left out with
-    ordinates; quadrants: above to above, and with a stack that transmits below to below, and above to below.
+    values: for each channel an array over (quadrant and direction out, direction in, azimuth), the azimuth left out
+    with ordinates and with one mode; quadrants: above to above, and with a stack that transmits below to below, and
+    above to below. `steps`: of the azimuth from 0 to pi, with one more point beyond either end.
 
     near and far: energy scattered to the same side and the other, as a share of what meets an event: a row for light
     from above and one for light from below, per channel, for each direction in.
@@ -39,6 +44,7 @@ class Tables(eqx.Module):
     far: Array
     opaque: bool = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
+    steps: int | None = eqx.field(static=True)
 
 
 def make_tables(
@@ -48,6 +54,7 @@ def make_tables(
     top, bottom = grid.regions[0], grid.regions[-1]
     count = 1 if azimuths is None else azimuths
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
+    steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
     lifts = {id(region): _lift(grid, region, modes, azimuths) for region in (top, bottom)}
 
     def kernel(flux: Operator, out: Region) -> Operator:
@@ -64,10 +71,9 @@ def make_tables(
         mean = 0.5 * (there + jnp.swapaxes(back, -1, -2))
         values = mean * (jnp.repeat(out.cosine, count)[:, None] + jnp.repeat(into.cosine, count))
         fine = lifts[id(out)] @ values @ jnp.swapaxes(lifts[id(into)], -1, -2)
-        if azimuths is not None:
+        if steps is None:
             return fine[:, 0]
-        twice = jnp.where(jnp.arange(values.shape[1]) == 0, 1.0, 2.0)
-        return jnp.moveaxis(fine, 1, -1) * twice.astype(fine.dtype)
+        return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
 
     reflected = kernel(whole.reflect_top.rest, top)
     quadrants = [table(reflected, reflected, top, top)]
@@ -95,7 +101,7 @@ def make_tables(
             )
     shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])
     stacked = [jnp.stack([jnp.broadcast_to(row, shape) for row in rows]) for rows in (near, far)]
-    return Tables(grid, values, stacked[0], stacked[1], opaque, azimuths)
+    return Tables(grid, values, stacked[0], stacked[1], opaque, azimuths, steps)
 
 
 def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -122,18 +128,18 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     start = (quadrant * (tables.values[0].shape[0] // (1 if tables.opaque else 3)))[..., None]
     points_out = _points(tables, out, ior_out, 0.0)
     points_into = _points(tables, into, ior_into, np.pi)  # a table's azimuths are those of travel
-    cosines: Array | None = None
-    if tables.azimuths is None:
-        cosines = _azimuth_modes(into, out, tables.values[0].shape[-1])
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
-    rows, columns = (start + points_out[0])[..., :, None], points_into[0][..., None, :]
+    index = (start + points_out[0])[..., :, None] * tables.values[0].shape[1] + points_into[0][..., None, :]
     weights = points_out[1][..., :, None] * points_into[1][..., None, :]
+    if tables.steps is not None:
+        first, around = _azimuth_stencil(into, out, tables.steps)
+        index = index[..., None] * tables.values[0].shape[2] + first[..., None, None, None] + np.arange(4)
+        weights = weights[..., None] * around[..., None, None, :]
+    axes = tuple(range(-3 if tables.steps is not None else -2, 0))
     channels = []
     for values in tables.values:
-        entries = values[rows, columns]
-        if cosines is not None:
-            entries = jnp.sum(entries * cosines[..., None, None, :], axis=-1)
-        channels.append(factor * at_least(jnp.sum(weights * entries, axis=(-2, -1)), 0.0))
+        entries = values.reshape(-1).at[index].get(mode="promise_in_bounds")
+        channels.append(factor * at_least(jnp.sum(weights * entries, axis=axes), 0.0))
     return tuple(channels)
 
 
@@ -186,12 +192,19 @@ def _points(tables: Tables, w: Vector, ior: Array, turn: float) -> tuple[Array, 
     return index.reshape(*index.shape[:-2], 16), weight.reshape(*weight.shape[:-2], 16)
 
 
-def _azimuth_modes(wi: Vector, wo: Vector, modes: int) -> Array:
-    """cos(m phi) along a new last axis, phi the azimuth between the directions of travel."""
+def _azimuth_stencil(wi: Vector, wo: Vector, steps: int) -> tuple[Array, Array]:
+    """First index and, along a new last axis, weights for the azimuth between the directions of travel."""
     sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
     at_pole = (sine == 0) & (cosine == 0)
-    phi = jnp.arctan2(jnp.where(at_pole, 0.0, sine), jnp.where(at_pole, 1.0, cosine))
-    return jnp.cos(phi[..., None] * np.arange(modes))
+    place = (steps / np.pi) * jnp.arctan2(jnp.abs(jnp.where(at_pole, 0.0, sine)), jnp.where(at_pole, 1.0, cosine))
+    first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)), 0, steps - 1)
+    return first.astype(jnp.int32), jnp.stack(cubic(place - first + 1.0), axis=-1)
+
+
+def _waves(modes: int, steps: int) -> np.ndarray:
+    """Matrix from Fourier modes to the azimuths of a table, (modes, points)."""
+    phi = np.pi / steps * np.arange(-1, steps + 2)
+    return np.where(np.arange(modes) == 0, 1.0, 2.0)[:, None] * np.cos(np.outer(np.arange(modes), phi))
 
 
 def _lift(grid: Grid, region: Region, modes: int, azimuths: int | None) -> Array:
