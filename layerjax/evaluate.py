@@ -283,9 +283,12 @@ def _in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Ar
         _, results = jax.lax.scan(step, None, blocks)
         parts.append(results.reshape(whole, -1))
     if whole < pairs:
-        missing = -(pairs - whole) % chunk  # a vector of zeros is no direction: it gives 0
-        rest = [jnp.pad(array[whole:], ((0, missing), (0, 0))) for array in flat]
-        parts.append(run(*rest)[: pairs - whole])
+        left = pairs - whole
+        number = -(-left // chunk)
+        even = -(-left // number)
+        # a vector of zeros is no direction: it gives 0
+        rest = [jnp.pad(array[whole:], ((0, number * even - left), (0, 0))) for array in flat]
+        parts.append(_block(function, even, *rest)[:left])
     return jnp.concatenate(parts).reshape(*batch, -1)
 
 

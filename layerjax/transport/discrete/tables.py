@@ -5,7 +5,9 @@ A table is finer than the grid: polynomials in the cosine and Fourier series in 
 summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
 """
 
-from collections.abc import Callable
+import itertools
+import math
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -25,6 +27,10 @@ AZIMUTH_DENSITY = 2
 
 MODE_DENSITY = 3
 """Steps of a table from azimuth 0 to pi for each Fourier mode."""
+
+
+Points = tuple[Array, Array]
+"""Four offsets into a table along one of its axes, and their weights: (4, ...) each."""
 
 
 class Tables(eqx.Module):
@@ -125,22 +131,38 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         scale = jnp.where(wo[2] < 0, bottom, top) ** 2
         quadrant = jnp.where(out[2] > 0, 0, jnp.where(into[2] > 0, 2, 1))
     out, into = _inside(out, valid), _inside(into, valid)
-    start = (quadrant * (tables.values[0].shape[0] // (1 if tables.opaque else 3)))[..., None]
-    points_out = _points(tables, out, ior_out, 0.0)
-    points_into = _points(tables, into, ior_into, np.pi)  # a table's azimuths are those of travel
-    factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
-    index = (start + points_out[0])[..., :, None] * tables.values[0].shape[1] + points_into[0][..., None, :]
-    weights = points_out[1][..., :, None] * points_into[1][..., None, :]
+    shape = tables.values[0].shape
+    start = quadrant * (shape[0] // (1 if tables.opaque else 3) * math.prod(shape[1:]))
+    axes = [
+        *_points(tables, out, ior_out, 0.0, math.prod(shape[1:])),
+        *_points(tables, into, ior_into, np.pi, math.prod(shape[2:])),  # a table's azimuths are those of travel
+    ]
     if tables.steps is not None:
-        first, around = _azimuth_stencil(into, out, tables.steps)
-        index = index[..., None] * tables.values[0].shape[2] + first[..., None, None, None] + np.arange(4)
-        weights = weights[..., None] * around[..., None, None, :]
-    axes = tuple(range(-3 if tables.steps is not None else -2, 0))
-    channels = []
-    for values in tables.values:
-        entries = values.reshape(-1).at[index].get(mode="promise_in_bounds")
-        channels.append(factor * at_least(jnp.sum(weights * entries, axis=axes), 0.0))
-    return tuple(channels)
+        axes.append(_azimuth_points(into, out, tables.steps))
+    factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
+    found = _contracted(tables.values, start, axes)
+    return tuple(factor * at_least(value, 0.0) for value in found)
+
+
+def _contracted(values: Channels, start: Array, axes: Sequence[Points]) -> Channels:
+    """Sum of the entries at start and the offsets of all axes, times their weights; four along the last axis a step."""
+    flat = [value.reshape(-1) for value in values]
+    *outer, (offsets, weights) = axes
+
+    def step(sums: Channels, which: Array) -> tuple[Channels, None]:
+        place, weight = start, jnp.ones((), weights.dtype)
+        for (near, share), k in zip(outer, which, strict=True):
+            place, weight = place + near[k], weight * share[k]
+        added = []
+        for entries in flat:
+            read = [weights[k] * entries.at[place + offsets[k]].get(mode="promise_in_bounds") for k in range(4)]
+            added.append(weight * (read[0] + read[1] + read[2] + read[3]))
+        return tuple(total + more for total, more in zip(sums, added, strict=True)), None
+
+    shape = jnp.broadcast_shapes(start.shape, *(weights.shape[1:] for _, weights in axes))
+    zero = jnp.zeros(shape, weights.dtype)
+    every = np.asarray(list(itertools.product(range(4), repeat=len(outer))), np.int32)
+    return jax.lax.scan(step, (zero,) * len(flat), jnp.asarray(every))[0]
 
 
 def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
@@ -149,16 +171,13 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     valid = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if tables.opaque:
         valid = valid & above
-    row = jnp.where(above | tables.opaque, 0, 1)[..., None]
+    row = jnp.where(above | tables.opaque, 0, 1)
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
-    points = _points(tables, _inside(wi, valid), ior, np.pi)
+    axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
     energies: list[Channels] = []
     for table in (tables.near, tables.far):
-        found = []
-        for c in range(table.shape[1]):
-            total = jnp.sum(points[1] * table[row, c, points[0]], axis=-1)
-            found.append(jnp.where(valid, at_least(total, 0.0), 0.0))
-        energies.append(tuple(found))
+        found = _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
+        energies.append(tuple(jnp.where(valid, at_least(value, 0.0), 0.0) for value in found))
     return energies[0], energies[1]
 
 
@@ -175,30 +194,32 @@ def _inside(w: Vector, valid: Array) -> Vector:
     return (jnp.where(valid, w[0], 0.6), jnp.where(valid, w[1], 0.0), jnp.where(valid, jnp.abs(w[2]), 0.8))
 
 
-def _points(tables: Tables, w: Vector, ior: Array, turn: float) -> tuple[Array, Array]:
-    """Indices into a table and weights, along a new last axis."""
+def _points(tables: Tables, w: Vector, ior: Array, turn: float, stride: int) -> list[Points]:
+    """Where a direction lies in a table whose directions are `stride` apart: in cosine, and with ordinates azimuth."""
     first, polar = stencil(tables.grid, ior, w[2], w[0] * w[0] + w[1] * w[1])
-    index, weight = first[..., None] + np.arange(4), jnp.stack(polar, axis=-1)
     if tables.azimuths is None:
-        return index, weight
+        return [(stride * _four(first), jnp.stack(polar))]
     count = AZIMUTH_DENSITY * tables.azimuths
     at_pole = (w[0] == 0) & (w[1] == 0)
     phi = jnp.arctan2(jnp.where(at_pole, 0.0, w[1]), jnp.where(at_pole, 1.0, w[0])) + turn
     place = phi * (count / (2.0 * np.pi))
     corner = jax.lax.stop_gradient(jnp.floor(place))
-    around = (corner.astype(jnp.int32)[..., None] - 1 + np.arange(4)) % count
-    index = index[..., :, None] * count + around[..., None, :]
-    weight = weight[..., :, None] * jnp.stack(cubic(place - corner + 1.0), axis=-1)[..., None, :]
-    return index.reshape(*index.shape[:-2], 16), weight.reshape(*weight.shape[:-2], 16)
+    around = _four(corner.astype(jnp.int32) - 1) % count
+    weights = jnp.stack(cubic(place - corner + 1.0))
+    return [(stride * count * _four(first), jnp.stack(polar)), (stride * around, weights)]
 
 
-def _azimuth_stencil(wi: Vector, wo: Vector, steps: int) -> tuple[Array, Array]:
-    """First index and, along a new last axis, weights for the azimuth between the directions of travel."""
+def _azimuth_points(wi: Vector, wo: Vector, steps: int) -> Points:
+    """Where the azimuth between the directions of travel lies in a table."""
     sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
     at_pole = (sine == 0) & (cosine == 0)
     place = (steps / np.pi) * jnp.arctan2(jnp.abs(jnp.where(at_pole, 0.0, sine)), jnp.where(at_pole, 1.0, cosine))
     first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)), 0, steps - 1)
-    return first.astype(jnp.int32), jnp.stack(cubic(place - first + 1.0), axis=-1)
+    return _four(first.astype(jnp.int32)), jnp.stack(cubic(place - first + 1.0))
+
+
+def _four(first: Array) -> Array:
+    return jnp.stack([first + k for k in range(4)])
 
 
 def _waves(modes: int, steps: int) -> np.ndarray:
