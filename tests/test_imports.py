@@ -66,6 +66,7 @@ LAYERS = [
     "layerjax.transport.statistics.drawing",
     "layerjax.transport.statistical",
     "layerjax.transport",
+    "layerjax.transport.automatic",
     "layerjax.evaluate",
     "layerjax.goniophotometer",
     "layerjax",
