@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from fits.formats.csv import write_csv as write_csv
     from fits.geometry import Geometry as Geometry
     from fits.geometry import slices as slices
+    from fits.identifiability import Combination as Combination
     from fits.likelihood import Noise as Noise
     from fits.measurements import Measurements as Measurements
     from fits.optimise import fit as fit
@@ -43,6 +44,7 @@ _HOMES = {
     "write_csv": "formats.csv",
     "Geometry": "geometry",
     "slices": "geometry",
+    "Combination": "identifiability",
     "Noise": "likelihood",
     "Measurements": "measurements",
     "fit": "optimise",

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.problem import Model, Problem
+from fits.problem import Model, Problem, half_squares
 
 TOLERANCE = 1e-12
 MOST_STEPS = 500
@@ -20,7 +20,7 @@ MOST_STEPS = 500
 
 def cost(model: Model, s: Any) -> Any:
     """Half the sum of squared residuals at `s` in the unit box."""
-    return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(s)))
+    return half_squares(model.residuals(model.box.from_unit(s)))
 
 
 def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:

@@ -149,7 +149,10 @@ def compare(arguments: Namespace) -> int:
     from fits.compare import compare as run_compare
 
     candidates = _candidates([Path(directory) for directory in arguments.directories])
-    tables.print_table(tables.comparison_table(run_compare(candidates)), sys.stdout)
+    compared = run_compare(candidates)
+    tables.print_table(tables.comparison_table(compared), sys.stdout)
+    for sentence in compared.verdict:
+        print(sentence)
     if arguments.out:
         from fits.report import comparison_page
 

@@ -11,6 +11,10 @@ import numpy as np
 from fits.fit_result import Fit
 from fits.posterior import Posterior
 
+LEANING, CLEAR = 2.0, 10.0
+"""Differences in AIC and BIC below the first say nothing, above the second leave hardly any doubt (Burnham & Anderson
+2002, Sec. 2.6; Kass & Raftery 1995)."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -42,10 +46,15 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows, best first; what they are sorted by ("loo", "aic" or "chi_square"); what to mind in reading them."""
+    """Fits of the same data, side by side.
+
+    rows: best first. sorted_by: "loo", "aic" or "chi_square". verdict: a sentence for each fit behind the best, that
+    says whether the data prefer the best to it. notes: what to mind in reading them.
+    """
 
     rows: tuple[Row, ...]
     sorted_by: str
+    verdict: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -76,7 +85,8 @@ def compare(candidates: Mapping[str, Fit | Posterior]) -> Comparison:
     else:
         rows.sort(key=lambda row: row.chi_square)
     sorted_by = "loo" if loo else "aic" if first.is_posterior else "chi_square"
-    return Comparison(tuple(rows), sorted_by, tuple(_notes(fits, rows, len(posteriors))))
+    verdict = tuple(_preference(rows[0], row, sorted_by) for row in rows[1:])
+    return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(fits, rows, len(posteriors))))
 
 
 def _row(name: str, fit: Fit, loo: dict[str, float]) -> Row:
@@ -98,6 +108,31 @@ def _row(name: str, fit: Fit, loo: dict[str, float]) -> Row:
         converged=fit.converged,
         at_bound=fit.at_bound,
     )
+
+
+def _preference(best: Row, other: Row, sorted_by: str) -> str:
+    """Whether the data prefer one fit to another, in one sentence.
+
+    A best fit that misses the data by more than their noise says that the noise is larger than stated: differences in
+    log-likelihood are then divided by its reduced chi-square (Burnham & Anderson 2002, Sec. 2.5, QAIC).
+    """
+    if sorted_by == "chi_square":
+        return f"{best.name} comes closer than {other.name}; without a likelihood it cannot be said whether by chance."
+    excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
+    counted = f" (the scatter that {best.name} leaves counted as noise)" if excess > 1.0 else ""
+    if sorted_by == "loo":
+        ahead, error = other.loo_behind / excess, other.loo_behind_error / excess
+        lead = 2.0 * (ahead - 2.0 * error)
+        differ = f"it expects new data with a log-density higher by {ahead:.1f} ± {error:.1f}{counted}"
+    else:
+        gain = 2.0 * (best.log_likelihood - other.log_likelihood)
+        spared = gain / excess - gain
+        aic, bic = other.aic - best.aic + spared, other.bic - best.bic + spared
+        lead = min(aic, bic)
+        differ = f"AIC lower by {aic:.1f}, BIC by {bic:.1f}{counted}"
+    if lead < LEANING:
+        return f"The data do not tell {best.name} from {other.name}: {differ}."
+    return f"The data {'prefer' if lead > CLEAR else 'slightly prefer'} {best.name} to {other.name}: {differ}."
 
 
 def _leave_one_out(posteriors: Mapping[str, Posterior]) -> dict[str, dict[str, float]]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.identifiability import Combination
 from fits.problem import Model, Problem
 
 Floats = NDArray[np.float64]
@@ -30,7 +31,7 @@ class Fit:
     where the data leave it open; those of the others hold with the parameters in `at_bound` kept there.
     covariance: (P, P). cost: half the sum of squared residuals. iterations: steps of the solver to this minimum.
     condition_number: of the information about the parameters, each scaled to unit length.
-    open_directions: (singular value relative to the largest, {name: weight in units of the box}).
+    unresolved: the combinations of parameters that the data alone do not separate, worst first.
     minima: best first. alternatives: those among them, other than the best, that explain the data equally well.
     """
 
@@ -44,7 +45,7 @@ class Fit:
     status: str
     iterations: int
     condition_number: float
-    open_directions: tuple[tuple[float, dict[str, float]], ...]
+    unresolved: tuple[Combination, ...]
     minima: tuple[Minimum, ...]
     alternatives: tuple[Minimum, ...]
 

@@ -131,7 +131,7 @@ def fit_problem(
         status=_status(problem, ends, minima, at_bound, converged, found, notes),
         iterations=int(ends.steps[best]),
         condition_number=found.condition_number,
-        open_directions=found.open_directions,
+        unresolved=found.unresolved,
         minima=minima,
         alternatives=(),
     )
@@ -243,7 +243,7 @@ def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, A
         vectors, costs, _, success = _solve_batch(repeat, starts)
         best = jnp.argmin(jnp.where(success, costs, jnp.inf))
         vector, cost, converged = vectors[best], costs[best], success[best]
-        rows, prior_rows = repeat.information_root(vector)
+        rows, prior_rows, _ = jax.jacfwd(repeat.information_rows)(vector)
         width = model.box.slope(vector)
         rows, prior_rows = rows * width, prior_rows * width
         covariance = jnp.linalg.pinv(rows.T @ rows + prior_rows.T @ prior_rows, hermitian=True)
@@ -323,8 +323,8 @@ def _status(
         words.append(f"{total - good} of {total} starts failed")
     if at_bound:
         words.append(f"at a bound: {', '.join(at_bound)}; the errors of the others hold with them kept there")
-    if found.open_directions:
-        words.append(f"the data leave {len(found.open_directions)} direction(s) open")
+    if found.unresolved:
+        words.append(f"the data leave {len(found.unresolved)} direction(s) unresolved")
     if problem.objective != "likelihood":
         words.append(
             f"objective {problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"

@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, get_args
 
 import equinox as eqx
@@ -20,6 +20,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 import layerjax as lj
+from fits.compiled import Static, run
 from fits.likelihood import (
     DEFAULT_FLOOR,
     DEFAULT_RELATIVE,
@@ -96,37 +97,27 @@ class Model(eqx.Module):
         The third of them, where sigma varies with the parameters, is that of log sigma. `fixed_sigma` (N, C), where it
         is finite, replaces sigma: the first step towards a fit of noise levels.
         """
-        if self.objective != "likelihood":
-            cosine = jnp.abs(self.wi[:, 2:])
-            return (named_residual(self.objective, self.predict(vector), self.values, cosine),)
         predicted, sigma = self._predicted_and_sigma(vector)
         if fixed_sigma is not None:
             sigma = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma)
-        z = (predicted - self.values) / sigma
-        parts = [tail_residual(z, self.tails, self.degrees_of_freedom), self.box.prior_residuals(vector)]
-        if self.varying:
-            parts.append(sigma_residual(sigma, self.lowest))
-        return tuple(parts)
+        return self._residuals(vector, predicted, sigma)
 
-    def information_root(self, vector: Array) -> tuple[Array, Array]:
-        """Rows A whose A'A is the Fisher information: of the data, (rows, P), and of the prior, (P, P).
+    def information_rows(self, vector: Array) -> tuple[Array, Array, Array]:
+        """Of the data (rows,) and of the prior (P,): their Jacobian A has the Fisher information A'A; and the cost.
 
         The expected information needs first derivatives only and is never indefinite; for Gaussian noise that is known
-        it is J'J. For a named objective: the Jacobian of its residuals.
+        it is J'J. For a named objective: its residuals. The cost is half the sum of squared residuals.
         """
+        predicted, sigma = self._predicted_and_sigma(vector)
+        residuals = self._residuals(vector, predicted, sigma)
+        cost = half_squares(residuals)
         if self.objective != "likelihood":
-            jacobian = jax.jacfwd(lambda v: self.residuals(v)[0].reshape(-1))(vector)
-            return jacobian, jnp.zeros((vector.size, vector.size), vector.dtype)
+            return residuals[0].reshape(-1), jnp.zeros_like(vector), cost
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
-
-        def rows(v: Array) -> Array:
-            predicted, level = self._predicted_and_sigma(v)
-            mean = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(level)).reshape(-1)
-            if not self.varying:
-                return mean
-            return jnp.concatenate([mean, jnp.sqrt(of_level) * jnp.log(level).reshape(-1)])
-
-        return jax.jacfwd(rows)(vector), jax.jacfwd(self.box.prior_residuals)(vector)
+        rows = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
+        if self.varying:
+            rows = jnp.concatenate([rows, jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)])
+        return rows, self.box.prior_residuals(vector), cost
 
     def log_likelihood_per_datum(self, vector: Array) -> Array:
         """Normalised log-density of each datum, (N, C)."""
@@ -146,6 +137,15 @@ class Model(eqx.Module):
         vector = self.box.constrain(u)
         total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def _residuals(self, vector: Array, predicted: Array, sigma: Array) -> tuple[Array, ...]:
+        if self.objective != "likelihood":
+            return (named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:])),)
+        z = (predicted - self.values) / sigma
+        parts = [tail_residual(z, self.tails, self.degrees_of_freedom), self.box.prior_residuals(vector)]
+        if self.varying:
+            parts.append(sigma_residual(sigma, self.lowest))
+        return tuple(parts)
 
     def _predicted_and_sigma(self, vector: Array) -> tuple[Array, Array]:
         parts = self.build(vector)
@@ -267,35 +267,15 @@ class Problem:
         return run(function, self.split_model, *(jnp.asarray(argument) for argument in arguments))
 
     @cached_property
-    def split_model(self) -> tuple[Any, Any]:
+    def split_model(self) -> tuple[Any, Static]:
         """The model's arrays, and what is static in it wrapped for use as a key."""
         arrays, static = eqx.partition(self.model, eqx.is_array)
-        return arrays, _Static(static)
+        return arrays, Static(static)
 
 
-class _Static:
-    """A tree without arrays as a hashable key: the hash is taken once, not at every call."""
-
-    def __init__(self, tree: Any):
-        leaves, structure = jax.tree.flatten(tree)
-        self.tree, self.key = tree, (tuple(leaves), structure)
-        self.hash = hash(self.key)
-
-    def __hash__(self) -> int:
-        return self.hash
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Static) and self.key == other.key
-
-
-def run(function: Callable[..., Any], split_model: tuple[Any, _Static], *arguments: Any) -> Any:
-    """`function(model, *arguments)` compiled; see `Problem.call`."""
-    return _run(function, split_model[1], split_model[0], *arguments)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _run(function: Callable[..., Any], static: _Static, arrays: Any, *arguments: Any) -> Any:
-    return function(eqx.combine(arrays, static.tree), *arguments)
+def half_squares(residuals: tuple[Array, ...]) -> Array:
+    """Half the sum of the squares of all residuals: the cost that a fit minimises."""
+    return 0.5 * jnp.sum(jnp.stack([jnp.sum(part**2) for part in residuals]))
 
 
 def forward(

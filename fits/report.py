@@ -147,8 +147,13 @@ def comparison_section(candidates: "Mapping[str, Fit | Posterior]", images: Pict
     """Which of several fits explains the data, as an HTML fragment."""
     from fits.compare import compare
 
-    table = tables.html_table(tables.comparison_table(compare(candidates)))
-    return _section("Comparison", table, _image(images, "comparison", "The fits beside the same data."))
+    compared = compare(candidates)
+    return _section(
+        "Comparison",
+        _sentences(compared.verdict),
+        tables.html_table(tables.comparison_table(compared)),
+        _image(images, "comparison", "The fits beside the same data."),
+    )
 
 
 def source_name(data: Measurements) -> str:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fits.fit_result import Fit
     from fits.posterior import Posterior
 
-SCHEMA = 1
+SCHEMA = 2
 REPORT, SUMMARY = "report.html", "summary.json"
 FIT, DATA, PROBLEM, FITTED, CHAIN = "fit.json", "data.csv", "problem.toml", "fitted.toml", "chain.h5"
 _STORED = (
@@ -43,7 +43,6 @@ _STORED = (
     "status",
     "iterations",
     "condition_number",
-    "open_directions",
 )
 _DERIVED = (
     "scale",
@@ -116,6 +115,7 @@ def write_fit(
             for index, (name, value) in enumerate(fit.values.items())
         ],
         "fit": {name: getattr(fit, name) for name in _STORED},
+        "unresolved": [asdict(combination) for combination in fit.unresolved],
         "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
         "alternatives": [list(map(id, fit.minima)).index(id(one)) for one in fit.alternatives],
         "derived": {name: getattr(fit, name) for name in _DERIVED},
@@ -126,6 +126,7 @@ def write_fit(
 def load_fit(directory: str | Path) -> "Fit":
     """The fit that was saved in a directory. ValueError, on one line, for one that holds none or a damaged one."""
     from fits.fit_result import Fit, Minimum
+    from fits.identifiability import Combination
     from fits.problem import Problem
     from fits.stack_file import read_problem
 
@@ -156,7 +157,12 @@ def load_fit(directory: str | Path) -> "Fit":
             status=stored["status"],
             iterations=stored["iterations"],
             condition_number=_number(stored["condition_number"]),
-            open_directions=tuple((_number(size), weights) for size, weights in stored["open_directions"]),
+            unresolved=tuple(
+                Combination(
+                    _number(one["error"]), one["weights"], {name: _number(e) for name, e in one["alone"].items()}
+                )
+                for one in content["unresolved"]
+            ),
             minima=minima,
             alternatives=tuple(minima[index] for index in content["alternatives"]),
         )

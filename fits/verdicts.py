@@ -2,11 +2,13 @@
 the minimum is. The report prints them; the thresholds are stated in the sentences or here."""
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fits.diagnostics import ResidualStructure
+from fits.identifiability import UNRESOLVED_BEYOND, Combination
 
 if TYPE_CHECKING:
     from fits.fit_result import Fit
@@ -20,8 +22,8 @@ MISFIT_SIGMAS = 3.0  # chi-square this many of its own standard deviations away 
 def identifiability(fit: "Fit") -> dict[str, str]:
     """For each parameter, in a few words, whether the data determines it."""
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
-    open_share = {name: sum(weights.get(name, 0.0) ** 2 for _, weights in fit.open_directions) for name in names}
     np.fill_diagonal(correlation, 0.0)
+    worst = {name: combination for combination in reversed(fit.unresolved) for name in combination.weights}
     words = {}
     for index, name in enumerate(names):
         width = float(fit.problem.high[index] - fit.problem.low[index])
@@ -29,8 +31,10 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
         if name in fit.at_bound:
             words[name] = "AT BOUND"
-        elif open_share[name] >= 0.05:
-            words[name] = f"OPEN: {min(open_share[name], 1.0):.0%} along open directions"
+        elif name in worst:
+            others = [other for other in worst[name].weights if other != name]
+            kind = "OPEN" if worst[name].open else "LOOSE"
+            words[name] = f"{kind}: not separated from {listed(others)}" if others else f"{kind}: hardly seen"
         elif not math.isfinite(error):
             words[name] = "not determined"
         elif error > 0.3 * width:
@@ -88,20 +92,20 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         )
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
-    if fit.open_directions:
-        sentences.append("Some combinations of parameters are not determined by the data.")
+    for combination in fit.unresolved[:1]:
+        sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
     if fit.alternatives:
         sentences.append("Another stack explains the data equally well.")
     if sentences:
         return sentences, False
-    return ["The model explains the data to within its noise, and the data leaves no direction open."], True
+    return ["The model explains the data to within its noise, and the data resolve every parameter."], True
 
 
 def outcome(fit: "Fit") -> list[str]:
     """A few lines for the terminal: how good, how sure, and how it ended."""
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     sure = f"best minimum reached by {fit.minima[0].count} starts, alternatives as good: {len(fit.alternatives)}"
-    return [f"{good}; {sure}", f"Status: {fit.status}"]
+    return [f"{good}; {sure}", f"Status: {fit.status}", *map(_unresolved, fit.unresolved)]
 
 
 def noise_in_words(problem: "Problem") -> str:
@@ -127,6 +131,31 @@ def scale_in_words(problem: "Problem") -> str:
         return "fixed at 1"
     return (
         f"fixed at {problem.scale:g}" if isinstance(problem.scale, int | float) else "fitted, see the table of values"
+    )
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names as words: "a, b and c"."""
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
+
+
+def _not_separated(combination: Combination) -> str:
+    names = list(combination.weights)
+    return f"The data do not {'separate' if len(names) > 1 else 'determine'} {listed(names)}"
+
+
+def _unresolved(combination: Combination) -> str:
+    """What is not resolved, how badly, and how well the rest of it is."""
+    weights, alone = combination.weights, combination.alone
+    size = f"{combination.error:.2g} of the bounds" if math.isfinite(combination.error) else "infinite"
+    held = "only bounds and priors decide there" if combination.open else "the bounds and priors hold it as well"
+    if len(weights) == 1:
+        return f"{_not_separated(combination)}: from them alone its standard error is {size}; {held}."
+    mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
+    known = ", ".join(f"{name} to {error:.2g}" for name, error in alone.items())
+    return (
+        f"{_not_separated(combination)}, only other mixtures: along {mixture} (in widths of the bounds) the "
+        f"standard error from the data alone is {size}, and {held}. Were the others known, the data would give {known}."
     )
 
 
@@ -165,17 +194,13 @@ def _structure(structure: ResidualStructure) -> list[str]:
 
 
 def determines(fit: "Fit") -> list[str]:
-    """What the data leaves open: condition number, open directions, parameters at a bound."""
+    """What the data leave open: condition number, combinations they do not separate, parameters at a bound."""
     sentences = [f"The condition number of the scaled problem is {fit.condition_number:.3g}."]
-    for size, weights in fit.open_directions:
-        largest = sorted(weights.items(), key=lambda item: -abs(item[1]))
-        mixture = ", ".join(f"{weight:+.2f} {name}" for name, weight in largest if abs(weight) >= 0.1)
+    sentences += map(_unresolved, fit.unresolved)
+    if not fit.unresolved:
         sentences.append(
-            f"Open direction (singular value {size:.1e} of the largest): the data hardly changes along {mixture}. "
-            "Only the bounds and the prior decide there."
+            f"The data alone know every combination of parameters to better than {UNRESOLVED_BEYOND:.0%} of its bounds."
         )
-    if not fit.open_directions:
-        sentences.append("No direction in parameter space is left open by the data.")
     if fit.at_bound:
         sentences.append(
             f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it; it has no symmetric error, and "

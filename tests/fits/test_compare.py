@@ -54,6 +54,32 @@ def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
         assert row.unreliable == 0
     assert comparison.rows[0].loo_behind == 0
     assert comparison.rows[1].loo_behind > 3 * comparison.rows[1].loo_behind_error
+    assert comparison.verdict[0].startswith("The data prefer line to flat: it expects new data")
+
+
+def test_the_verdict_says_what_the_data_prefer(fits: dict) -> None:
+    def verdict(other: dict) -> str:
+        (sentence,) = compare({"line": fits["line"], "other": fit(other, DATA, transport=line, starts=2)}).verdict
+        return sentence
+
+    rows = compare(fits).rows
+    aic, bic = rows[1].aic - rows[0].aic, rows[1].bic - rows[0].bic
+    assert verdict(FLAT) == f"The data prefer line to other: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+    slope, error = fits["line"].values["['b']"], fits["line"].standard_errors["['b']"]
+    nearly = verdict({"a": Free(0.9, -1.0, 3.0), "b": slope + 0.4 * error})
+    aic, bic = 2 - 0.16, math.log(COUNT) - 0.16  # a parameter less, for 0.4 standard errors
+    assert nearly == f"The data do not tell other from line: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+
+
+def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
+    """Errors stated ten times too small: differences in log-likelihood shrink by the best one's reduced chi-square."""
+    poor = measured(DATA.values, 0.005)
+    comparison = compare({name: fit(stack, poor, transport=line) for name, stack in (("flat", FLAT), ("line", LINE))})
+    best, other = comparison.rows
+    assert 80 < best.reduced_chi_square < 130
+    gain = (other.chi_square - best.chi_square) / best.reduced_chi_square
+    words = f"AIC lower by {gain - 2:.1f}, BIC by {gain - math.log(COUNT):.1f} (the scatter that line leaves counted"
+    assert words in comparison.verdict[0]
 
 
 def test_what_differs_is_said(fits: dict) -> None:

@@ -9,11 +9,13 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
+from fits.compiled import _run
 from fits.geometry import slices
+from fits.identifiability import Combination
 from fits.likelihood import Noise
 from fits.optimise import fit, fit_many, fit_problem, start_points
 from fits.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem import Problem, _run
+from fits.problem import Problem
 from fits.simulate import simulate
 from tests.fits.models import LOBE, design, directions, line, lobe, measured
 
@@ -67,7 +69,7 @@ def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
     np.testing.assert_allclose(lobe_fit.correlation, covariance / np.outer(errors, errors), atol=2e-3)
     assert lobe_fit.reduced_chi_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / 594))
     assert not lobe_fit.at_bound
-    assert not lobe_fit.open_directions
+    assert not any(combination.open for combination in lobe_fit.unresolved)
 
 
 def test_starts_are_counted(lobe_fit) -> None:
@@ -145,9 +147,10 @@ def test_a_product_leaves_its_direction_open() -> None:
     data = measured(design(COUNT)[:, 1:] * 0.25, 0.01)
     stack = {"a": Free(0.5, 0.1, 1.0, LogUniform()), "b": Free(0.5, 0.1, 1.0, LogUniform())}
     result = fit(stack, data, transport=product, starts=4)
-    assert len(result.open_directions) == 1
-    size, weights = result.open_directions[0]
-    assert size < 1e-6
+    (combination,) = result.unresolved
+    assert combination.open
+    assert combination.error > 1e3
+    weights = combination.weights
     assert weights["['a']"] == pytest.approx(-weights["['b']"], rel=1e-4)
     assert abs(weights["['a']"]) == pytest.approx(np.sqrt(0.5), rel=1e-4)
     assert result.condition_number > 1e6
@@ -163,7 +166,8 @@ def test_a_prior_closes_an_open_direction() -> None:
     result = fit(stack, measured(np.full((COUNT, 1), 1.0), 0.01), transport=total, starts=4)
     assert named(result) == pytest.approx({"a": 0.3, "b": 0.7}, abs=1e-6)
     assert result.standard_errors["['a']"] == pytest.approx(0.2, rel=1e-6)
-    assert len(result.open_directions) == 1  # it is the prior that decides, and the data are said not to
+    (combination,) = result.unresolved  # it is the prior that decides, and the data are said not to
+    assert combination.open
 
 
 def test_a_parameter_without_effect_is_not_determined() -> None:
@@ -171,6 +175,8 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     assert result.standard_errors["['c']"] == np.inf
     assert result.condition_number == np.inf
     assert np.isfinite(result.standard_errors["['a']"])
+    assert result.unresolved == (Combination(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
+    assert "the data leave 1 direction(s) unresolved" in result.status
 
 
 def test_two_stacks_that_explain_the_data_equally_well_are_both_reported() -> None:

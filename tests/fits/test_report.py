@@ -20,6 +20,7 @@ from fits.diagnostics import (
 )
 from fits.fit_result import Fit
 from fits.geometry import direction, slices
+from fits.identifiability import Combination
 from fits.measurements import Measurements, Source
 from fits.report import report
 
@@ -140,16 +141,27 @@ def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
     assert not verdicts.in_short(bad, residual_structure(data, 3 * residuals))[1]
 
 
-def test_open_directions_and_bounds_are_named(coat_fit: Fit) -> None:
+def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     first, second = coat_fit.problem.names
-    undecided = Altered(coat_fit, open_directions=((1e-9, {first: 0.8, second: -0.6}),), at_bound=(second,))
+    together = Combination(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
+    undecided = Altered(coat_fit, unresolved=(together,), at_bound=(second,))
     words = " ".join(verdicts.determines(undecided))
-    assert f"+0.80 {first}, -0.60 {second}" in words
+    assert f"The data do not separate {first} and {second}" in words
+    assert f"along +0.8 {first}, -0.6 {second}" in words
+    assert "is 0.3 of the bounds" in words
+    assert f"would give {first} to 0.01, {second} to 0.02" in words
     assert f"At a bound: {second}" in words
-    assert verdicts.identifiability(undecided)[first].startswith("OPEN: 64%")
+    assert f"The data do not separate {first} and {second}" in " ".join(verdicts.outcome(undecided))
+    short, fine = verdicts.in_short(undecided, residual_structure(coat_fit.problem.data, standardised(coat_fit)))
+    assert f"The data do not separate {first} and {second}." in short
+    assert not fine
+    assert verdicts.identifiability(undecided)[first] == f"LOOSE: not separated from {second}"
     assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
     apart = Altered(coat_fit, correlation=np.eye(2))
     assert verdicts.identifiability(apart)[first] == "yes"
+    unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
+    assert f"The data do not determine {first}: from them alone" in " ".join(verdicts.determines(unseen))
+    assert verdicts.identifiability(unseen)[first] == "OPEN: hardly seen"
 
 
 def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:

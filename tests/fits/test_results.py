@@ -11,6 +11,7 @@ import pytest
 
 import layerjax as lj
 from fits.fit_result import Fit, Minimum
+from fits.identifiability import Combination
 from fits.likelihood import Noise
 from fits.parameters import Free, LogNormal
 from fits.problem import Problem
@@ -22,7 +23,7 @@ STORED = ("vector", "errors", "covariance", "cost", "condition_number")
 def assert_same(loaded: Fit, saved: Fit) -> None:
     for name in STORED:
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
-    for name in ("at_bound", "converged", "status", "iterations", "open_directions", "units", "values"):
+    for name in ("at_bound", "converged", "status", "iterations", "unresolved", "units", "values"):
         assert getattr(loaded, name) == getattr(saved, name), name
     assert [one.values for one in loaded.minima] == [one.values for one in saved.minima]
     assert len(loaded.alternatives) == len(saved.alternatives)
@@ -60,7 +61,7 @@ def unfitted(problem: Problem) -> Fit:
         status="made by hand",
         iterations=0,
         condition_number=1.0,
-        open_directions=((0.0, {problem.names[0]: 1.0}),),
+        unresolved=(Combination(np.inf, {problem.names[0]: 1.0}, {problem.names[0]: np.inf}),),
         minima=(minimum,),
         alternatives=(minimum,),
     )
@@ -153,7 +154,7 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
         ("fit.json", "{", "not valid JSON"),
         ("fit.json", "[]", "must be an object"),
         ("fit.json", '{"layerjax_result": 99}', "version 99"),
-        ("fit.json", '{"layerjax_result": 1}', "damaged"),
+        ("fit.json", '{"layerjax_result": 2}', "damaged"),
         ("data.csv", "", "empty"),
         ("problem.toml", "layers = 3", "layers"),
     ],

@@ -1,0 +1,84 @@
+"""Which combinations of parameters the data cannot separate, from their Fisher information A'A at an optimum.
+
+With one column of A a parameter in units of its box, a singular value s of A says that the parameters can move by 1 / s
+of their boxes along its direction before the fit worsens by one standard deviation. Neither priors nor bounds count
+here: they may hold a parameter that the data do not. It is a statement about small changes: along a curved valley the
+direction turns.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+UNRESOLVED_BEYOND = 0.1  # boxes: a direction with a larger standard error is not resolved
+OPEN_BEYOND = 1.0  # boxes: nor is this one held within its bounds
+UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
+CERTAIN_MEMBER = 0.05  # weight from which a parameter belongs to a direction
+MEMBER, OWED = 0.01, 0.25  # weight from which it does so if it owes the direction this share of its variance
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A direction in the space of parameters that the data do not resolve: only its members' other combinations are.
+
+    error: standard error along it from the data alone, in boxes; infinite where they say nothing. weights: of its
+    members, in units of their boxes, largest first; their squares add up to about 1. alone: standard error that the
+    data would give each member, were all other parameters known, in physical units.
+    """
+
+    error: float
+    weights: dict[str, float]
+    alone: dict[str, float]
+
+    @property
+    def open(self) -> bool:
+        """Whether one standard error along it crosses the whole box: only bounds and priors decide there."""
+        return self.error > OPEN_BEYOND
+
+
+def unresolved_combinations(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Combination, ...]:
+    """Directions known to no better than a tenth of the box, worst first.
+
+    root: rows A of the data alone, (rows, P), in units of the boxes. width: of the boxes, (P,), in physical units.
+    Members are the parameters that move along a direction by more than a twentieth of its length, or a hundredth where
+    they owe it a quarter of their variance (Belsley, Kuh and Welsch 1980, variance proportions).
+    """
+    _, values, directions = np.linalg.svd(square(root))
+    errors = 1.0 / floored(values)
+    variance = (directions * errors[:, None]) ** 2
+    share = variance / np.sum(variance, axis=0)
+    lengths = np.linalg.norm(root, axis=0)
+    alone = np.divide(width, lengths, out=np.full(len(names), math.inf), where=lengths > 0)
+    found = []
+    for error, direction, owed in zip(errors[::-1], directions[::-1], share[::-1], strict=True):
+        if error <= UNRESOLVED_BEYOND:
+            break
+        direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
+        members = [
+            index
+            for index in np.argsort(-np.abs(direction), kind="stable")
+            if abs(direction[index]) > (MEMBER if owed[index] > OWED else CERTAIN_MEMBER)
+        ]
+        found.append(
+            Combination(
+                error=float(error) if error < UNKNOWN_BEYOND else math.inf,
+                weights={names[index]: float(direction[index]) for index in members},
+                alone={names[index]: float(alone[index]) for index in members},
+            )
+        )
+    return tuple(found)
+
+
+def floored(values: Floats) -> Floats:
+    """Singular values, those lost in rounding as the smallest that are not: their inverses are large, never wrong."""
+    return np.maximum(values, np.finfo(float).eps * len(values) * max(values[0], np.finfo(float).tiny))
+
+
+def square(root: Floats) -> Floats:
+    """Zero rows below a matrix with fewer rows than columns, so that every direction has its singular value."""
+    missing = max(root.shape[1] - root.shape[0], 0)
+    return np.vstack([root, np.zeros((missing, root.shape[1]))])
