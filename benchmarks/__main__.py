@@ -1,6 +1,6 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
-``error-vs-time`` (every model against the truth, over the suite of stacks) and ``references`` (the solver and the walk
-beside PythonicDISORT and Mitsuba)."""
+``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
+beside PythonicDISORT and Mitsuba) and ``statistics`` (directional statistics, lobe by lobe, beside the walk)."""
 
 import argparse
 import importlib
@@ -15,7 +15,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="benchmark", required=True)
-    for name in ("throughput", "recovery", "error-vs-time", "references"):
+    for name in ("throughput", "recovery", "error-vs-time", "references", "statistics"):
         command = commands.add_parser(name)
         command.add_argument("--quick", action="store_true", help="fewer repeats: a look, no result to quote")
         command.add_argument("--out", type=Path, help="directory to write into (default: benchmarks/results)")

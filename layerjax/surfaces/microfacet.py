@@ -44,11 +44,16 @@ class Conductor(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return ggx_density(h, self.alpha) * ggx_masking(wi, self.alpha) / (4.0 * wi[2])
+        return facet_density(h, wi, self.alpha)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         upper, _ = flake_rule(wi, *radii("surface", self.alpha), None, nodes)
         return upper
+
+
+def facet_density(h: Vector, wi: Vector, alpha: Array) -> Array:
+    """Density, 1/sr, of directions reflected at GGX facets that are seen from wi, by their half vector with wi."""
+    return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
 
 
 def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Array) -> Array:

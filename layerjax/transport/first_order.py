@@ -15,12 +15,12 @@ from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.distributions import ggx_density, ggx_masking, ggx_sample, radii
+from layerjax.distributions import ggx_sample, radii
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes, flake_rule
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.surfaces.microfacet import facet_density, interface_reflection, interface_transmission
 from layerjax.transport._transport import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 
@@ -39,7 +39,7 @@ class Face(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return ggx_density(h, self.alpha) * ggx_masking(wi, self.alpha) / (4.0 * wi[2])
+        return facet_density(h, wi, self.alpha)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         upper, _ = flake_rule(wi, *radii("surface", self.alpha), None, nodes)

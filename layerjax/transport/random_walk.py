@@ -13,9 +13,10 @@ from jax import Array
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.distributions import ggx_density, ggx_masking, ggx_sample
+from layerjax.distributions import ggx_sample
 from layerjax.stack import Interface, Stack, simplify
 from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.surfaces.microfacet import facet_density
 from layerjax.transport._lanes import average, upright
 from layerjax.transport._transport import Side, Transport
 from layerjax.transport._walk import Microfacets, Orders, Walk
@@ -134,8 +135,7 @@ class RandomWalk(Transport):
         facets = _facets(state)
         if facets is not None:
             h, _ = half_vector(local, towards)
-            mirrored = ggx_density(h, facets) * ggx_masking(local, facets) / (4.0 * local[2])
-            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
+            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, facet_density(h, local, facets), 0.0)
         return density
 
 

@@ -20,17 +20,17 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack, simplify
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.surfaces.microfacet import facet_density, interface_reflection
 from layerjax.transport._transport import Side, Transport
 from layerjax.transport.first_order import mirror
-from layerjax.transport.statistics.diffuse_base import DiffuseBase, make_diffuse
-from layerjax.transport.statistics.diffuse_lobe import DiffuseLobe, make_diffuse_lobe, why_no_lobe
+from layerjax.transport.statistics.diffuse_base import make_diffuse
+from layerjax.transport.statistics.diffuse_lobe import make_diffuse_lobe, why_no_lobe
 from layerjax.transport.statistics.drawing import (
+    DiffusePart,
     density,
     diffuse_energy,
     diffuse_part,
     draw,
-    facet_density,
     lifted,
     planar,
     read_energies,
@@ -58,7 +58,7 @@ class Statistics(eqx.Module):
 
     top: Table
     bottom: Table | None
-    diffuse: DiffuseBase | DiffuseLobe | None
+    diffuse: DiffusePart | None
     below: Array
     reference: Array
 
@@ -67,7 +67,8 @@ class Statistical(Transport):
     """Layered statistics: any number of dielectric interfaces and media over a conductor, a diffuse base, or none.
 
     Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
-    followed), and every base; one that is diffuse, but not Lambertian, counts as a Lambertian of its mean albedo.
+    followed), and every base; one that is diffuse, but not Lambertian, counts under layers as a Lambertian of its mean
+    albedo.
 
     Args:
         symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
@@ -121,10 +122,14 @@ class Statistical(Transport):
     def prepare(self, stack: Stack) -> Statistics:
         slim = simplify(stack)
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side)
-        diffuse: DiffuseBase | DiffuseLobe | None = None
+        diffuse: DiffusePart | None = None
         if slim.base is not None and _is_diffuse(slim.base):
-            exact = self.diffuse == "exact"
-            diffuse = make_diffuse(slim, slim.base, self.microfacets) if exact else make_diffuse_lobe(slim)
+            if not slim.layers:
+                diffuse = slim.base
+            elif self.diffuse == "exact":
+                diffuse = make_diffuse(slim, slim.base, self.microfacets)
+            else:
+                diffuse = make_diffuse_lobe(slim)
         return Statistics(
             top=make_table(slim, options, upward=False),
             bottom=None if slim.base is not None else make_table(slim, options, upward=True),
@@ -164,7 +169,7 @@ class Statistical(Transport):
         above = wi[2] > horizon(wi[2].dtype)
         near, far = self._energies(state, state.top, lifted(wi, above), nodes, upward=False)
         if state.diffuse is not None:
-            near = _summed([near, diffuse_energy(state.diffuse, lifted(wi, above))])
+            near = _summed([near, diffuse_energy(state.diffuse, lifted(wi, above), nodes)])
         if state.bottom is None:
             return tuple(jnp.where(above, e, 0.0) for e in near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
@@ -185,6 +190,8 @@ class Statistical(Transport):
 
     def _reflections(self, table: Table, wi: Vector, wo: Vector) -> list[Channels]:
         """Every lobe, for light and viewer above."""
+        if not table.reflected:
+            return []
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
         wi, wo = lifted(wi, valid), lifted(wo, valid)

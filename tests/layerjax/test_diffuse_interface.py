@@ -15,11 +15,8 @@ from layerjax.transport.statistics.diffuse import (
     closed_form,
     coat_means,
     coated_transmission,
-    diffuse_width,
-    escape,
     indirect_energy,
     indirect_lobe,
-    internal_reflection,
     normal_lobe,
     reflection,
     stack_lobe,
@@ -30,7 +27,19 @@ from layerjax.transport.statistics.diffuse import (
 SMOOTH = 1e-4
 TABLE_ERROR = 1e-3
 
-t01, r10, t10, alpha_2 = (jax.jit(f) for f in (coated_transmission, internal_reflection, escape, diffuse_width))
+t01, means = jax.jit(coated_transmission), jax.jit(coat_means)
+
+
+def r10(alpha, n, tau):
+    return means(alpha, n, tau).returned
+
+
+def t10(alpha, n, tau):
+    return means(alpha, n, tau).leaving
+
+
+def alpha_2(alpha, n, tau):
+    return means(alpha, n, tau).width
 
 
 def gauss(nodes, *edges):

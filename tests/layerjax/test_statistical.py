@@ -239,3 +239,12 @@ def test_values_and_gradients_are_finite_over_the_box(name, dtype):
     for found in (values, by_wi, by_wo, *by_parameter.values()):
         assert jnp.all(jnp.isfinite(found))
     assert jnp.all(values >= 0)
+
+
+def test_a_bare_diffuse_base_is_itself():
+    rough, wi, wo = lj.Stack([], lj.OrenNayar([0.8, 0.3], 0.7)), LIGHT[1:], LIGHT[:3] * [-1, 1, 1]
+    single = lj.SingleScattering()
+    np.testing.assert_array_equal(lj.evaluate(rough, wi, wo, SYMMETRIC), lj.evaluate(rough, wi, wo, single))
+    np.testing.assert_array_equal(lj.albedo(rough, wi, SYMMETRIC), lj.albedo(rough, wi, single))
+    _, density, weight = lj.sample(rough, jnp.asarray(wi), jax.random.key(0), SYMMETRIC)
+    assert jnp.all(jnp.isfinite(weight) & (weight > 0) & (density[:, None] > 0))

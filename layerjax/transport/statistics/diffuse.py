@@ -109,21 +109,6 @@ def coat_means(alpha: Array, ior: Array, tau: Array) -> Means:
     )
 
 
-def escape(alpha: Array, ior: Array, tau: Array) -> Array:
-    """T10: share of diffuse light from the bottom of a coat that leaves it."""
-    return coat_means(alpha, ior, tau).leaving
-
-
-def internal_reflection(alpha: Array, ior: Array, tau: Array) -> Array:
-    """R10: share of diffuse light from the bottom of a coat that returns there."""
-    return coat_means(alpha, ior, tau).returned
-
-
-def diffuse_width(alpha: Array, ior: Array, tau: Array) -> Array:
-    """alpha_2+: GGX width of the lobe of diffuse light that leaves a coat; see `Means`."""
-    return coat_means(alpha, ior, tau).width
-
-
 def indirect_energy(entering: Array, leaving: Array, returned: Array, albedo: Array) -> Array:
     """rho_2+: energy of the light that has met the base, from T01, T10, R10 and the base's albedo (Eqs. 2-3)."""
     return entering * albedo * leaving / (1.0 - albedo * returned)

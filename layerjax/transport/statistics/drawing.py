@@ -7,13 +7,19 @@ from jax import Array
 from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.distributions import ggx_density, ggx_masking, ggx_sample
+from layerjax.distributions import ggx_sample
+from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.surfaces.microfacet import facet_density
 from layerjax.transport.first_order import mirror
+from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistics.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistics.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
 from layerjax.transport.statistics.lobes import bounded
 from layerjax.transport.statistics.tables import Columns, Table, folded, look_up, unfolded
+
+DiffusePart = DiffuseBase | DiffuseLobe | Surface
+"""Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""
 
 
 def planar(w: Vector) -> Array:
@@ -53,7 +59,7 @@ def widths(table: Table, wi: Vector) -> tuple[list[Array], list[Array]]:
 
 def draw(
     table: Table,
-    diffuse: DiffuseBase | DiffuseLobe | None,
+    diffuse: DiffusePart | None,
     wi: Vector,
     uniforms: tuple[Array, Array, Array],
     entry: Array,
@@ -84,9 +90,7 @@ def draw(
     return (wo[0], wo[1], jnp.where(lost, 0.0, wo[2]))
 
 
-def density(
-    table: Table, diffuse: DiffuseBase | DiffuseLobe | None, wi: Vector, wo: Vector, entry: Array, exit: Array
-) -> Array:
+def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array) -> Array:
     """Density of `draw` in solid angle, 1/sr."""
     edge = horizon(wi[2].dtype)
     lit = wi[2] > edge
@@ -116,27 +120,29 @@ def density(
     return jnp.where(lit, total, 0.0)
 
 
-def facet_density(h: Vector, wi: Vector, alpha: Array) -> Array:
-    """Density of directions reflected at facets that are seen from wi, 1/sr."""
-    return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
-
-
-def diffuse_energy(diffuse: DiffuseBase | DiffuseLobe, wi: Vector) -> Channels:
-    """Energy of the light that has met a diffuse base, of either form."""
+def diffuse_energy(diffuse: DiffusePart, wi: Vector, nodes: int) -> Channels:
+    """Energy of the light that has met a diffuse base, of any form; `nodes`: see `layerjax.albedo`."""
+    if isinstance(diffuse, Surface):
+        return SingleScattering().albedo(Media((), diffuse), wi, nodes)[0]
     return diffuse_albedo(diffuse, wi) if isinstance(diffuse, DiffuseBase) else lobe_albedo(diffuse, wi)
 
 
-def diffuse_part(diffuse: DiffuseBase | DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
-    """BRDF of the light that has met a diffuse base, of either form."""
+def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
+    """BRDF of the light that has met a diffuse base, of any form; 0 unless both directions are above."""
+    if isinstance(diffuse, Surface):
+        return SingleScattering().evaluate(Media((), diffuse), wi, wo, "reflection")
     return diffuse_value(diffuse, wi, wo) if isinstance(diffuse, DiffuseBase) else lobe_value(diffuse, wi, wo)
 
 
-def _probabilities(table: Table, diffuse: DiffuseBase | DiffuseLobe | None, wi: Vector) -> list[Array]:
+def _probabilities(table: Table, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
     """Of the lobes, in the order of the table; what is missing from 1 is that of the diffuse part."""
+    if table.shares.shape[-1] == 0:
+        return []
     row = look_up(table.shares, wi[2], planar(wi))
     energies = [jnp.where(row[..., k] > 1e-6, row[..., k], 1e-6) for k in range(row.shape[-1])]
     total = sum(energies, jnp.zeros_like(wi[2]))
     if diffuse is not None:
-        parts = diffuse_energy(diffuse, wi)
+        assert not isinstance(diffuse, Surface)  # which has no lobes beside it
+        parts = diffuse_energy(diffuse, wi, 0)
         total = total + 1e-6 + sum(parts, jnp.zeros_like(wi[2])) / len(parts)
     return [safe_div(energy, total) for energy in energies]

@@ -26,10 +26,11 @@ reflect totally (there by 0.01 if "single").
 """
 
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
@@ -50,6 +51,14 @@ from layerjax.transport.statistics.visible import (
 Microfacets = Literal["single", "multiple"]
 
 POINTS = 12
+
+SMOOTH = 1e-4
+"""The least width. Of a surface known to be so narrow the energies are Fresnel's, and no quadrature is needed."""
+
+
+def is_smooth(alpha: Any) -> bool:
+    """Whether a width is known while tracing to be `SMOOTH`."""
+    return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH))
 
 
 @partial(jax.jit, static_argnames=("microfacets", "points"))

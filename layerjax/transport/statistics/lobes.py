@@ -8,15 +8,17 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._numerics import at_least, at_most
 from layerjax.channels import per_channel
 from layerjax.phase import HenyeyGreenstein
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
 from layerjax.transport.statistics.adding import Element, Lobe, add_element, nothing, retain
-from layerjax.transport.statistics.energies import conductor_energy, interface_energies, retained
+from layerjax.transport.statistics.energies import conductor_energy, interface_energies, is_smooth, retained
 from layerjax.transport.statistics.variance import (
     phase_variance,
     refracted_cosine,
@@ -125,18 +127,19 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
 
 
 def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options) -> list[Element]:
-    """Elements of all interfaces: their energies together, as one quadrature."""
+    """Elements of all interfaces: the energies of the rough ones together, as one quadrature."""
     chosen = [k for k, part in enumerate(met) if isinstance(part.what, Interface)]
     if not chosen:
         return []
     cosine = jnp.stack([cosines[k] for k in chosen])
     alpha = jnp.stack([jnp.asarray(met[k].what.alpha) for k in chosen])[:, None]
     ior = jnp.stack([jnp.asarray(met[k].below / met[k].above) for k in chosen])[:, None]
+    smooth = [is_smooth(met[k].what.alpha) for k in chosen]
     refracted, exists = refracted_cosine(cosine, ior, STEEPEST)
-    r12, t12 = interface_energies(cosine, alpha, ior, options.microfacets, points=POINTS)
+    r12, t12 = _dielectric(cosine, alpha, ior, smooth, options)
     r21, t21 = r12, t12  # Helmholtz: exact where the interface is smooth
     if options.own_side:
-        inside = interface_energies(refracted, alpha, 1.0 / ior, options.microfacets, points=POINTS)
+        inside = _dielectric(refracted, alpha, 1.0 / ior, smooth, options)
         r21, t21 = (jnp.where(exists, own, other) for own, other in zip(inside, (r12, t12), strict=True))
     one = jnp.ones_like(cosine)
     steep_i, steep_t = (cosine, refracted) if options.angles else (one, one)
@@ -153,10 +156,27 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     ]
 
 
+def _dielectric(
+    cosine: Array, alpha: Array, ior: Array, smooth: Sequence[bool], options: Options
+) -> tuple[Array, Array]:
+    """Reflected and transmitted energy of interfaces, one a row."""
+    if not any(smooth):
+        return interface_energies(cosine, alpha, ior, options.microfacets, points=POINTS)
+    exact = fresnel.dielectric(cosine, ior)
+    rough = np.flatnonzero(~np.asarray(smooth))
+    if not rough.size:
+        return exact, 1.0 - exact
+    r, t = interface_energies(cosine[rough], alpha[rough], ior[rough], options.microfacets, points=POINTS)
+    return exact.at[rough].set(r), (1.0 - exact).at[rough].set(t)
+
+
 def _conductor(base: Conductor, cosine: Array, index: Array, options: Options) -> Element:
     alpha = jnp.asarray(base.alpha)
     ior, k = (jnp.reshape(value, (-1, 1)) / index for value in (base.ior, base.k))
-    levels = conductor_energy(cosine, alpha, ior, k, options.microfacets)[None]
+    if is_smooth(base.alpha):
+        levels = fresnel.conductor(cosine, ior, k)[None]
+    else:
+        levels = conductor_energy(cosine, alpha, ior, k, options.microfacets)[None]
     zero = jnp.zeros_like(cosine)[None]
     nothing_passes = zero[None]
     width = variance(alpha) * jnp.ones_like(zero)

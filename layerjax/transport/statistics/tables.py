@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._numerics import at_least, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.discrete.grid import cubic
-from layerjax.transport.statistics.energies import conductor_energy, lobe_energy, retained, single_energy
+from layerjax.transport.statistics.energies import conductor_energy, is_smooth, lobe_energy, retained, single_energy
 from layerjax.transport.statistics.lobes import (
     STEEPEST,
     Options,
@@ -208,7 +209,10 @@ def _widened(variance: Array, spread: Array | None, order: int) -> Array:
 def _unscaled(what: Interface | Conductor, relative: Array, cosine: Array) -> Array:
     """Energy (C or 1, n) that the facets of the first interface or base reflect at their first collision."""
     alpha = jnp.asarray(what.alpha)
+    smooth = is_smooth(what.alpha)
     if isinstance(what, Interface):
-        return single_energy(cosine, alpha, relative)[None]
+        return (fresnel.dielectric(cosine, relative) if smooth else single_energy(cosine, alpha, relative))[None]
     ior, k = (jnp.reshape(value, (-1, 1)) / relative for value in (what.ior, what.k))
+    if smooth:
+        return fresnel.conductor(cosine, ior, k)
     return conductor_energy(cosine, alpha, ior, k, "single")

@@ -1,0 +1,64 @@
+"""Directional statistics of what a stack does not hold leave no operations behind: counted in the lowered program."""
+
+import jax.numpy as jnp
+import pytest
+
+import layerjax as lj
+from benchmarks.operations import count
+
+WI, WO = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
+METAL, DIFFUSE = lj.Conductor(0.2, 3.9, 0.3), lj.Lambertian(0.5)
+COAT = lj.Interface(1.5, 0.2)
+HAZE = lj.Medium(0.7, 0.9, lj.HenyeyGreenstein(0.6))
+
+
+def program(layers, base=METAL, **options):
+    """Operations by name, of the preparation and the values together."""
+    stack = lj.Stack(layers, base)
+    return count(lambda wi, wo: lj.evaluate(stack, wi, wo, lj.Statistical(**options)), WI, WO)
+
+
+def operations(layers, base=METAL, **options):
+    return sum(program(layers, base, **options).values())
+
+
+def test_media():
+    clear, dark = operations([COAT]), operations([COAT, lj.Medium(0.7, 0.0)])
+    assert clear < dark < operations([COAT, HAZE])
+    assert operations([COAT, HAZE], scattering="single") < operations([COAT, HAZE])
+    assert program([COAT, lj.Medium(0.0, 0.9)]) == program([COAT])
+
+
+def test_interfaces():
+    bare, one, two = (operations(layers) for layers in ([], [COAT], [COAT, lj.Interface(1.8, 0.1)]))
+    assert bare < one < two
+    assert program([lj.Interface(1.0, 0.2), COAT]) == program([COAT])  # nothing is there to see
+    assert program([COAT, lj.Interface(1.5, 0.1)]) == program([COAT])
+
+
+@pytest.mark.parametrize("microfacets", ["single", "multiple"])
+def test_smooth_interfaces(microfacets):
+    """Fresnel's formulas in place of a quadrature over facets."""
+    smooth, rough = (operations([lj.Interface(1.5, alpha)], microfacets=microfacets) for alpha in (1e-4, 0.2))
+    assert smooth < rough
+
+
+def test_bases():
+    """A diffuse base asks for a solver, and nothing else does; without layers it is itself alone."""
+    clear, diffuse = program([COAT], None, symmetric=False), program([COAT], DIFFUSE, symmetric=False)
+    assert clear["while"] == program([COAT])["while"] == 0 < diffuse["while"]
+    assert operations([], DIFFUSE) < 12 < operations([], METAL) < operations([COAT])
+
+
+def test_one_side():
+    stack = lj.Stack([COAT])
+    everything, reflection = (
+        sum(count(lambda wi, wo, side=side: lj.evaluate(stack, wi, wo, lj.Statistical(), side=side), WI, WO).values())
+        for side in ("all", "reflection")
+    )
+    assert reflection < everything
+
+
+def test_channels():
+    one, three = operations([COAT, lj.Medium(0.7, 0.0)]), operations([COAT, lj.Medium([0.1, 0.7, 2.0], 0.0)])
+    assert one < three < 1.5 * one
