@@ -192,8 +192,9 @@ BOX = {
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        ("through", jnp.float32),
+        ("over metal", jnp.float32),
         pytest.param("over metal", jnp.float64, marks=pytest.mark.slow),
+        pytest.param("through", jnp.float32, marks=pytest.mark.slow),
         pytest.param("over diffuse", jnp.float32, marks=pytest.mark.slow),
     ],
 )

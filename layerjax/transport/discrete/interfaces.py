@@ -22,12 +22,16 @@ from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import interface_reflection
 from layerjax.transport.discrete.grid import Grid, Region, spread
 from layerjax.transport.discrete.operators import Layer, Parts
-from layerjax.transport.discrete.sampling import balance, modes_at_nodes, straight_on
+from layerjax.transport.discrete.sampling import BALANCING, balance, modes_at_nodes, straight_on
+from layerjax.transport.statistics.energies import interface_energies
 
 Microfacets = Literal["single", "multiple"]
 
 LEAST_FACETS = 24
 """Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
+
+LEAST_SHARE, MOST_OFF = 1e-6, 50.0
+"""Energies below this share of the largest, or deposited that many times wrong, are left as they are deposited."""
 
 
 def interface_layer(
@@ -40,14 +44,19 @@ def interface_layer(
     from above counts as entering.
     """
     near, far = (above, below) if enters else (below, above)
-    reflected, refracted, lost_outside = _shares(grid, near, far, alpha, modes)
+    outside, refracted, lost_outside = _shares(grid, near, far, alpha, modes)
+    outer = _face(near, outside, far.ior / near.ior, alpha, modes)
+    inside, (_, passed), lost_inside = _shares(grid, far, near, alpha, modes)
     through = _deposit(grid, *refracted, far, near, modes)
-    outer = _face(near, jnp.sum(reflected, axis=-1), far.ior / near.ior, alpha, modes)
-    reflected, _, lost_inside = _shares(grid, far, near, alpha, modes)
-    inner = _face(far, jnp.sum(reflected, axis=-1), near.ior / far.ior, alpha, modes)
+    through = _balanced(through, near, far, jnp.sum(refracted[1], axis=-1), jnp.sum(passed, axis=-1))
+    inner = _face(far, inside, near.ior / far.ior, alpha, modes)
     operators = [outer, through, _adjoint(through, near, far), inner]
     if microfacets == "multiple":
-        operators = _returned(operators, (lost_outside, lost_inside), (near.weight, far.weight))
+        turned = [
+            _turned_back(a, b.ior / a.ior, alpha, level, lost)
+            for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
+        ]
+        operators = _returned(operators, (lost_outside, lost_inside), turned, (near.weight, far.weight))
     reflect_near, into, out, reflect_far = (Parts(operator[None]) for operator in operators)
     if enters:
         return Layer(reflect_near, reflect_far, into, out)
@@ -107,7 +116,7 @@ def _adjoint(flux: Array, near: Region, far: Region) -> Array:
 def _shares(
     grid: Grid, near: Region, far: Region, alpha: Array, modes: int
 ) -> tuple[Array, tuple[Vector, Array], Array]:
-    """Of light from every near node, by facets: the share reflected; where to and how much is refracted; the loss."""
+    """Of light from every near node, by facets: the energy reflected; where to and how much is refracted; the loss."""
     ratio = far.ior / near.ior
     normals, weight, wi = _visible_normals(grid, near, alpha, modes)
     level = fresnel.dielectric(dot(wi, normals), ratio)
@@ -116,7 +125,7 @@ def _shares(
     wo: Vector = (down[0], down[1], -down[2])  # z counted on the far side
     refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, alpha), 0.0)
     lost = at_least(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
-    return reflected, (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
+    return jnp.sum(reflected, axis=-1), (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
 
 
 def _visible_normals(grid: Grid, region: Region, alpha: Array, modes: int) -> tuple[Vector, Array, Vector]:
@@ -166,16 +175,49 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
 
-def _returned(operators: Sequence[Array], lost: tuple[Array, Array], weights: tuple[Array, Array]) -> list[Array]:
+def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
+    """Deposited flux, scaled to pass the energy `down` of light from near nodes, and its adjoint `up` from far ones.
+
+    Both are known by quadrature; what is deposited on a node of little weight, at a critical angle, is not exact.
+    """
+    into, out = jnp.ones_like(down), jnp.ones_like(up)
+    for _ in range(BALANCING):
+        out = _scale(up * far.weight, flux[0] @ (near.weight * into))
+        into = _scale(down, out @ flux[0])
+    return out[:, None] * flux * into
+
+
+def _scale(wanted: Array, found: Array) -> Array:
+    """Their quotient; 1 where hardly anything passes, or was deposited by rounding alone."""
+    known = (wanted > LEAST_SHARE * jnp.max(wanted)) & (found * MOST_OFF > wanted) & (found < MOST_OFF * wanted)
+    return jnp.where(known, wanted / jnp.where(known, found, 1.0), 1.0)
+
+
+def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
+    """Of the energy lost to masking what ends on its own side, by the walk on the microsurface (Heitz et al. 2016)."""
+    exists = region.weight > 0
+    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, "multiple")
+    gain = at_least(level - once, 0.0)
+    return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
+
+
+def _returned(
+    operators: Sequence[Array], lost: tuple[Array, Array], turned: Sequence[Array], weights: tuple[Array, Array]
+) -> list[Array]:
     """The four operators with the energy lost to masking given back (after Kulla & Conty 2017), both sides at a time.
 
-    What is lost, l, comes back diffusely as l l' / <l>, which is reciprocal and conserves energy; the same l decides
-    how much of it crosses.
+    What ends on its own side, r, comes back diffusely as r r' / <r>, and what crosses, t, as t t' / <t>: reciprocal,
+    and all that is lost returns. As much must cross one way as the other; where the two differ, the smaller decides.
     """
-    mean = jnp.sum(weights[0] * lost[0]) + jnp.sum(weights[1] * lost[1])
+    crossing = [l - r for l, r in zip(lost, turned, strict=True)]
+    sums = [jnp.sum(weight * t) for weight, t in zip(weights, crossing, strict=True)]
+    least = jnp.where(sums[0] < sums[1], sums[0], sums[1])
+    crossing = [t * safe_div(least, total) for t, total in zip(crossing, sums, strict=True)]
+    staying = [l - t for l, t in zip(lost, crossing, strict=True)]
     given = []
     for operator, (out, into) in zip(operators, ((0, 0), (1, 0), (0, 1), (1, 1)), strict=True):
-        given.append(operator.at[0].add(safe_div(jnp.outer(weights[out] * lost[out], lost[into]), mean)))
+        parts, mean = (staying, jnp.sum(weights[out] * staying[out])) if out == into else (crossing, least)
+        given.append(operator.at[0].add(safe_div(jnp.outer(weights[out] * parts[out], parts[into]), mean)))
     return given
 
 

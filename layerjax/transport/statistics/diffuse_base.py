@@ -25,7 +25,8 @@ from layerjax.stack import Stack, optical_depths
 from layerjax.surfaces import Lambertian, Surface
 from layerjax.transport.adding_doubling import AddingDoubling, Solved
 from layerjax.transport.statistics.diffuse import closed_form, indirect_energy
-from layerjax.transport.statistics.tables import GRAZING, index_below, look_up, points, precision
+from layerjax.transport.statistics.lobes import precision
+from layerjax.transport.statistics.tables import GRAZING, index_below, look_up, points
 
 NODES = 24
 """Cosines of the solver, and of the mean over diffuse light."""

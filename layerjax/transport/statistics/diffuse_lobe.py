@@ -14,7 +14,8 @@ from layerjax.directions import Vector
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
 from layerjax.transport.statistics.diffuse import Coat, indirect_lobe, stack_lobe
-from layerjax.transport.statistics.tables import GRAZING, look_up, points, precision
+from layerjax.transport.statistics.lobes import precision
+from layerjax.transport.statistics.tables import GRAZING, look_up, points
 
 
 class DiffuseLobe(eqx.Module):

@@ -7,6 +7,8 @@ Statistics of the atomic operators (Belcour 2018, Sec. 4) for light along given 
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -77,10 +79,15 @@ class Part(NamedTuple):
     below: Array
 
 
+def precision(stack: Stack) -> Any:
+    """Floating type of the parameters of a stack."""
+    return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
+
+
 def parts(stack: Stack, upward: bool) -> list[Part]:
     """The layers and a conductor below, in the order in which light from above (or from below: `upward`) meets them."""
     found = []
-    index = jnp.asarray(1.0)
+    index = jnp.ones((), precision(stack))
     for layer in stack.layers:
         below = jnp.asarray(layer.ior) if isinstance(layer, Interface) else index
         found.append(Part(layer, index, below))

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,6 +23,7 @@ from layerjax.transport.statistics.lobes import (
     Options,
     Statistics,
     lobe_roughness,
+    precision,
     statistics,
 )
 from layerjax.transport.statistics.variance import refracted_cosine
@@ -62,11 +62,6 @@ class Table(eqx.Module):
     facet: tuple[Interface | Conductor, Array] | None
     reflected: tuple[Columns, ...]
     transmitted: tuple[Columns, ...]
-
-
-def precision(stack: Stack) -> Any:
-    """Floating type of the parameters of a stack."""
-    return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
 def points(dtype: Any) -> Array:
@@ -137,7 +132,7 @@ def make_table(stack: Stack, options: Options, upward: bool) -> Table:
 
 def index_below(stack: Stack) -> Array:
     """Refractive index below a stack without a base, over that above."""
-    index = jnp.asarray(1.0)
+    index = jnp.ones((), precision(stack))
     for layer in stack.layers:
         index = jnp.asarray(layer.ior) if isinstance(layer, Interface) else index
     return index
