@@ -44,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     parser.add_argument("--traceback", action="store_true", help="show where an error comes from (for bug reports)")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_fit, _add_sample, _add_report, _add_compare, _add_info, _add_convert, _add_simulate):
+    for add in (_add_fit, _add_sample, _add_report, _add_compare, _add_info, _add_convert, _add_simulate, _add_render):
         add(commands)
     return parser
 
@@ -164,6 +164,21 @@ def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument("--noise", type=_level, default=0.0, metavar="REL", help="relative noise (default: none)")
     parser.add_argument("--floor", type=_level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
+    _add_force(parser, "overwrite the file")
+
+
+def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "render",
+        "draw a material: spheres, lobes and a map of its BSDF",
+        "layerjax render window_shade --out window_shade.png",
+    )
+    parser.add_argument(
+        "material", metavar="NAME|TOML", help="a material of the gallery, or a stack (free parameters at their start)"
+    )
+    parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
+    parser.add_argument("--size", type=_count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
     _add_force(parser, "overwrite the file")
 
 

@@ -184,7 +184,7 @@ def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     from fits.formats.csv import write_csv
 
-    _require_csv(arguments.out)
+    _require_ending(arguments.out, ".csv", "measurements")
     _refuse_existing(arguments.out, arguments.force)
     data = _measurements(arguments)
     write_csv(data, arguments.out, force=arguments.force)
@@ -194,7 +194,7 @@ def convert(arguments: Namespace) -> int:
 
 def simulate(arguments: Namespace) -> int:
     """Write what a goniometer would measure of a stack."""
-    _require_csv(arguments.out)
+    _require_ending(arguments.out, ".csv", "measurements")
     _refuse_existing(arguments.out, arguments.force)
     _use_jax()
     from fits.formats.csv import write_csv
@@ -214,6 +214,30 @@ def simulate(arguments: Namespace) -> int:
     )
     write_csv(data, arguments.out, force=arguments.force)
     print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
+    return DONE
+
+
+def render(arguments: Namespace) -> int:
+    """Draw a material of the gallery, or of a file."""
+    _require_ending(arguments.out, ".png", "pictures")
+    _refuse_existing(arguments.out, arguments.force)
+    _use_jax()
+    from fits.pictures import as_png
+    from fits.render import render as run_render
+    from fits.stack_file import read_problem
+    from layerjax import gallery
+
+    name, transport = arguments.material, None
+    if name in gallery.names():
+        stack = gallery.stack(name)
+    elif Path(name).suffix == ".toml":
+        given = read_problem(name)
+        stack, transport = _at_start(given.stack), None if given.transport == "auto" else given.transport
+    else:
+        raise ValueError(f"{name}: neither a .toml file nor one of the gallery: {', '.join(gallery.names())}")
+    figure = run_render(stack, transport, title=Path(name).stem.replace("_", " "), size=arguments.size)
+    write_bytes(arguments.out, as_png(figure), force=arguments.force)
+    print(f"{arguments.out}: {name}")
     return DONE
 
 
@@ -286,9 +310,9 @@ def _at_start(stack: "Stack") -> "Stack":
     return jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free)
 
 
-def _require_csv(path: str) -> None:
-    if Path(path).suffix.lower() != ".csv":
-        raise ValueError(f"{path}: measurements can be written as .csv only")
+def _require_ending(path: str, ending: str, what: str) -> None:
+    if Path(path).suffix.lower() != ending:
+        raise ValueError(f"{path}: {what} can be written as {ending} only")
 
 
 def _refuse_existing(path: str | None, force: bool) -> None:

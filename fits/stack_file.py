@@ -3,6 +3,7 @@
     transport = "SingleScattering"             # optional, "auto" if left out; { kind = "AddingDoubling", nodes = 16 }
     objective = "likelihood"                   # optional
     about = { source = "..." }                 # optional: a table of texts that are kept and not looked at
+    gallery = "fabric"                         # optional: a material by name, in place of layers and base
 
     [[layers]]                                 # from top to bottom
     kind = "Medium"
@@ -37,6 +38,7 @@ import layerjax as lj
 from fits._files import write_text
 from fits.likelihood import Noise, Objective
 from fits.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
+from layerjax import gallery
 
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
@@ -78,9 +80,10 @@ def read_problem(path: str | Path) -> ProblemFile:
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{path}: not valid TOML: {error}") from None
     try:
-        _check_keys("the file", tables, ("about", "transport", "objective", "layers", "base", "noise", "scale"))
+        known = ("about", "transport", "objective", "gallery", "layers", "base", "noise", "scale")
+        _check_keys("the file", tables, known)
         return ProblemFile(
-            stack=stack_from_dict({key: tables[key] for key in ("layers", "base") if key in tables}),
+            stack=_stack({key: tables[key] for key in ("gallery", "layers", "base") if key in tables}),
             transport=_transport(tables.get("transport", "auto")),
             noise=_noise(tables.get("noise", {})),
             scale=_scale(tables["scale"]) if "scale" in tables else None,
@@ -133,6 +136,15 @@ def stack_from_dict(tables: Mapping[str, Any]) -> lj.Stack:
         [_build(f"layers[{index}]", layer, _LAYERS) for index, layer in enumerate(layers)],
         base=_build("base", tables["base"], _BASES) if "base" in tables else None,
     )
+
+
+def _stack(tables: Mapping[str, Any]) -> lj.Stack:
+    """A material of the gallery by its name, or what `layers` and `base` say."""
+    if "gallery" not in tables:
+        return stack_from_dict(tables)
+    if len(tables) > 1:
+        raise ValueError("gallery names a whole stack, must stand without layers and base")
+    return gallery.stack(_choice("gallery", tables["gallery"], gallery.names()))
 
 
 def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:

@@ -1,0 +1,61 @@
+"""Pictures of materials: what a pixel shows, and the command."""
+
+import numpy as np
+import pytest
+
+import layerjax as lj
+from fits.cli import main
+from fits.render import SKY, SUN, _display, _sky, _sphere, render
+
+WHITE = lj.Stack([], lj.Lambertian(1.0))
+SINGLE = lj.SingleScattering()
+
+
+def test_a_white_sphere_shows_the_cosine() -> None:
+    """The pixel in the middle, lit from the viewer and from 60 degrees; a pixel is flat to 1e-3."""
+    for light, cosine in (((0.0, 0.0, 1.0), 1.0), ((np.sqrt(0.75), 0.0, 0.5), 0.5)):
+        picture = _sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65)
+        np.testing.assert_allclose(picture[32, 32], _display(np.asarray(SUN * cosine + SKY)), atol=2e-3)
+    np.testing.assert_allclose(picture[0, 0], _display(np.asarray(SKY)))  # beside the sphere
+
+
+def test_what_loses_nothing_cannot_be_seen_under_a_sky() -> None:
+    """A lossless haze returns the sky; 1e-3 for the angles between those of the table."""
+    haze = lj.Stack([lj.Medium(1.0, 1.0, lj.HenyeyGreenstein(0.5))])
+    solved = lj.prepare(haze, lj.AddingDoubling(nodes=12, modes=8))
+    wo = np.asarray(lj.direction(np.radians([0.0, 20.0, 50.0, 80.0]), 1.0))
+    np.testing.assert_allclose(_sky(haze, solved, wo), 1.0, atol=1e-3)
+
+
+def test_an_opaque_material_has_no_picture_from_behind() -> None:
+    figure = render(WHITE, SINGLE, title="white", size=16)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert "lit from the front" in titles
+    assert "from behind" not in titles
+    assert not any("transmitted" in title for title in titles)
+
+
+def test_bad_arguments_are_named() -> None:
+    with pytest.raises(ValueError, match="size: 4 is not >= 16 pixels"):
+        render(WHITE, SINGLE, size=4)
+    with pytest.raises(ValueError, match="transport: RandomWalk is random"):
+        render(WHITE, lj.RandomWalk(), size=16)
+
+
+def test_the_command(tmp_path, capsys) -> None:
+    stack = tmp_path / "haze.toml"
+    stack.write_text(
+        'transport = "SingleScattering"\n[[layers]]\nkind = "Medium"\n'
+        'thickness = { start = 0.5, low = 0.0, high = 2.0 }\n[base]\nkind = "Lambertian"\nalbedo = 0.5\n'
+    )
+    picture = tmp_path / "haze.png"
+    assert main(["render", str(stack), "--out", str(picture), "--size", "16"]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    for words, complaint in (
+        ([str(stack), "--out", str(picture)], "exists already"),
+        (["fabrik", "--out", str(tmp_path / "a.png")], "neither a .toml file nor one of the gallery: window_shade"),
+        (["fabric", "--out", str(tmp_path / "a.jpg")], "pictures can be written as .png only"),
+    ):
+        assert main(["render", *words]) == 2
+        assert complaint in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["haze.png", "haze.toml"]
