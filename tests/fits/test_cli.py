@@ -288,9 +288,11 @@ def test_an_interrupted_fit_exits_with_130_and_leaves_nothing(work: Path, coat_f
     before = contents(work)
     command = [sys.executable, "-m", "fits.cli", "fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(work.parent / "cache")}
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
     process = subprocess.Popen(
         [*command, "--starts", "100000", "--solver", "bounded"], stderr=subprocess.PIPE, text=True, env=environment
     )
+    signal.signal(signal.SIGINT, ours)
     assert process.stderr is not None
     first = process.stderr.readline()
     process.send_signal(signal.SIGINT)

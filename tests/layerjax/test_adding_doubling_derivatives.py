@@ -110,7 +110,7 @@ def extreme_stack(kind, generator):
     [
         ("faces", "float32"),
         pytest.param("metal", "float64", marks=pytest.mark.slow),
-        ("tilted", "float32"),
+        pytest.param("tilted", "float32", marks=pytest.mark.slow),
         pytest.param("media", "float32", marks=pytest.mark.slow),
         pytest.param("media", "float64", marks=pytest.mark.slow),
     ],
