@@ -13,6 +13,8 @@ from fits.optimise import fit
 from fits.parameters import Free, LogNormal
 from fits.simulate import simulate
 
+pytestmark = pytest.mark.slow  # its derivatives compile for more than a minute
+
 TRANSPORT = lj.Statistical(microfacets="single")
 NOISE = 0.03
 TRUTH = {

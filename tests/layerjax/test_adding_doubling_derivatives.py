@@ -33,7 +33,9 @@ def pairs(stack):
     return tuple(w.at[:, 2].set(jnp.abs(w[:, 2])) for w in (wi, wo))
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "plate" else name for name in STACKS]
+)
 def test_derivatives_by_differences(name):
     stack = STACKS[name]
     start, build = ravel_pytree(stack)

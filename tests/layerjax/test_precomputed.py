@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import layerjax.precomputed
 from layerjax.precomputed import load, microsurface
@@ -21,6 +22,7 @@ def test_tables_are_small_and_are_made_here():
     assert (FOLDER / "microsurface.npz").stat().st_size < 2e5
 
 
+@pytest.mark.slow
 def test_a_coarse_table_of_microsurfaces_equals_the_one_that_ships():
     lines: list[str] = []
     coarse, fine = microsurface.make(coarse=True, report=lines.append), load("microsurface")

@@ -142,6 +142,7 @@ def test_closed_form_of_a_coated_diffuse_base(ior, absorbing):
     np.testing.assert_array_less(np.abs(values - estimates), 4 * errors + 3e-3 * np.abs(estimates))
 
 
+@pytest.mark.slow
 def test_closed_form_under_two_interfaces_and_haze():
     """Energies by the solver's other modes and resolution are the truth here: all orders, the same base."""
     stack = lj.Stack(

@@ -47,8 +47,7 @@ def draw(dtype):
     )
 
 
-def total(p, wi, wo, name):
-    count = 3 if name == "over white" else INTERFACES  # derivatives of the solver compile for long
+def total(p, wi, wo, name, count=INTERFACES):
     faces = [lj.Interface(p["ior"][i], p["alpha"][i]) for i in range(count)]
     f = lj.evaluate(lj.Stack(faces, BASES[name](p)), wi, wo, lj.Statistical())
     return jnp.sum(f), f
@@ -87,13 +86,33 @@ def test_energies_of_smooth_interfaces(dtype):
 @pytest.mark.parametrize("name", BASES)
 def test_values_and_gradients(name, dtype):
     p, wi, wo = draw(dtype)
+    count = 3 if name == "over white" else INTERFACES  # gradients of the solver compile for long, see below
 
     @jax.jit
     def run(p):
-        return jax.lax.map(lambda q: jax.grad(total, argnums=(0, 1, 2), has_aux=True)(q, wi, wo, name), p)
+        return jax.lax.map(lambda q: jax.grad(total, argnums=(0, 1, 2), has_aux=True)(q, wi, wo, name, count), p)
 
     (by_parameter, by_wi, by_wo), f = run(p)
     assert f.dtype == dtype
     for found in (f, by_wi, by_wo, *by_parameter.values()):
         assert jnp.all(jnp.isfinite(found))
     assert jnp.all(f >= 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_values_and_slopes_of_ten_over_white(dtype):
+    """The derivative along all parameters together."""
+    p, wi, wo = draw(dtype)
+
+    @jax.jit
+    def run(p):
+        def one(q):
+            return jax.jvp(lambda q: total(q, wi, wo, "over white")[1], (q,), (jax.tree.map(jnp.ones_like, q),))
+
+        return jax.lax.map(one, p)
+
+    values, slopes = run(p)
+    assert values.dtype == dtype
+    assert jnp.all(jnp.isfinite(values) & (values >= 0))
+    assert jnp.all(jnp.isfinite(slopes))
