@@ -67,10 +67,10 @@ TEXT = """\
 Wall times, medians of {rounds} interleaved rounds, everything warm; *ratio* is layerjax over the other, the median of
 the ratios within a round. Errors are the largest relative ones, values below 1e-3 of the largest measured against that.
 Of a fixed series of resolutions (nodes x modes of `AddingDoubling`, streams x modes of DISORT) each solver of the full
-BRDF runs at the one that reaches the error in the least time, from the parameters to the values; it has 16 x 16 cosines
-and 33 azimuths. Otherwise `AddingDoubling` runs at the first that reaches the error. The layers with axes are measured
-by their rms error from the walk. The bars are those of the project's performance sheet: at least, and in brackets the
-aim. {peers}
+BRDF runs at the one that reaches the error in the least time, from the parameters to the values, `AddingDoubling` as
+one compiled function of them; it has 16 x 16 cosines and 33 azimuths. Otherwise `AddingDoubling` runs at the first that
+reaches the error. The layers with axes are measured by their rms error from the walk. The bars are those of the
+project's performance sheet: at least, and in brackets the aim. {peers}
 
 {rows}"""
 
@@ -153,7 +153,8 @@ def full_brdf(size: Size, report: Callable[[str], None]) -> list[Row]:
         for corrected in (False, True)
     ]
     ours = [
-        _way(f"{n} x {m}", _solver(stack, wi, wo, (n, m), "reflection"), exact[..., None]) for n, m in FULL_RESOLUTIONS
+        _way(f"{n} x {m}", _compiled(stack, wi, wo, (n, m), "reflection"), exact[..., None])
+        for n, m in FULL_RESOLUTIONS
     ]
     rows = []
     for error in size.errors:
@@ -266,6 +267,13 @@ def _solver(stack: lj.Stack, wi: Any, wo: Any, resolution: tuple[int, int], side
     """The whole work of `AddingDoubling`, from the stack to the values; modes are azimuths where an axis needs them."""
     transport = lj.AddingDoubling(nodes=resolution[0], modes=resolution[1], ordinates=resolution)
     return lambda: np.asarray(lj.evaluate(lj.prepare(stack, transport), wi, wo, side=side))
+
+
+def _compiled(stack: lj.Stack, wi: Any, wo: Any, resolution: tuple[int, int], side: Any) -> Callable[[], Floats]:
+    """The same as one program of the stack's numbers."""
+    transport = lj.AddingDoubling(nodes=resolution[0], modes=resolution[1])
+    program = jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, side=side))
+    return lambda: np.asarray(program(stack, wi, wo))
 
 
 def _walk(prepared: lj.Prepared, wi: Any, wo: Any) -> Callable[[], tuple[Any, Any]]:
