@@ -47,7 +47,7 @@ def test_values():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(f"{part:.3g}" for part in case[:5]) + case[5])
 def test_energies_at_ten_million_paths(case):
-    """0.3 %, and 3 standard errors of the walks: 0.5 %, over a dark base up to 1 %. What the top reflects is not in them."""
+    """0.3 %, and 3 standard errors of the walks: 0.5 %, over a dark base 1 %. What the top reflects is not in them."""
     *kind, microfacets = case
     wi = lj.direction(0.5, 0.0)
     transport = lj.Statistical(symmetric=False, microfacets=microfacets)
