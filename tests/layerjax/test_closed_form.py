@@ -47,7 +47,7 @@ def test_values():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(f"{part:.3g}" for part in case[:5]) + case[5])
 def test_energies_at_ten_million_paths(case):
-    """0.3 %, and 3 standard errors of the walks: 0.5 %, over a dark base 1 %. What the top reflects is not in them."""
+    """0.3 %, and 3 standard errors of the walks: 0.5 %, over a dark base 2 %. What the top reflects is not in them."""
     *kind, microfacets = case
     wi = lj.direction(0.5, 0.0)
     transport = lj.Statistical(symmetric=False, microfacets=microfacets)
@@ -70,5 +70,5 @@ def test_energies_at_ten_million_paths(case):
         walked.append(float(seen.orders[0, 1, 0]))
         errors.append(float(seen.orders_error[0, 1, 0]))
     base, noise = walked[0] - sum(walked[1:]), np.hypot.reduce(errors)
-    assert 3 * noise < (0.01 if kind[4] < 0.5 else 0.005) * base
+    assert 3 * noise < (0.02 if kind[4] < 0.5 else 0.005) * base
     assert abs(found[0] - found[1] - base) < 3 * noise + 3e-3 * base
