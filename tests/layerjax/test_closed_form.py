@@ -59,7 +59,7 @@ def test_energies_at_ten_million_paths(case):
         seen = lj.goniophotometer(
             stack,
             wi,
-            key=jax.random.key(seed),
+            key=jax.random.fold_in(jax.random.key(seed), CASES.index(case)),
             paths=10_000_000,
             polar=1,
             azimuth=1,
