@@ -1,6 +1,7 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
 ``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
-beside PythonicDISORT and Mitsuba) and ``statistics`` (directional statistics, lobe by lobe, beside the walk)."""
+beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk) and
+``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits)."""
 
 import argparse
 import importlib
@@ -15,12 +16,15 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="benchmark", required=True)
-    for name in ("throughput", "recovery", "error-vs-time", "references", "statistics"):
+    for name in ("throughput", "recovery", "error-vs-time", "references", "statistics", "spongecake"):
         command = commands.add_parser(name)
         command.add_argument("--quick", action="store_true", help="fewer repeats: a look, no result to quote")
         command.add_argument("--out", type=Path, help="directory to write into (default: benchmarks/results)")
     for name, named_peers in (("throughput", "Mitsuba and Dr.Jit"), ("references", "Mitsuba and PythonicDISORT")):
         commands.choices[name].add_argument("--no-peers", action="store_true", help=f"without {named_peers}")
+    commands.choices["spongecake"].add_argument(
+        "--work", type=Path, default=Path("spongecake-data"), help="folder for the truth of its materials"
+    )
     compared = commands.choices["error-vs-time"]
     families = sorted(path.name for path in (Path(__file__).parent / "suite").iterdir())
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
@@ -43,6 +47,8 @@ def main(arguments: list[str] | None = None) -> int:
         options["directory"] = given.out
     if given.benchmark in ("throughput", "references"):
         options["with_peers"] = not given.no_peers
+    if given.benchmark == "spongecake":
+        options["work"] = given.work
     if given.benchmark == "error-vs-time":
         from benchmarks.models import named
 

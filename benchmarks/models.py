@@ -31,6 +31,7 @@ class Model:
 
 MODELS = (
     Model("single scattering", {"first order": lj.SingleScattering()}),
+    Model("SpongeCake", {"two lobes": lj.SpongeCake()}),
     Model("statistics, forward", {"2018": lj.Statistical(symmetric=False, microfacets="single")}),
     Model("statistics, symmetric", {"2018": lj.Statistical(microfacets="single")}),
     Model("Weidlich & Wilkie", {"one half vector": lj.WeidlichWilkie()}),

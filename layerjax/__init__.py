@@ -24,6 +24,7 @@ from layerjax.surfaces import OrenNayar as OrenNayar
 from layerjax.transport import AddingDoubling as AddingDoubling
 from layerjax.transport import RandomWalk as RandomWalk
 from layerjax.transport import SingleScattering as SingleScattering
+from layerjax.transport import SpongeCake as SpongeCake
 from layerjax.transport import Statistical as Statistical
 from layerjax.transport import Transport as Transport
 from layerjax.transport import WeidlichWilkie as WeidlichWilkie

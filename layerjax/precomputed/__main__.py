@@ -1,4 +1,4 @@
-"""python -m layerjax.precomputed NAME [--out DIR] [--coarse]: make a table again."""
+"""python -m layerjax.precomputed NAME [--out DIR] [--coarse] [--work DIR]: make a table again."""
 
 import argparse
 import importlib
@@ -15,9 +15,14 @@ def main() -> None:
     parser.add_argument("name", choices=NAMES)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder for NAME.npz")
     parser.add_argument("--coarse", action="store_true", help="a quick, less exact table")
+    parser.add_argument(
+        "--work", type=Path, default=Path("spongecake-data"), help="folder that long work (spongecake) goes on from"
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    table = importlib.import_module(f"layerjax.precomputed.{options.name}").make(coarse=options.coarse)
+    module = importlib.import_module(f"layerjax.precomputed.{options.name}")
+    kept = {"work": options.work} if options.name == "spongecake" else {}
+    table = module.make(coarse=options.coarse, **kept)
     options.out.mkdir(parents=True, exist_ok=True)
     path = options.out / f"{options.name}.npz"
     np.savez_compressed(path, **table)

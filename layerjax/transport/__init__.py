@@ -5,5 +5,6 @@ from layerjax.transport._transport import Transport as Transport
 from layerjax.transport.adding_doubling import AddingDoubling as AddingDoubling
 from layerjax.transport.random_walk import RandomWalk as RandomWalk
 from layerjax.transport.single_scattering import SingleScattering as SingleScattering
+from layerjax.transport.spongecake import SpongeCake as SpongeCake
 from layerjax.transport.statistical import Statistical as Statistical
 from layerjax.transport.weidlich_wilkie import WeidlichWilkie as WeidlichWilkie

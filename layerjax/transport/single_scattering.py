@@ -63,39 +63,25 @@ class SingleScattering(Transport):
         return Media(tuple(media_of(slim)), slim.base)
 
     def evaluate(self, state: Media, wi: Vector, wo: Vector, side: Side) -> Channels:
-        return _total(list(_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
+        return _total(list(layer_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
 
     def sample(self, state: Media, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        u, u1, u2 = uniforms
-        wo: Vector = (jnp.zeros_like(u1), jnp.zeros_like(u1), jnp.ones_like(u1))
-        edge = jnp.zeros_like(u)
-        for probability, lobe in _choices(state, wi):
-            chosen = (u >= edge) & (probability > 0)
-            wo = select(chosen, lobe.sample(wi, u1, u2), wo)
-            edge = edge + probability
-        return wo
+        return draw(choices(state, wi), wi, uniforms)
 
     def pdf(self, state: Media, wi: Vector, wo: Vector) -> Array:
-        density = jnp.zeros_like(wi[2] * wo[2])
-        for probability, lobe in _choices(state, wi):
-            if isinstance(lobe, Surface):
-                above = jnp.where(wo[2] > horizon(wo[2].dtype), lobe.pdf(_lifted(wi), _lifted(wo)), 0.0)
-                density = density + probability * above
-            else:
-                density = density + probability * lobe.pdf(wi, wo)
-        return density
+        return density(choices(state, wi), wi, wo)
 
     def albedo(self, state: Media, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         near, far = [], []
         spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
         for index in _scattering(state):
             same_side, other_side = state.media[index].phase.rule(wi, nodes)
-            near.append(_integral(_lobes(state, spread, same_side[0], "all")[index], same_side))
+            near.append(_integral(layer_lobes(state, spread, same_side[0], "all")[index], same_side))
             if state.base is None:
-                far.append(_integral(_lobes(state, spread, other_side[0], "all")[index], other_side))
+                far.append(_integral(layer_lobes(state, spread, other_side[0], "all")[index], other_side))
         if state.base is not None:
             upper = state.base.rule(_lifted(wi), nodes)
-            near.append(_integral(_lobes(state, spread, upper[0], "reflection")[BASE], upper))
+            near.append(_integral(layer_lobes(state, spread, upper[0], "reflection")[BASE], upper))
         zero = jnp.zeros_like(wi[2])
         return _total(near, zero), _total(far, zero)
 
@@ -105,22 +91,28 @@ def _scattering(slab: Media) -> list[int]:
     return [k for k, medium in enumerate(slab.media) if not is_known(medium.albedo, 0.0)]
 
 
-def _lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
+def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Channels]:
     """BSDF of each medium that scatters, by its index, and of the base, by `BASE`."""
     opaque = slab.base is not None
     if opaque and side == "transmission":
         return {}
-    edge = horizon(wi[2].dtype)
+    valid = answered(wi, wo, side, opaque)
     if opaque or side == "reflection":
-        valid = (wi[2] > edge) & (wo[2] > edge)
         lobes = _from_above(slab, _lifted(wi), _lifted(wo))
     else:
-        valid_i, valid_o = jnp.abs(wi[2]) > edge, jnp.abs(wo[2]) > edge
-        valid = valid_i & valid_o & (wi[2] * wo[2] < 0) if side == "transmission" else valid_i & valid_o
-        inside_i = (wi[0], wi[1], jnp.where(valid_i, wi[2], 0.5))
-        inside_o = (wo[0], wo[1], jnp.where(valid_o, wo[2], 0.5))
+        edge = horizon(wi[2].dtype)
+        inside_i, inside_o = ((w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)) for w in (wi, wo))
         lobes = _from_any_side(slab, inside_i, inside_o, side)
     return {k: tuple(jnp.where(valid, value, 0.0) for value in lobe) for k, lobe in lobes.items()}
+
+
+def answered(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+    """Whether a pair is one that is asked for: no direction in the tangent plane, and none below an opaque base."""
+    edge = horizon(wi[2].dtype)
+    if opaque or side == "reflection":
+        return (wi[2] > edge) & (wo[2] > edge)
+    valid = (jnp.abs(wi[2]) > edge) & (jnp.abs(wo[2]) > edge)
+    return valid & (wi[2] * wo[2] < 0) if side == "transmission" else valid
 
 
 def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
@@ -202,7 +194,7 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
     return strength if is_known(medium.albedo, 1.0) else _times(per_channel(medium.albedo), strength)
 
 
-def _choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
+def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """Probability of each lobe and the lobe: first collision in that layer (Sec. 4.6) times the share that survives it.
 
     The base is the last choice; without one the light that collides nowhere is left out, and the rest normalised.
@@ -212,19 +204,43 @@ def _choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     wi = (wi[0], wi[1], jnp.where(valid, wi[2], 0.5))
     depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
-    choices: list[tuple[Array, Any]] = []
+    found: list[tuple[Array, Any]] = []
     for k in _scattering(slab):
         medium = slab.media[k]
         collides = mean(_times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
-        choices.append((collides * survives, medium.phase))
+        found.append((collides * survives, medium.phase))
     if slab.base is not None:
         reached = jnp.ones_like(wi[2])
         for depth in depths:
             reached = reached * mean(tuple(jnp.exp(-d) for d in depth))
-        choices.append((reached, slab.base))
-    total = sum((weight for weight, _ in choices), jnp.zeros_like(wi[2]))
-    return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in choices]
+        found.append((reached, slab.base))
+    total = sum((weight for weight, _ in found), jnp.zeros_like(wi[2]))
+    return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in found]
+
+
+def draw(choices: list[tuple[Array, Any]], wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    """A direction from one of the lobes, picked by their probabilities; the normal, if these are all 0."""
+    u, u1, u2 = uniforms
+    wo: Vector = (jnp.zeros_like(u1), jnp.zeros_like(u1), jnp.ones_like(u1))
+    edge = jnp.zeros_like(u)
+    for probability, lobe in choices:
+        chosen = (u >= edge) & (probability > 0)
+        wo = select(chosen, lobe.sample(wi, u1, u2), wo)
+        edge = edge + probability
+    return wo
+
+
+def density(choices: list[tuple[Array, Any]], wi: Vector, wo: Vector) -> Array:
+    """The density of `draw`, 1/sr."""
+    total = jnp.zeros_like(wi[2] * wo[2])
+    for probability, lobe in choices:
+        if isinstance(lobe, Surface):
+            above = jnp.where(wo[2] > horizon(wo[2].dtype), lobe.pdf(_lifted(wi), _lifted(wo)), 0.0)
+            total = total + probability * above
+        else:
+            total = total + probability * lobe.pdf(wi, wo)
+    return total
 
 
 def _lifted(w: Vector) -> Vector:

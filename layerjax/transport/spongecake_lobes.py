@@ -1,0 +1,226 @@
+"""The second lobe of `layerjax.transport.spongecake`: single scattering with other parameters, and a level.
+
+Single scattering of flakes depends on wi and wo by their half vector, which turns ever faster as wo comes to lie
+opposite wi: the lobe of fibers has a dark seam there, and that of surface flakes nothing at all. Light that has met
+several flakes knows no half vector, and goes on that way: the paper's failure case (its Fig. 22). So the density of
+flakes is blurred by b, with s = wi + wo in place of h,
+
+    D_b = 1 / (pi sqrt(det S) q^2),    q = (s' S^-1 s + b) / (s' s + b),
+
+which is D at b = 0, reciprocal, and leads over to a lobe straight on.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import safe_sqrt
+from layerjax.channels import Channels, count, mean, per_channel, pick
+from layerjax.directions import Vector, add, dot, half_vector, normalize, split
+from layerjax.distributions import radii, squared_lengths
+from layerjax.phase import SGGX, HenyeyGreenstein
+from layerjax.quadrature import gauss_legendre
+from layerjax.stack import Medium
+from layerjax.transport._transport import Side
+from layerjax.transport.single_scattering import Media, answered, layer_lobes
+from layerjax.transport.spongecake_mapping import Numbers, Weights, shape_of, weights_of
+
+ABOVE, BELOW, THROUGH = range(3)
+
+
+class BlurredSGGX(SGGX):
+    """Flakes with a blurred density, see the top of the file."""
+
+    blur: Array = eqx.field(default=0.0)
+
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
+        total = add(wi, wo)
+        radial, axial = radii(self.kind, self.alpha)
+        across, along = squared_lengths(total, self._axis())
+        stretched = across / (radial * radial) + along / (axial * axial)
+        ratio = (dot(total, total) + self.blur) / (stretched + self.blur)
+        return 0.25 / (jnp.pi * radial * radial * axial) * ratio * ratio
+
+    def sharp(self, wi: Vector, wo: Vector) -> Array:
+        """The kernel without the blur, which is what is drawn from."""
+        return SGGX.kernel(self, wi, wo, None)
+
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        return self.sharp(wi, wo) / self.cross_section(wi)
+
+
+class SecondLobe(eqx.Module):
+    """What several collisions leave. slab: media with other parameters and no albedo of their own.
+
+    weights: for each channel, see `layerjax.transport.spongecake_mapping.Weights`, stacked (C, ...).
+    """
+
+    slab: Media
+    weights: Weights
+
+
+def second_lobe(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> SecondLobe:
+    """The second lobe of one medium or two."""
+    dtype = jnp.result_type(*jax.tree.leaves(media))
+    net = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, networks[len(media)]
+    )
+    channels = max(count(*(per_channel(jnp.asarray(value)) for value in _optics(medium))) for medium in media)
+    numbers = [_numbers(media, c, dtype) for c in range(channels)]
+    albedo = mean([number.albedo for number in numbers])
+    f0 = mean([number.f0 for number in numbers])
+    coloured = any(jnp.ndim(medium.thickness) for medium in media)  # else one thickness serves all channels
+    shapes = [shape_of(net, number._replace(albedo=albedo, f0=f0)) for number in (numbers if coloured else numbers[:1])]
+    alpha, blur = mean([shape.alpha for shape in shapes]), mean([shape.blur for shape in shapes])
+    slab = []
+    for k, medium in enumerate(media):
+        taus = [shape.thickness[k] for shape in shapes]
+        thickness = jnp.stack(taus) if coloured else taus[0]
+        phase: SGGX | HenyeyGreenstein = HenyeyGreenstein(alpha[k])
+        if isinstance(medium.phase, SGGX):
+            phase = BlurredSGGX(medium.phase.kind, alpha[k], medium.phase.axis, blur[k])
+        plain = Medium(thickness, 1.0, phase)
+        slab.append(eqx.tree_at(lambda m: m.albedo, plain, 1.0))  # known: nothing to multiply by
+    weights = [weights_of(net, number, albedo, f0) for number in numbers]
+    return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights))
+
+
+def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
+    """BSDF of what several collisions leave. opaque: there is a base, and light from above alone is answered."""
+    terms = [_level(second, wi, wo, side, opaque), *_lobes(second, wi, wo, side, opaque).values()]
+    return tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
+
+
+def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> dict[int, Channels]:
+    """What each medium adds, by its index, for all channels."""
+    _, cosine = half_vector(wi, wo)
+    edge = (1.0 - cosine) ** 2
+    edge = edge * edge * (1.0 - cosine)  # Schlick's term
+    found = {}
+    for k, lobe in layer_lobes(second.slab, wi, wo, "reflection" if opaque else side).items():
+        values = []
+        for c in range(_channels(second)):
+            plain, rim = (_of_side(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
+            values.append((plain + rim * edge) * pick(lobe, c))
+        found[k] = tuple(values)
+    return found
+
+
+def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
+    """The Lambertian term, for all channels."""
+    valid = answered(wi, wo, side, opaque)
+    rise_i, rise_o = (1.0 - jnp.abs(w[2]) for w in (wi, wo))
+    values = []
+    for c in range(_channels(second)):
+        reflected, transmitted = second.weights.slopes[c]
+        if opaque or side == "reflection":
+            slope_i = slope_o = reflected[0]
+        else:
+            same = wi[2] * wo[2] > 0
+            slope_i, slope_o = (
+                jnp.where(
+                    same,
+                    jnp.where(w[2] > 0, reflected[0], reflected[1]),
+                    jnp.where(w[2] > 0, transmitted[0], transmitted[1]),
+                )
+                for w in (wi, wo)
+            )
+        level = _of_side(second.weights.levels[c], wi, wo, side, opaque)
+        values.append(jnp.where(valid, level * (1.0 + slope_i * rise_i) * (1.0 + slope_o * rise_o), 0.0))
+    return tuple(values)
+
+
+def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
+    """Energy of `evaluate_second` on wi's side and on the other, by quadrature with `nodes` points a dimension.
+
+    Where the unblurred kernel of flakes peaks, nodes follow it; the rest is taken over the hemispheres evenly.
+    """
+    side = jnp.where(wi[2] < 0, -1.0, 1.0)[..., None]
+    spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
+    x, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
+    phi = jnp.asarray((np.arange(2 * nodes) + 0.5) * np.pi / nodes, wi[2].dtype)
+    cosine, turn = (array.ravel() for array in jnp.meshgrid(x, phi, indexing="ij"))
+    sine = safe_sqrt(1.0 - cosine * cosine)
+    weight = jnp.repeat(w, 2 * nodes) * (np.pi / nodes)
+    sums = []
+    for sign in (1.0,) if opaque else (1.0, -1.0):
+        wo: Vector = (sine * jnp.cos(turn), sine * jnp.sin(turn), sign * side * cosine)
+        terms = [_level(second, spread, wo, "all", opaque)]
+        parts = []
+        for k, lobe in _lobes(second, spread, wo, "all", opaque).items():
+            phase = second.slab.media[k].phase
+            near, far = phase.rule(wi, nodes)
+            peaked, solid_angle = near if sign > 0 else far
+            if isinstance(phase, HenyeyGreenstein):
+                rest, share = None, jnp.ones_like(solid_angle)
+            else:
+                rest, share = 1.0 - _peaked(phase, spread, wo), _peaked(phase, spread, peaked)
+                terms.append(tuple(rest * value for value in lobe))
+            there = _lobes(second, spread, peaked, "all", opaque)[k]
+            parts.append(tuple(jnp.sum(v * share * jnp.abs(peaked[2]) * solid_angle, -1) for v in there))
+        parts += [tuple(jnp.sum(v * cosine * weight, -1) for v in term) for term in terms]
+        sums.append(tuple(sum((part[c] for part in parts[1:]), parts[0][c]) for c in range(_channels(second))))
+    return sums[0], sums[1] if len(sums) > 1 else (jnp.zeros_like(wi[2]),)
+
+
+def _peaked(phase: SGGX, wi: Vector, wo: Vector) -> Array:
+    """Share of the kernel that nodes which follow its peak account for."""
+    assert isinstance(phase, BlurredSGGX)
+    sharp = phase.sharp(wi, wo)
+    return sharp / (sharp + 1.0 / jnp.pi)
+
+
+class Hemisphere(eqx.Module):
+    """Directions in proportion to their cosine, on wi's side or on the other."""
+
+    through: bool = eqx.field(static=True)
+
+    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        side = jnp.where((wi[2] < 0) != self.through, -1.0, 1.0)
+        radius, phi = safe_sqrt(u1), 2.0 * jnp.pi * u2
+        return radius * jnp.cos(phi), radius * jnp.sin(phi), side * safe_sqrt(1.0 - u1)
+
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        there = (wi[2] * wo[2] < 0) if self.through else (wi[2] * wo[2] > 0)
+        return jnp.where(there, jnp.abs(wo[2]) / jnp.pi, 0.0)
+
+
+def _channels(second: SecondLobe) -> int:
+    return second.weights.levels.shape[0]
+
+
+def _of_side(weights: Array, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+    """The weight that holds for the pair."""
+    if opaque or side == "reflection":
+        return weights[ABOVE]
+    if side == "transmission":
+        return weights[THROUGH]
+    same = wi[2] * wo[2] > 0
+    return jnp.where(same, jnp.where(wi[2] > 0, weights[ABOVE], weights[BELOW]), weights[THROUGH])
+
+
+def _optics(medium: Medium) -> tuple:
+    return medium.thickness, medium.albedo, 1.0 if medium.f0 is None else medium.f0
+
+
+def _numbers(media: tuple[Medium, ...], c: int, dtype: Any) -> Numbers:
+    """The numbers of one channel."""
+    rows = []
+    for medium in media:
+        thickness, albedo, f0 = (pick(per_channel(jnp.asarray(value, dtype)), c) for value in _optics(medium))
+        phase = medium.phase
+        one, zero = jnp.ones_like(thickness), jnp.zeros_like(thickness)
+        axis = jnp.stack([zero, zero, one])
+        if isinstance(phase, HenyeyGreenstein):
+            rows.append((jnp.stack([zero, zero, one]), one, phase.g, thickness, albedo, f0, axis))
+            continue
+        kind = jnp.stack([one, zero, zero] if phase.kind == "surface" else [zero, one, zero])
+        if phase.axis is not None:
+            axis = jnp.stack(normalize(split(phase.axis)))
+        rows.append((kind, phase.alpha, zero, thickness, albedo, f0, axis))
+    return Numbers(*(jnp.stack([jnp.asarray(row[n], dtype) for row in rows]) for n in range(len(Numbers._fields))))
