@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
@@ -37,7 +38,7 @@ INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
 """Edges of the cells of the matrix picture, degrees."""
 
 DECADES, MATRIX_BELOW = 4.0, np.radians(75.0)
-"""Of its values, from the largest among angles below this."""
+"""Of its values at most, from the largest among angles below this."""
 
 
 def render(
@@ -59,10 +60,17 @@ def render(
         size: pixels of a sphere's diameter, >= 16.
 
     Raises:
-        ValueError: the size is too small, or the transport is random or does not carry the stack.
+        ValueError: the size is too small, the stack ends in another index than that of air, or the transport is random
+            or does not carry the stack.
     """
     if size < 16:
         raise ValueError(f"size: {size} is not >= 16 pixels")
+    interfaces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
+    if stack.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
+        raise ValueError(
+            f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the picture is of a sheet "
+            "in air: close it with an Interface of ior 1, or give it a base"
+        )
     chosen = lj.AddingDoubling() if transport is None else transport
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
@@ -137,6 +145,7 @@ def _lobes(axes: Axes, prepared: lj.Prepared, transmits: bool) -> None:
     if not transmits:
         axes.set_thetamin(-90)  # type: ignore[attr-defined]
         axes.set_thetamax(90)  # type: ignore[attr-defined]
+    axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.set_title("√(f |cos θₒ|), 1/√sr, in the plane of incidence", pad=14)
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
 
@@ -152,10 +161,11 @@ def _in_plane(prepared: lj.Prepared, open_below: bool) -> dict[str, Floats]:
 
 
 def _matrix(figure: SubFigure, maps: dict[str, Floats]) -> None:
-    """Incident by outgoing angle, one map for each side; colours reach up to the largest value off grazing."""
+    """Incident by outgoing angle, one map for each side; colours go from the least to the largest value off grazing."""
     off = np.ix_(_middle(INCIDENT) < MATRIX_BELOW, np.abs(_middle(OUTGOING)) < MATRIX_BELOW)
     largest = max(float(values[off].max()) for values in maps.values()) or 1.0
-    norm = LogNorm(largest * 10.0**-DECADES, largest)
+    least = min(float(values[off].min()) for values in maps.values())
+    norm = LogNorm(min(max(least, largest * 10.0**-DECADES), 0.5 * largest), largest)
     panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, values) in zip(panels, maps.items(), strict=True):
         shown = np.clip(values, norm.vmin, norm.vmax)

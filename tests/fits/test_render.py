@@ -38,6 +38,8 @@ def test_an_opaque_material_has_no_picture_from_behind() -> None:
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(ValueError, match="size: 4 is not >= 16 pixels"):
         render(WHITE, SINGLE, size=4)
+    with pytest.raises(ValueError, match=r"layers: the stack ends in a medium of index 1\.5, .* Interface of ior 1"):
+        render(lj.Stack([lj.Interface(1.5, 0.2)]), size=16)
     with pytest.raises(ValueError, match="transport: RandomWalk is random"):
         render(WHITE, lj.RandomWalk(), size=16)
 
