@@ -31,7 +31,7 @@ KINDS: tuple[Kind, ...] = ("surface", "fiber")
 CAKE, FIRST = lj.SpongeCake(), lj.SingleScattering()
 COUNTS, QUICK_COUNTS = PLANS[False].test, (64, 64)
 
-GAINS, QUICK_GAINS = (1024, 300), (64, 5)
+GAINS, QUICK_GAINS = (1024, 150), (64, 5)
 """Materials learned from, and epochs, where the gain of each step is measured."""
 
 ANGLES = (0.0, 30.0, 50.0, 70.0, 80.0)
@@ -43,7 +43,7 @@ NODES = 32
 NARROW = 0.3
 """Roughness of fibers below which the paper names its failure case."""
 
-WALKS, QUICK_WALKS = 1 << 19, 1 << 14
+WALKS, QUICK_WALKS = 1 << 18, 1 << 14
 POINTS = 1 << 13
 """Paths of the walk: for energies, and for each point value."""
 
@@ -65,7 +65,8 @@ def study(
         report(f"media {media}: errors")
         furnaces += furnace(samples, media)
         report(f"media {media}: furnace")
-    steps = gains(work, *(QUICK_GAINS if quick else GAINS), report)
+    gain = QUICK_GAINS if quick else GAINS
+    steps = gains(work, *gain, report)
     drawn = []
     for name, stack, which in list(figures())[:: 6 if quick else 1]:
         drawn.append(drawn_figure(name, stack, which, walks))
@@ -298,7 +299,7 @@ def fit(name: str, phase: Callable[[Any], Any], truth: tuple[float, float, float
     free = stack(fits.Free(0.4, 0.05, 0.95), fits.Free(3.0, 0.3, 30.0), fits.Free(0.9, 0.3, 1.0))
     found = []
     for how in (CAKE, FIRST):
-        best = fits.fit(free, data, transport=how, starts=4, seed=0).stack.layers[0]
+        best = fits.fit(free, data, transport=how, starts=2, seed=0).stack.layers[0]
         alpha = best.phase.g if isinstance(best.phase, lj.HenyeyGreenstein) else best.phase.alpha
         found.append((float(alpha), float(best.thickness), float(best.albedo)))
 

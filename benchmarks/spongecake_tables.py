@@ -27,9 +27,9 @@ over materials and angles.
 {furnace}
 ## What each step is worth
 
-The same short training each time (one medium, 1,024 materials, 300 epochs), 512 held out: errors as above, and those of
-the energy of lossless materials, the mean over 12 angles of |R + T - truth|, each over its 24 directions (so that
-narrow lobes leave noise in it).
+The same short training each time (one medium, {gain_materials:,} materials, {gain_epochs} epochs), half as many held
+out: errors as above, and those of the energy of lossless materials, the mean over 12 angles of |R + T - truth|, each
+over its 24 directions (so that narrow lobes leave noise in it).
 
 {gains}
 ## The paper's figures
@@ -124,6 +124,7 @@ def markdown(
     fitted: Sequence[Fitted],
     paths: int,
     angles: Sequence[float],
+    gain: tuple[int, int],
 ) -> str:
     """The tables."""
 
@@ -138,6 +139,8 @@ def markdown(
         two=counts[1],
         angles=", ".join(f"{angle:g}" for angle in angles),
         paths=paths,
+        gain_materials=gain[0],
+        gain_epochs=gain[1],
         errors=table(
             ("materials", "media", "count", *heads),
             [

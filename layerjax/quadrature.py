@@ -163,7 +163,7 @@ def _panel_frame(pole: Vector, towards: Vector) -> tuple[Vector, Vector]:
     """A frame about the pole whose first vector leans towards the given one (any, if they are parallel)."""
     projected = combine(jnp.ones_like(pole[2]), towards, -dot(towards, pole), pole)
     tangent, _ = frame(pole)
-    parallel = dot(projected, projected) < 1e-24
+    parallel = dot(projected, projected) < jnp.finfo(pole[2].dtype).eps ** 1.5  # what is left is rounding
     first = normalize(select(parallel, tangent, projected))
     return first, cross(pole, first)
 

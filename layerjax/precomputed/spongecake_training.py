@@ -29,6 +29,9 @@ HG = KINDS.index("hg")
 ENERGY = 0.5
 """Weight of errors of albedos in the loss."""
 
+FAR = 4.0
+"""Weight of the squared error of R + T beside the error itself, for the sake of the few that are far off."""
+
 MULTIPLE, APART = 0.2, 0.5
 """Weights of the error of multiple scattering alone, and of that of each side by itself."""
 
@@ -124,7 +127,7 @@ def predict(
     if not parts.rim:
         weights = weights._replace(lobes=weights.lobes * jnp.asarray([1.0, 0.0]))
     if not parts.slopes:
-        weights = weights._replace(slopes=jnp.zeros_like(weights.slopes))
+        weights = weights._replace(slopes=jnp.zeros_like(weights.slopes), rims=jnp.zeros_like(weights.rims))
     if not parts.apart:  # those of reflection above for all
         weights = Weights(*(jnp.broadcast_to(part[:1], part.shape) for part in weights))
     sides = sides_of(len(media.thickness))
@@ -195,7 +198,8 @@ def _loss(net: eqx.nn.MLP, batch: Batch, mean_albedo: Array, mean_f0: Array, ene
     full = jnp.sqrt(jnp.sum(squares, -1) / whole + tiny)
     each = jnp.mean(jnp.sqrt(squares / (apart + 1e-3 * whole[:, None]) + tiny), -1)
     multiple = jnp.sqrt(jnp.sum(squares, -1) / (jnp.sum(batch.size_multiple**2, -1) + 1e-12) + tiny)
-    both = jnp.mean(jnp.abs(albedos[:, 0] + albedos[:, -1]), -1)
+    sums = albedos[:, 0] + albedos[:, -1]
+    both = jnp.mean(jnp.abs(sums) + FAR * sums * sums, -1)
     single = jnp.mean(jnp.abs(albedos), (1, 2))
     return jnp.mean(full + APART * each + MULTIPLE * multiple + energy * (both + 0.5 * single))
 
@@ -227,7 +231,7 @@ def _first(media: Numbers, wi: Array, wo: Array) -> Array:
     kind_alpha = jnp.where(media.kind[:, HG] > 0, media.g, media.alpha)
     shape = Shape(kind_alpha, media.thickness, jnp.zeros_like(media.thickness))
     strength = media.albedo[:, None] * jnp.stack([media.f0, 1.0 - media.f0], -1)
-    weights = Weights(jnp.stack([strength] * 3), jnp.zeros(3), jnp.zeros((2, 2)))
+    weights = Weights(jnp.stack([strength] * 3), jnp.zeros(3), *[jnp.zeros((2, 2))] * 2)
     sides = sides_of(len(media.thickness))
     return jnp.stack([_second(media, shape, weights, side, wi[n], wo[n]) for n, side in enumerate(sides)])
 
@@ -242,9 +246,12 @@ def _second(media: Numbers, shape: Shape, weights: Weights, side: int, wi: Array
     depths = [
         [_area(media, shape, k, w) * shape.thickness[k] / jnp.abs(w[..., 2]) for w in (wi, wo)] for k in _media(media)
     ]
-    sides = ((0, 0), (1, 1), (0, 1))[side]
-    slopes = weights.slopes[int(side == 2)]
-    value = weights.levels[side] * (1.0 + slopes[sides[0]] * (1.0 - ci)) * (1.0 + slopes[sides[1]] * (1.0 - co))
+    way = int(side == 2)
+    ends = [(weights.slopes[way, end], weights.rims[way, end]) for end in ((0, 0), (1, 1), (0, 1))[side]]
+    value, rim = weights.levels[side], jnp.ones_like(ci)
+    for (slope, steep), cosine in zip(ends, (ci, co), strict=True):
+        value = value * (1.0 + slope * (1.0 - cosine))
+        rim = rim * (1.0 + steep * (1.0 - cosine) ** 4)
     for k in _media(media):
         over_i, over_o = (
             sum((depths[j][which] for j in _media(media) if (j < k if up else j > k)), jnp.zeros_like(ci))
@@ -256,7 +263,7 @@ def _second(media: Numbers, shape: Shape, weights: Weights, side: int, wi: Array
         start = jnp.minimum(into, out) if side == 2 else 0.0
         gain = shape.thickness[k] / (ci * co) * jnp.exp(-start - over_i - over_o) * -jnp.expm1(-y) / y
         plain, edge = weights.lobes[side, k]
-        value = value + (plain + edge * schlick) * gain * _kernel(media, shape, k, total, squared, wi, wo)
+        value = value + rim * (plain + edge * schlick) * gain * _kernel(media, shape, k, total, squared, wi, wo)
     return value
 
 

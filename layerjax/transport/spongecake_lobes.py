@@ -101,12 +101,17 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
     _, cosine = half_vector(wi, wo)
     edge = (1.0 - cosine) ** 2
     edge = edge * edge * (1.0 - cosine)  # Schlick's term
+    rises = [(1.0 - jnp.abs(w[2])) ** 2 for w in (wi, wo)]
+    rims = [
+        _rising(second.weights.rims[c], [rise * rise for rise in rises], wi, wo, side, opaque)
+        for c in range(_channels(second))
+    ]
     found = {}
     for k, lobe in layer_lobes(second.slab, wi, wo, "reflection" if opaque else side).items():
         values = []
-        for c in range(_channels(second)):
-            plain, rim = (_of_side(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
-            values.append((plain + rim * edge) * pick(lobe, c))
+        for c, rim in enumerate(rims):
+            plain, more = (_of_side(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
+            values.append((plain + more * edge) * rim * pick(lobe, c))
         found[k] = tuple(values)
     return found
 
@@ -114,25 +119,27 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
 def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
     """The Lambertian term, for all channels."""
     valid = answered(wi, wo, side, opaque)
-    rise_i, rise_o = (1.0 - jnp.abs(w[2]) for w in (wi, wo))
+    rises = [1.0 - jnp.abs(w[2]) for w in (wi, wo)]
     values = []
     for c in range(_channels(second)):
-        reflected, transmitted = second.weights.slopes[c]
-        if opaque or side == "reflection":
-            slope_i = slope_o = reflected[0]
-        else:
-            same = wi[2] * wo[2] > 0
-            slope_i, slope_o = (
-                jnp.where(
-                    same,
-                    jnp.where(w[2] > 0, reflected[0], reflected[1]),
-                    jnp.where(w[2] > 0, transmitted[0], transmitted[1]),
-                )
-                for w in (wi, wo)
-            )
         level = _of_side(second.weights.levels[c], wi, wo, side, opaque)
-        values.append(jnp.where(valid, level * (1.0 + slope_i * rise_i) * (1.0 + slope_o * rise_o), 0.0))
+        slope = _rising(second.weights.slopes[c], rises, wi, wo, side, opaque)
+        values.append(jnp.where(valid, level * slope, 0.0))
     return tuple(values)
+
+
+def _rising(slopes: Array, rises: list[Array], wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+    """(1 + slope rise) of both directions, with the slopes that hold for their sides, (2, 2) as in `Weights`."""
+    if opaque or side == "reflection":
+        return (1.0 + slopes[0, 0] * rises[0]) * (1.0 + slopes[0, 0] * rises[1])
+    product = jnp.ones_like(rises[0] * rises[1])
+    for w, rise in zip((wi, wo), rises, strict=True):
+        above = w[2] > 0
+        through = jnp.where(above, slopes[1, 0], slopes[1, 1])
+        if side == "all":
+            through = jnp.where(wi[2] * wo[2] > 0, jnp.where(above, slopes[0, 0], slopes[0, 1]), through)
+        product = product * (1.0 + through * rise)
+    return product
 
 
 def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:

@@ -36,7 +36,9 @@ LEAST_ALPHA = 0.03
 """Narrower lobes are mapped as these: none is learned from."""
 
 LEAST_SLOPE = -0.9
-"""Of the Lambertian term from the normal to the horizon: it stays positive."""
+"""From the normal to the horizon: what is multiplied stays positive."""
+
+LN2 = float(np.log(2.0))
 
 LEVEL = 0.3 / jnp.pi
 """Scale of the constant term."""
@@ -71,19 +73,21 @@ class Shape(NamedTuple):
 class Weights(NamedTuple):
     """Strength of the second lobe for each pair of sides. lobes: (3, k, 2), plain and times a Schlick term.
 
-    levels: (3,), the Lambertian term, 1/sr. slopes: (2, 2), reflection and transmission by directions above and below:
-    the term is multiplied by 1 + slope (1 - cos) of either direction.
+    levels: (3,), the Lambertian term, 1/sr. slopes, rims: (2, 2), reflection and transmission by directions above and
+    below: of either direction the Lambertian term is multiplied by 1 + slope (1 - cos), the lobes by
+    1 + rim (1 - cos)^4.
     """
 
     lobes: Array
     levels: Array
     slopes: Array
+    rims: Array
 
 
 def network(media: int, key: Array) -> eqx.nn.MLP:
     """A network for so many media that has learned nothing yet: the second lobe is the first, spread a little."""
     inputs = media * MEDIUM_FEATURES + (PAIR_FEATURES if media > 1 else 0)
-    outputs = 3 * media + 2 * (2 * media + 2)
+    outputs = 3 * media + 2 * (2 * media + 3)
     fresh = eqx.nn.MLP(inputs, outputs, WIDTH, DEPTH, activation=jax.nn.silu, key=key)
     last = fresh.layers[-1]
     small = (0.1 * last.weight, jnp.zeros(outputs))
@@ -127,14 +131,15 @@ def shape_of(net: eqx.nn.MLP, media: Numbers) -> Shape:
 def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Weights:
     """The second lobe's strength in one channel. mean_albedo, mean_f0: over all channels, (k,) each."""
     count = len(media.thickness)
-    lobes, levels, slopes = [], [], []
+    lobes, levels, slopes, rims = [], [], [], []
     for order in _orders(count):
         index = jnp.asarray(order)
         raw = _answer(net, _in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
-        strength = jax.nn.softplus(raw.reshape(2, 2 * count + 2))
+        strength = jax.nn.softplus(raw.reshape(2, 2 * count + 3))
         lobes.append(strength[:, : 2 * count].reshape(2, count, 2)[:, index])
         levels.append(strength[:, 2 * count])
-        slopes.append(LEAST_SLOPE + (-LEAST_SLOPE / jnp.log(2.0)) * strength[:, 2 * count + 1])
+        slopes.append(LEAST_SLOPE * (1.0 - strength[:, 2 * count + 1] / LN2))  # 0 before anything is learned
+        rims.append(LEAST_SLOPE * (1.0 - strength[:, 2 * count + 2] / LN2))
     above, below = 0, len(lobes) - 1
     through = (sum(lobe[1] for lobe in lobes) / len(lobes), sum(level[1] for level in levels) / len(levels))
     kept = _kept(media.albedo, media.f0)
@@ -143,6 +148,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
         share * jnp.stack([lobes[above][0], lobes[below][0], through[0]]),
         LEVEL * share * jnp.stack([levels[above][0], levels[below][0], through[1]]),
         jnp.stack([slopes[above], slopes[below]], -1),
+        jnp.stack([rims[above], rims[below]], -1),
     )
 
 

@@ -186,3 +186,18 @@ def test_costs_one_more_lobe_and_a_constant(name, side):
         return sum(count(lambda wi, wo: lj.evaluate(prepared, wi, wo, side=side), wi, wo).values())
 
     assert operations(CAKE) < 2.9 * operations(FIRST)
+
+
+def test_albedo_of_upright_fibers_at_normal_incidence_in_float32():
+    """Whatever alpha rounds to, nodes find a frame around the normal; 1e-3 is the error of the rule at 16 nodes."""
+    wi, alphas = jnp.asarray([0.0, 0.0, 1.0], jnp.float32), jnp.linspace(0.2, 0.9, 200, dtype=jnp.float32)
+
+    def energy(alpha, dtype):
+        stack = lj.Stack([lj.Medium(jnp.asarray(2.0, dtype), 1.0, lj.SGGX("fiber", alpha.astype(dtype)))])
+        return jnp.stack(lj.albedo(stack, wi.astype(dtype), CAKE, nodes=16))[:, 0]
+
+    single, double = (
+        jax.jit(jax.vmap(lambda alpha, dtype=dtype: energy(alpha, dtype)))(alphas)
+        for dtype in (jnp.float32, jnp.float64)
+    )
+    np.testing.assert_allclose(single, double, atol=1e-3)
