@@ -42,6 +42,10 @@ class SpongeCake(Transport):
     that these must be known: under ``jit`` or ``grad`` with traced parameters more than two are refused. A base is seen
     through the media, without inter-reflection.
 
+    Relative L2 error of the BSDF over random materials: 2 % for one medium and 4 % for two (median), 11 % and 22 %
+    (95th percentile); most where fibers are narrow (`benchmarks/results/spongecake.md`). Reciprocal, and finite over
+    the box; albedos of lossless slabs are off by 1 % (median).
+
     Args:
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
     """

@@ -106,8 +106,9 @@ def test_error_is_what_the_tables_say(name):
     assert (norm(values - truth) < 0.7 * norm(first - truth)).all()
 
 
-@pytest.mark.parametrize("proposal", ["first", "both"])
-@pytest.mark.parametrize(("name", "theta"), [("flakes", 0.7), ("fibers over haze", 2.3)])
+@pytest.mark.parametrize(
+    ("name", "theta", "proposal"), [("flakes", 0.7, "first"), ("flakes", 2.3, "both"), ("haze", 0.7, "both")]
+)
 def test_samples(name, theta, proposal):
     stack, wi, how = STACKS[name], lj.direction(theta, 0.4), lj.SpongeCake(proposal=proposal)
     towards = jnp.broadcast_to(wi, (DRAWS, 3))

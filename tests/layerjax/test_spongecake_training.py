@@ -14,7 +14,7 @@ from layerjax.transport.spongecake_lobes import evaluate_second, second_lobe
 from layerjax.transport.spongecake_mapping import network, pack, unpack
 
 
-def drawn(media, shards=6, seed=1):
+def drawn(media, shards=4, seed=1):
     """Materials and directions as they are drawn, values made up."""
     random = np.random.default_rng(seed)
     parts = [data.draw_layers(random, media)[0] for _ in range(shards)]
@@ -29,8 +29,8 @@ def test_the_lobes_that_are_trained_are_those_of_the_transport(media):
     samples, net = drawn(media), network(media, jax.random.key(4))
     net = jax.tree.map(lambda leaf: 3.0 * leaf if eqx.is_inexact_array(leaf) else leaf, net)
     batch = training.batch_of(samples)
-    predicted = training.predict
-    for n in range(0, len(samples.values), data.SHARD // 2):
+    predicted = eqx.filter_jit(training.predict)
+    for n in range(0, len(samples.values), data.SHARD):
         numbers = jax.tree.map(lambda part, n=n: jnp.asarray(part[n]), batch.media)
         found = predicted(net, numbers, numbers.albedo, numbers.f0, batch.wi[n], batch.wo[n])
         kinds = tuple(data.KINDS[k] for k in samples.layers.kind[n])
