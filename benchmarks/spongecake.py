@@ -76,9 +76,7 @@ def study(
         fitted.append(fit(name, phase, truth))
         report(f"fits: {name}: bias {fitted[-1].cake_bias:.3f}, single scattering {fitted[-1].first_bias:.3f}")
     surroundings = environment.describe()
-    text = markdown(
-        surroundings, counts, errors, furnaces, steps, drawn, fitted, QUICK_WALKS if quick else WALKS, ANGLES
-    )
+    text = markdown(surroundings, counts, errors, furnaces, steps, drawn, fitted, walks, ANGLES, gain)
     content: dict[str, Any] = {
         "environment": surroundings,
         "quick": quick,
