@@ -21,8 +21,8 @@ that were learned from but never seen: median and 95th percentile, in percent. *
 {errors}
 ## White furnace
 
-The same materials with albedo 1 and no Fresnel term, light at {angles} degrees: |R + T + unscattered - 1| in percent,
-over materials and angles.
+The same materials with albedo 1 and no Fresnel term, light at {angles} degrees:
+|R + T + unscattered - 1| in percent, over materials and angles.
 
 {furnace}
 ## What each step is worth

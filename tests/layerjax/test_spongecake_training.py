@@ -14,7 +14,7 @@ from layerjax.transport.spongecake_lobes import evaluate_second, second_lobe
 from layerjax.transport.spongecake_mapping import network, pack, unpack
 
 
-def drawn(media, shards=4, seed=1):
+def drawn(media, shards=3, seed=1):
     """Materials and directions as they are drawn, values made up."""
     random = np.random.default_rng(seed)
     parts = [data.draw_layers(random, media)[0] for _ in range(shards)]
