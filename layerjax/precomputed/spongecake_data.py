@@ -102,7 +102,10 @@ def stack_of(kinds: tuple[str, ...], tilted: bool, numbers: dict[str, Array]) ->
 
 
 def make(folder: Path, count: int, media: int, split: Split, seed: int) -> Iterator[int]:
-    """Make the shards of `count` materials that the folder lacks; yields the number of materials that are there."""
+    """Make the shards of `count` materials that the folder lacks; yields the number of materials that are there.
+
+    A folder is for one seed: shards that are there are taken as they are.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(-(-count // SHARD)):
         path = _path(folder, media, split, number)

@@ -163,10 +163,9 @@ def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> t
             phase = second.slab.media[k].phase
             near, far = phase.rule(wi, nodes)
             peaked, solid_angle = near if sign > 0 else far
-            if isinstance(phase, HenyeyGreenstein):
-                rest, share = None, jnp.ones_like(solid_angle)
-            else:
-                rest, share = 1.0 - _peaked(phase, spread, wo), _peaked(phase, spread, peaked)
+            share = jnp.ones_like(solid_angle)  # a Henyey-Greenstein lobe is followed whole
+            if not isinstance(phase, HenyeyGreenstein):
+                share, rest = _peaked(phase, spread, peaked), 1.0 - _peaked(phase, spread, wo)
                 terms.append(tuple(rest * value for value in lobe))
             there = _lobes(second, spread, peaked, "all", opaque)[k]
             parts.append(tuple(jnp.sum(v * share * jnp.abs(peaked[2]) * solid_angle, -1) for v in there))

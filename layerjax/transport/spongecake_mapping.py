@@ -8,11 +8,12 @@ known is built in and need not be learned:
 - a turn about the normal changes nothing: tilts and the angle between axes go in as even invariants of the axes;
 - a slab turned upside down is lit from below: one network serves both sides, called for either order of the media;
 - without collisions, or after one, nothing is left: weights are in proportion to the square of what scatters;
-- reciprocity: the lobes are reciprocal, the levels constant, and transmission has one set of weights both ways.
+- reciprocity: the lobes are reciprocal, the levels a constant, both times one factor of either direction, and
+  transmission has one set of weights both ways.
 
 Beyond the paper: weights of reflection and transmission are apart, since one for both cannot fit both (isotropic, tau
-5: 0.585 and 0.250 of the light); the blur, see `layerjax.transport.spongecake_lobes`; the Schlick term; and
-Henyey-Greenstein media.
+5: 0.585 and 0.250 of the light); the blur, see `layerjax.transport.spongecake_lobes`; the Schlick term; the
+factors, which bend both towards grazing; and Henyey-Greenstein media.
 """
 
 from collections.abc import Mapping
@@ -28,9 +29,6 @@ from layerjax._numerics import at_least, safe_sqrt
 
 WIDTH, DEPTH = 128, 3
 """Hidden layers: how wide, how many."""
-
-SIDES = 3
-"""Pairs of sides that have weights of their own: both above, both below, through."""
 
 LEAST_ALPHA = 0.03
 """Narrower lobes are mapped as these: none is learned from."""

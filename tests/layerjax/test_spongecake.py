@@ -91,7 +91,7 @@ def test_nothing_is_added_where_nothing_scatters_twice():
 
 @pytest.mark.parametrize("name", STACKS)
 def test_error_is_what_the_tables_say(name):
-    """Far above the 95th percentile that held-out materials of the record have."""
+    """Within the 95th percentile of the held-out materials of the record, and well below the first order alone."""
     record = lj.precomputed.load("spongecake")[f"{len(STACKS[name].layers)}-error"]
     random = np.random.default_rng(1)
     cosines = np.sqrt(random.uniform(0.01, 1.0, (2, 600))) * [[1.0], [1.0]]
@@ -188,7 +188,10 @@ def test_refusals():
 @pytest.mark.parametrize("name", STACKS)
 @pytest.mark.parametrize("side", ["all", "reflection"])
 def test_costs_one_more_lobe_and_a_constant(name, side):
-    """Operations of a value: 2.2 times those of single scattering, and a few dozen scalars a side and channel."""
+    """Twice the operations of single scattering, and what picks weights by side and channel: 2.9 times at most.
+
+    The bar, 2.2, is one of time, which is not asserted.
+    """
     wi, wo = pairs()
 
     def operations(how):
