@@ -80,8 +80,21 @@ def draw(seed):
     return parameters, wi, wo
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
-@pytest.mark.parametrize(("dtype", "mode"), [(np.float32, "reverse"), (np.float64, "reverse"), (np.float32, "forward")])
+QUICK = {
+    (np.float32, "reverse"): tuple(STRUCTURES),
+    (np.float64, "reverse"): ("tilted fibers", "conductor"),
+    (np.float32, "forward"): ("surface flakes", "haze on rough diffuse"),
+}
+"""What every run of the tests goes through; the other pairs take as long to compile and are marked slow."""
+
+CASES = [
+    pytest.param(name, *how, marks=() if name in quick else pytest.mark.slow)
+    for how, quick in QUICK.items()
+    for name in STRUCTURES
+]
+
+
+@pytest.mark.parametrize(("name", "dtype", "mode"), CASES)
 def test_values_and_gradients_are_finite(name, dtype, mode):
     make = STRUCTURES[name]
     parameters, wi, wo = jax.tree.map(lambda x: x.astype(dtype), draw(11))
@@ -144,14 +157,14 @@ def test_no_draw_gains_energy(name):
 def test_tangent_and_unnormalised_directions_give_no_nan():
     stack = lj.Stack(three({k: jnp.asarray(v[0]) for k, v in draw(1)[0].items()}))
     odd = jnp.array([[1.0, 0, 0], [0, 0, 0], [2, 2, 2], [1, 0, 1e-30], [0, 0, 1e-8], [0, 0, -3], [1e-20, 0, 1e-20]])
-    for dtype in (jnp.float32, jnp.float64):
+    bases = (None, lj.Conductor(0.2, 3.0, 0.1), lj.OrenNayar(0.5, 0.5))
+    for base, dtype in zip(bases, (jnp.float32, jnp.float64, jnp.float32), strict=True):
         wi, wo = odd[:, None].astype(dtype), odd[None].astype(dtype)
-        for base in (None, lj.Conductor(0.2, 3.0, 0.1), lj.OrenNayar(0.5, 0.5)):
-            whole = lj.Stack(stack.layers, base)
-            total = jax.jit(jax.grad(lambda stack, a, b: jnp.sum(lj.evaluate(stack, a, b)), (1, 2)))
-            gradients = total(whole, wi, wo)
-            assert np.isfinite(lj.evaluate(whole, wi, wo)).all()
-            assert all(np.isfinite(g).all() for g in gradients)
+        whole = lj.Stack(stack.layers, base)
+        total = jax.jit(jax.grad(lambda stack, a, b: jnp.sum(lj.evaluate(stack, a, b)), (1, 2)))
+        gradients = total(whole, wi, wo)
+        assert np.isfinite(lj.evaluate(whole, wi, wo)).all()
+        assert all(np.isfinite(g).all() for g in gradients)
 
 
 @pytest.mark.parametrize("name", STRUCTURES)

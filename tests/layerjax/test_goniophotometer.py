@@ -121,12 +121,12 @@ COATED = {
     ("name", "microfacets"),
     [
         ("two media", "single"),
-        ("paint", "single"),
+        pytest.param("paint", "single", marks=pytest.mark.slow),
         ("paint", "multiple"),
-        ("haze on varnish", "single"),
+        pytest.param("haze on varnish", "single", marks=pytest.mark.slow),
         ("plate", "multiple"),
         ("two coats on metal", "single"),
-        ("two coats on metal", "multiple"),
+        pytest.param("two coats on metal", "multiple", marks=pytest.mark.slow),
     ],
 )
 def test_bins_hold_the_integral_of_the_values(name, microfacets):

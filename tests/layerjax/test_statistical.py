@@ -111,7 +111,13 @@ def test_what_nothing_meets_is_not_in_the_albedo():
 
 @pytest.mark.parametrize(
     ("stack", "transport", "theta"),
-    [(COAT, FORWARD, 0.5), (DIFFUSE, FORWARD, 1.2), (SLAB, FORWARD, 0.5), (SLAB, FORWARD, 2.4), (SLAB, SYMMETRIC, 2.4)],
+    [
+        (COAT, FORWARD, 0.5),
+        (DIFFUSE, FORWARD, 1.2),
+        pytest.param(SLAB, FORWARD, 0.5, marks=pytest.mark.slow),
+        pytest.param(SLAB, FORWARD, 2.4, marks=pytest.mark.slow),
+        (SLAB, SYMMETRIC, 2.4),
+    ],
 )
 def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, transport, theta):
     wi, draws = lj.direction(theta, 0.7), 200_000
@@ -184,6 +190,7 @@ def box_stack(p):
 
 
 BOX = {
+    "coated metal": lambda p: lj.Stack(box_stack(p)[:1], lj.Conductor(p["n"], p["k"], p["beta"])),
     "over metal": lambda p: lj.Stack(box_stack(p)[:2], lj.Conductor(p["n"], p["k"], p["beta"])),
     "through": lambda p: lj.Stack(box_stack(p)),
     "over diffuse": lambda p: lj.Stack(box_stack(p), lj.Lambertian(p["albedo"])),
@@ -193,7 +200,8 @@ BOX = {
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        ("over metal", jnp.float32),
+        ("coated metal", jnp.float32),
+        pytest.param("over metal", jnp.float32, marks=pytest.mark.slow),
         pytest.param("over metal", jnp.float64, marks=pytest.mark.slow),
         pytest.param("through", jnp.float32, marks=pytest.mark.slow),
         pytest.param("over diffuse", jnp.float32, marks=pytest.mark.slow),
