@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-NAMES = ("microsurface", "diffuse_interface", "spongecake")
+NAMES = ("microsurface", "diffuse_interface", "spongecake", "vmf_diffuse")
 
 
 @functools.cache
