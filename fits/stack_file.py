@@ -42,7 +42,7 @@ from layerjax import gallery
 
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
-_BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.Conductor)}
+_BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.VMFDiffuse, lj.Conductor)}
 _PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.SGGX)}
 _TRANSPORTS: _Kinds = {
     name: kind
@@ -167,9 +167,11 @@ def _build(where: str, table: Any, kinds: _Kinds) -> Any:
     _check_keys(where, table, ("kind", *known))
     hints = get_type_hints(kind)
     given = {}
+    normals = f", {table['distribution']}" if table.get("distribution", "ggx") != "ggx" else ""
     for key, (name, parameter) in known.items():
         if key in table:
-            given[name] = _value(f"{where}.{key}", table[key], hints[name], f"{kind.__name__}.{name}")
+            ranged = f"{kind.__name__}.{name}{normals if name == 'alpha' else ''}"
+            given[name] = _value(f"{where}.{key}", table[key], hints[name], ranged)
         elif parameter.default is inspect.Parameter.empty:
             raise ValueError(f"{where} ({kind.__name__}) has no {key}")
     try:

@@ -21,6 +21,8 @@ from layerjax.stack import Stack as Stack
 from layerjax.surfaces import Conductor as Conductor
 from layerjax.surfaces import Lambertian as Lambertian
 from layerjax.surfaces import OrenNayar as OrenNayar
+from layerjax.surfaces import VMFDiffuse as VMFDiffuse
+from layerjax.transport import ENDF as ENDF
 from layerjax.transport import AddingDoubling as AddingDoubling
 from layerjax.transport import RandomWalk as RandomWalk
 from layerjax.transport import SingleScattering as SingleScattering

@@ -12,6 +12,7 @@ import numpy as np
 RANGES: dict[str, tuple[float, float]] = {
     "Interface.ior": (0.25, 4.0),
     "Interface.alpha": (1e-4, 1.0),
+    "Interface.alpha, vmf": (1e-4, 15.0),
     "Medium.thickness": (0.0, 1e4),
     "Medium.albedo": (0.0, 1.0),
     "Medium.f0": (0.0, 1.0),
@@ -20,11 +21,14 @@ RANGES: dict[str, tuple[float, float]] = {
     "Lambertian.albedo": (0.0, 1.0),
     "OrenNayar.albedo": (0.0, 1.0),
     "OrenNayar.roughness": (0.0, 1.0),
+    "VMFDiffuse.albedo": (0.0, 1.0),
+    "VMFDiffuse.roughness": (0.0, 1.0),
     "Conductor.ior": (0.01, 10.0),
     "Conductor.k": (0.0, 20.0),
     "Conductor.alpha": (1e-4, 1.0),
+    "Conductor.alpha, vmf": (1e-4, 15.0),
 }
-"""The documented box: the range of every numeric field."""
+"""The documented box: the range of every numeric field; of widths, for every distribution of normals."""
 
 PER_CHANNEL = frozenset(
     {
@@ -33,6 +37,7 @@ PER_CHANNEL = frozenset(
         "Medium.f0",
         "Lambertian.albedo",
         "OrenNayar.albedo",
+        "VMFDiffuse.albedo",
         "Conductor.ior",
         "Conductor.k",
     }
@@ -49,16 +54,20 @@ def is_placeholder(value: object) -> bool:
     return getattr(value, "__layerjax_placeholder__", False) is True
 
 
-def parameter(name: str, *, default: Any = dataclasses.MISSING, optional: bool = False) -> Any:
+def parameter(name: str, *, default: Any = dataclasses.MISSING, optional: bool = False, ranged: bool = True) -> Any:
     """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
 
-    Traced values are not checked (they have no value yet), placeholders pass as they are.
+    Traced values are not checked (they have no value yet), placeholders pass as they are. Not `ranged`: the range
+    depends on other fields, and is checked by the class.
     """
 
     def convert(value: Any) -> Any:
         if (optional and value is None) or is_placeholder(value):
             return value
-        return _checked(name, value)
+        array = _shaped(name, value)
+        if ranged:
+            check_range(name, array)
+        return array
 
     if default is dataclasses.MISSING:
         return eqx.field(converter=convert)
@@ -80,8 +89,7 @@ def floating(name: str, value: Any) -> jax.Array:
         raise ValueError(f"{name}: {value!r} is not a number or an array of real numbers") from None
 
 
-def _checked(name: str, value: Any) -> jax.Array:
-    low, high = RANGES[name]
+def _shaped(name: str, value: Any) -> jax.Array:
     array = floating(name, value)
     limit = 1 if name in PER_CHANNEL else 0
     if array.ndim > limit or (array.ndim == 1 and array.shape[0] == 0):
@@ -89,6 +97,12 @@ def _checked(name: str, value: Any) -> jax.Array:
         raise ValueError(
             f"{name}: shape {array.shape} given, {wanted} allowed (use jax.vmap for many materials at a time)"
         )
+    return array
+
+
+def check_range(name: str, array: jax.Array) -> None:
+    """Refuse concrete values outside the range of that name."""
+    low, high = RANGES[name]
     if not isinstance(array, jax.core.Tracer):
         concrete = np.asarray(array, dtype=np.float64)
         slack = 1e-6 if array.dtype != np.float64 else 1e-12  # the bounds themselves round when converted
@@ -96,7 +110,6 @@ def _checked(name: str, value: Any) -> jax.Array:
         if outside.any():
             bad = concrete[outside] if concrete.ndim else concrete
             raise ValueError(f"{name}: {float(np.ravel(bad)[0]):g} is outside [{low:g}, {high:g}]")
-    return array
 
 
 def leaves_with_names(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

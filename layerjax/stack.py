@@ -15,23 +15,30 @@ import numpy as np
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
+from layerjax.facets import Distribution, check_facets
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
-from layerjax.surfaces import Surface
+from layerjax.surfaces import Conductor, Surface
 
 
 class Interface(eqx.Module):
-    """Rough dielectric interface of GGX microfacets.
+    """Rough dielectric interface of microfacets.
 
-    ========= ====== ========= ======= ===========================================================================
-    parameter symbol range     default meaning
-    ========= ====== ========= ======= ===========================================================================
-    ior       eta    [0.25, 4]         index of what lies below, relative to what surrounds the stack
-    alpha     alpha  [1e-4, 1]         GGX width
-    ========= ====== ========= ======= ===========================================================================
+    ============ ====== ========== ======= ==========================================================================
+    parameter    symbol range      default meaning
+    ============ ====== ========== ======= ==========================================================================
+    ior          eta    [0.25, 4]          index of what lies below, relative to what surrounds the stack
+    alpha        alpha  [1e-4, 1]          width of the normals; for ``"vmf"`` [1e-4, 15], with kappa = 2 / alpha^2
+    distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (which `AddingDoubling` and
+                        "vmf"              `RandomWalk` carry, with ``microfacets="single"``)
+    ============ ====== ========== ======= ==========================================================================
     """
 
     ior: Parameter = parameter("Interface.ior")
-    alpha: Parameter = parameter("Interface.alpha")
+    alpha: Parameter = parameter("Interface.alpha", ranged=False)
+    distribution: Distribution = eqx.field(static=True, default="ggx")
+
+    def __check_init__(self) -> None:
+        check_facets("Interface", self.distribution, self.alpha)
 
 
 class Medium(eqx.Module):
@@ -65,7 +72,7 @@ class Stack(eqx.Module):
 
     Args:
         layers: any number of `Interface` and `Medium`, the topmost first.
-        base: an opaque surface (`Lambertian`, `OrenNayar`, `Conductor`), or None: light passes.
+        base: an opaque surface (`Lambertian`, `OrenNayar`, `VMFDiffuse`, `Conductor`), or None: light passes.
 
     Raises:
         ValueError: something else stands in the list, or parameters disagree on the number of channels.
@@ -143,6 +150,15 @@ def simplify(stack: Stack) -> Stack:
             layer = eqx.tree_at(lambda m: (m.albedo, m.f0), layer, (albedo, f0), is_leaf=lambda leaf: leaf is None)
         layers.append(layer)
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
+
+
+def place_of_vmf(stack: Stack) -> str | None:
+    """Where the first von Mises-Fisher facets of a stack are, such as ``layers[0].distribution``; None: nowhere."""
+    parts = [(f"layers[{index}]", layer) for index, layer in enumerate(stack.layers)]
+    for name, part in [*parts, ("base", stack.base)]:
+        if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
+            return f"{name}.distribution"
+    return None
 
 
 def media_of(stack: Stack) -> list[Medium]:

@@ -4,3 +4,4 @@ from layerjax.surfaces._surface import Surface as Surface
 from layerjax.surfaces.lambertian import Lambertian as Lambertian
 from layerjax.surfaces.microfacet import Conductor as Conductor
 from layerjax.surfaces.oren_nayar import OrenNayar as OrenNayar
+from layerjax.surfaces.vmf_diffuse import VMFDiffuse as VMFDiffuse

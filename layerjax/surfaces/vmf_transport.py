@@ -146,6 +146,7 @@ def _evaluate(wi: Vector, wo: Vector, modes: Array, spread: Array) -> tuple[Arra
     cosines = [jnp.ones_like(ui), along]
     for _ in range(MODES[0] - 2):
         cosines.append(2.0 * along * cosines[-1] - squared * cosines[-2])
-    shape = jnp.sum(smooth * jnp.stack(cosines), axis=1)
     ratio = facing_i * facing_o / (ui * mean_o + uo * mean_i)
-    return tuple(at_least(ratio * value, 0.0) for value in shape)
+    # mode by mode: the places may have fewer azimuths than the directions
+    shapes = [sum((g * turn for g, turn in zip(each, cosines, strict=True)), jnp.zeros_like(along)) for each in smooth]
+    return tuple(at_least(ratio * shape, 0.0) for shape in shapes)

@@ -7,7 +7,7 @@ import equinox as eqx
 from jax import Array
 
 from layerjax.directions import Vector
-from layerjax.stack import Stack
+from layerjax.stack import Stack, place_of_vmf
 
 Side = Literal["all", "reflection", "transmission"]
 """Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
@@ -62,3 +62,12 @@ class Transport(eqx.Module):
     def coarser(self) -> "Transport | None":
         """The same transport at a lower resolution, to estimate the error from the difference; None if it has none."""
         return None
+
+
+def refuse_vmf(stack: Stack, transport: str) -> None:
+    """Raise a ValueError that names the first von Mises-Fisher facets, on behalf of a transport without them."""
+    place = place_of_vmf(stack)
+    if place is not None:
+        raise ValueError(
+            f'{place}: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with microfacets="single" do'
+        )

@@ -4,20 +4,25 @@ Directions here are of travel, in the frame of the stack; inside each function t
 with z positive on the side that light arrives from.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, select
-from layerjax.distributions import ggx_masking, sggx_area
+from layerjax.facets import Distribution, draw_weight, masking, twice_seen
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import (
+    between,
+    interface_event,
     interface_pdf,
     interface_reflection,
-    interface_sample,
     interface_transmission,
     refraction_lobe,
 )
@@ -63,7 +68,7 @@ def is_base(scene: Scene, surface: Array | None) -> Array | bool:
 
 
 def roughness(scene: Scene, surface: Array | None) -> Array:
-    """GGX width of an interface."""
+    """Width of the normals of an interface."""
     return choose(surface, [interface.alpha for interface in scene.interfaces])
 
 
@@ -89,18 +94,27 @@ def bounce(
     results = []
     if at_base is not True:
         ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
-        wo, leaves = interface_sample(wi, ior, alpha, u1, u2, u3 if refracts is None else jnp.where(refracts, 2.0, u3))
-        masking = ggx_masking((wo[0], wo[1], jnp.abs(wo[2])), alpha)
-        value: Channels = () if towards is None else (_interface(wi, towards, ior, alpha) * jnp.abs(towards[2]),)
-        results.append(Bounce(value, wo, wo[2] < 0, (masking,), leaves))
+        u3 = u3 if refracts is None else jnp.where(refracts, 2.0, u3)
+
+        def event(distribution: Distribution) -> Bounce:
+            wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
+            kept = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
+            if distribution != "ggx":
+                kept = kept * draw_weight(wi, m, alpha)
+            sent: Channels = ()
+            if towards is not None:
+                sent = (_interface(wi, towards, ior, alpha, distribution) * jnp.abs(towards[2]),)
+            return Bounce(sent, wo, wo[2] < 0, (kept,), leaves)
+
+        results.append(_by_distribution(scene, surface, event))
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
         wo = base.sample(wi, u1, u2)
         leaves = wo[2] > 0
         inside = _facing(wo)
-        share = tuple(f * inside[2] / base.pdf(wi, inside) for f in base.evaluate(wi, inside))
-        value = () if towards is None else base_towards(base, wi, towards)
+        share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
+        value: Channels = () if towards is None else base_towards(base, wi, towards)
         results.append(Bounce(value, wo, jnp.zeros_like(leaves), share, leaves))
     result = results[0] if len(results) == 1 else merge(at_base, results[1], results[0])
     return result._replace(direction=turned(result.direction, from_above))
@@ -137,7 +151,11 @@ def density(
     value: Array | None = None
     if at_base is not True:
         ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
-        value = interface_pdf(_interface(wi, wo, ior, alpha), wo, alpha)
+
+        def drawn(distribution: Distribution) -> Array:
+            return interface_pdf(_interface(wi, wo, ior, alpha, distribution), wi, wo, ior, alpha, distribution)
+
+        value = _by_distribution(scene, surface, drawn)
     if at_base is not False:
         base = base_of(scene)
         assert base is not None
@@ -153,22 +171,47 @@ def exit_density(
     """Density with which an interface, seen from outside along `leaving`, refracts to the direction `inside`.
 
     Both directions point away from the interface; `above` says on which side `leaving` lies. Also the transmittance of
-    the facet and the Smith term 2 / (cos + sigma) of `inside`, multiplied.
+    the facet, G1 / cos of `inside` and what the draw weighs, multiplied.
     """
     wi, wo = turned(leaving, above), turned(inside, above)
     ior, alpha = scene.surface_ior(surface, above), roughness(scene, surface)
-    lobe, transmittance = refraction_lobe(wi, wo, ior, alpha)
-    value = jnp.where(wo[2] < 0, 2.0 * lobe / (wi[2] + sggx_area(wi, "surface", alpha, None)), 0.0)
+
+    def drawn(distribution: Distribution) -> tuple[Array, Array]:
+        lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
+        value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_seen(wi[2], wi, alpha, distribution), 0.0)
+        passed = transmittance * 2.0 / twice_seen(jnp.abs(wo[2]), wo, alpha, distribution)
+        if distribution == "ggx":
+            return value, passed
+        weight = draw_weight(wi, between(wi, wo, ior), alpha)
+        return value / weight, passed * weight
+
+    value, passed = _by_distribution(scene, surface, drawn)
     if diffuse:
         value = value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi
-    return value, transmittance * 2.0 / (jnp.abs(wo[2]) + sggx_area(wo, "surface", alpha, None))
+    return value, passed
 
 
-def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array) -> Array:
+def _by_distribution(scene: Scene, surface: Array | None, function: Callable[[Distribution], Any]) -> Any:
+    """What the function gives for the normals of the interface; computed for every distribution that there is."""
+    kinds = [interface.distribution for interface in scene.interfaces]
+    result = function(kinds[0])
+    for other in sorted(set(kinds[1:]) - {kinds[0]}):
+        chosen = choose(surface, [jnp.asarray(kind == other) for kind in kinds])
+        result = jax.tree.map(partial(jnp.where, chosen), function(other), result)
+    return result
+
+
+def _weight(value: Array, density: Array, base: Surface) -> Array:
+    """Their quotient; 0 where vMF normals are so improbable that both are 0."""
+    vanishes = isinstance(base, Conductor) and base.distribution == "vmf"
+    return safe_div(value, density) if vanishes else value / density
+
+
+def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution) -> Array:
     """BSDF of an interface, of whichever kind the side of wo asks for."""
     above = wo[2] > 0
-    reflected = interface_reflection(wi, (wo[0], wo[1], jnp.where(above, wo[2], 0.5)), ior, alpha)
-    refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha)
+    reflected = interface_reflection(wi, (wo[0], wo[1], jnp.where(above, wo[2], 0.5)), ior, alpha, distribution)
+    refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha, distribution)
     return jnp.where(above, reflected, refracted)
 
 

@@ -20,7 +20,7 @@ from jax import Array
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, direction, split
 from layerjax.stack import Stack, simplify
-from layerjax.transport._transport import Side, Transport
+from layerjax.transport._transport import Side, Transport, refuse_vmf
 from layerjax.transport.discrete.interfaces import Microfacets
 from layerjax.transport.discrete.solve import Plan, make_plan, solve
 from layerjax.transport.discrete.tables import Tables, make_tables, read_energy, read_rest
@@ -47,7 +47,8 @@ class Solved(eqx.Module):
 class AddingDoubling(Transport):
     """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
 
-    Carries everything that a `Stack` holds. The work per stack is done in `prepare`; a pair then costs microseconds.
+    Carries everything that a `Stack` holds; von Mises-Fisher normals with ``microfacets="single"`` only. The work per
+    stack is done in `prepare`; a pair then costs microseconds.
 
     Args:
         nodes: cosines a hemisphere (and for each range of angles between critical angles), >= 2.
@@ -89,7 +90,8 @@ class AddingDoubling(Transport):
                 raise ValueError(f"AddingDoubling.{name}: {choice!r} is not one of {allowed}")
 
     def check(self, stack: Stack) -> None:
-        """Any stack will do."""
+        if self.microfacets == "multiple":
+            refuse_vmf(stack, 'AddingDoubling(microfacets="multiple")')
 
     def prepare(self, stack: Stack) -> Solved:
         slim = simplify(stack)

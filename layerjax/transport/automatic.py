@@ -1,7 +1,7 @@
 """Which transport a stack gets when none is named."""
 
 from layerjax.phase import HenyeyGreenstein
-from layerjax.stack import Interface, Medium, Stack, is_known, media_of, simplify
+from layerjax.stack import Interface, Medium, Stack, is_known, media_of, place_of_vmf, simplify
 from layerjax.surfaces import Lambertian
 from layerjax.transport._transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
@@ -14,7 +14,8 @@ def automatic(stack: Stack) -> Transport:
     interfaces = sum(isinstance(layer, Interface) for layer in stack.layers)
     if not interfaces:
         return SingleScattering()
-    if interfaces == 1 and isinstance(stack.base, Lambertian) and all(map(_only_absorbs, media_of(simplify(stack)))):
+    closed = interfaces == 1 and isinstance(stack.base, Lambertian) and place_of_vmf(stack) is None
+    if closed and all(map(_only_absorbs, media_of(simplify(stack)))):
         return Statistical(microfacets="single")
     return AddingDoubling()
 

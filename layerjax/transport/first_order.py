@@ -15,12 +15,12 @@ from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.distributions import ggx_sample, radii
+from layerjax.facets import Distribution, facet_density, rule, sample
 from layerjax.phase import SGGX
-from layerjax.quadrature import Nodes, flake_rule
+from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.surfaces.microfacet import facet_density, interface_reflection, interface_transmission
+from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
 from layerjax.transport._transport import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 
@@ -30,20 +30,20 @@ class Face(Surface):
 
     ior: Parameter
     alpha: Parameter
+    distribution: Distribution = eqx.field(static=True, default="ggx")
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
-        return (interface_reflection(wi, wo, self.ior, self.alpha),)
+        return (interface_reflection(wi, wo, self.ior, self.alpha, self.distribution),)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        return reflect(wi, ggx_sample(wi, self.alpha, u1, u2))
+        return reflect(wi, sample(wi, self.alpha, u1, u2, self.distribution))
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return facet_density(h, wi, self.alpha)
+        return facet_density(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
-        upper, _ = flake_rule(wi, *radii("surface", self.alpha), None, nodes)
-        return upper
+        return rule(wi, self.alpha, nodes, self.distribution)
 
 
 class FirstOrder(eqx.Module):
@@ -68,7 +68,7 @@ def first_order(stack: Stack) -> FirstOrder:
     first, last = interfaces[0], interfaces[-1]
     face = stack.layers[first]
     assert isinstance(face, Interface)
-    upper = Media(_media(stack.layers[:first]), Face(face.ior, face.alpha))
+    upper = Media(_media(stack.layers[:first]), Face(face.ior, face.alpha, face.distribution))
     if stack.base is not None:
         return FirstOrder(upper, None, None, True, True)
     above: Any = 1.0
@@ -79,9 +79,10 @@ def first_order(stack: Stack) -> FirstOrder:
     bottom = stack.layers[last]
     assert isinstance(bottom, Interface)
     lower = Media(
-        tuple(map(_mirrored, reversed(_media(stack.layers[last + 1 :])))), Face(above / bottom.ior, bottom.alpha)
+        tuple(map(_mirrored, reversed(_media(stack.layers[last + 1 :])))),
+        Face(above / bottom.ior, bottom.alpha, bottom.distribution),
     )
-    crossing = Face(face.ior, face.alpha) if first == last else None
+    crossing = Face(face.ior, face.alpha, face.distribution) if first == last else None
     return FirstOrder(upper, lower, crossing, False, True)
 
 
@@ -124,7 +125,7 @@ def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channel
     valid = (over[2] > edge) & (under[2] < -edge)
     over = (over[0], over[1], jnp.where(valid, over[2], 0.5))
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
-    value = interface_transmission(over, under, face.ior, face.alpha)
+    value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
     value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
     depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, mirror(under))
     through = []

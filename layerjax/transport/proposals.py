@@ -27,7 +27,9 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
     wo = select(u < lobes + facets + near, (x, y, z), (x, y, -z))
     if state.crossing is not None:
         again = jnp.clip((u - lobes) / facets, 0.0, BELOW_ONE)
-        refracted, leaves = interface_sample(up, _ratio(state.crossing, above), state.crossing.alpha, u1, u2, again)
+        face = state.crossing
+        ior = _ratio(face, above)
+        refracted, leaves = interface_sample(up, ior, face.alpha, u1, u2, again, face.distribution)
         wo = select(u < lobes + facets, _nowhere_unless(leaves, refracted), wo)
     wo = select(above, wo, mirror(wo))
     inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
@@ -52,11 +54,12 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
     density = lobes * lobe + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
     if state.crossing is not None:
         up, out = select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
-        ior, alpha = _ratio(state.crossing, above), state.crossing.alpha
+        face = state.crossing
+        facets_of = (_ratio(face, above), face.alpha, face.distribution)
         up, out = _upright(up), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
-        reflected = interface_reflection(up, _upright(out), ior, alpha)
-        passed = interface_transmission(up, mirror(_upright(mirror(out))), ior, alpha)
-        density = density + facets * interface_pdf(jnp.where(same, reflected, passed), out, alpha)
+        reflected = interface_reflection(up, _upright(out), *facets_of)
+        passed = interface_transmission(up, mirror(_upright(mirror(out))), *facets_of)
+        density = density + facets * interface_pdf(jnp.where(same, reflected, passed), up, out, *facets_of)
     return density
 
 

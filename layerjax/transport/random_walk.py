@@ -13,12 +13,11 @@ from jax import Array
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.distributions import ggx_sample
+from layerjax.facets import facet_density, sample
 from layerjax.stack import Interface, Stack, simplify
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import facet_density
 from layerjax.transport._lanes import average, upright
-from layerjax.transport._transport import Side, Transport
+from layerjax.transport._transport import Side, Transport, refuse_vmf
 from layerjax.transport._walk import Microfacets, Orders, Walk
 from layerjax.transport._walk_scene import Scene
 from layerjax.transport._walk_state import Step
@@ -27,7 +26,8 @@ from layerjax.transport._walk_state import Step
 class RandomWalk(Transport):
     """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
 
-    Carries everything that a stack can hold. The same key and the same shapes give the same numbers, bit for bit.
+    Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. The same
+    key and the same shapes give the same numbers, bit for bit.
 
     Args:
         paths: number of paths for each pair of directions (for each direction, if an albedo is asked for), >= 2.
@@ -58,7 +58,8 @@ class RandomWalk(Transport):
                 raise ValueError(f"RandomWalk.{name}: {value!r} is not one of {', '.join(map(repr, allowed))}")
 
     def check(self, stack: Stack) -> None:
-        """Every stack is carried."""
+        if self.microfacets == "multiple":
+            refuse_vmf(stack, 'RandomWalk(microfacets="multiple")')
 
     def prepare(self, stack: Stack) -> Stack:
         return simplify(stack)
@@ -124,7 +125,8 @@ class RandomWalk(Transport):
         wo = select(u < near, cosine, (cosine[0], cosine[1], -cosine[2]))
         facets = _facets(state)
         if facets is not None:
-            wo = select(u < near + far, wo, reflect(local, ggx_sample(local, facets, u1, u2)))
+            m = sample(local, facets.alpha, u1, u2, facets.distribution)
+            wo = select(u < near + far, wo, reflect(local, m))
         return wo[0], wo[1], wo[2] * side
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
@@ -135,7 +137,8 @@ class RandomWalk(Transport):
         facets = _facets(state)
         if facets is not None:
             h, _ = half_vector(local, towards)
-            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, facet_density(h, local, facets), 0.0)
+            mirrored = facet_density(h, local, facets.alpha, facets.distribution)
+            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
         return density
 
 
@@ -145,8 +148,8 @@ def _diffuse_shares(state: Stack) -> tuple[float, float]:
     return (lobes, 0.0) if state.base is not None else (0.5 * lobes, 0.5 * lobes)
 
 
-def _facets(state: Stack) -> Array | None:
-    return next((layer.alpha for layer in state.layers if isinstance(layer, Interface)), None)
+def _facets(state: Stack) -> Interface | None:
+    return next((layer for layer in state.layers if isinstance(layer, Interface)), None)
 
 
 def _lifted(w: Vector) -> Vector:

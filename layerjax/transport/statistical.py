@@ -16,12 +16,13 @@ from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
 from layerjax.distributions import ggx_density, ggx_sample, sggx_area
+from layerjax.facets import facet_density
 from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack, simplify
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import facet_density, interface_reflection
-from layerjax.transport._transport import Side, Transport
+from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.transport._transport import Side, Transport, refuse_vmf
 from layerjax.transport.first_order import mirror
 from layerjax.transport.statistics.diffuse_base import make_diffuse
 from layerjax.transport.statistics.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -67,8 +68,8 @@ class Statistical(Transport):
     """Layered statistics: any number of dielectric interfaces and media over a conductor, a diffuse base, or none.
 
     Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
-    followed), and every base; one that is diffuse, but not Lambertian, counts under layers as a Lambertian of its mean
-    albedo.
+    followed), and every base. One that is diffuse, but not Lambertian, counts under layers as f = A(i) A(o) / (pi rho)
+    with its own directional albedo A, of mean rho: energies by its own, of its shape only what that product has.
 
     Args:
         symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
@@ -102,6 +103,7 @@ class Statistical(Transport):
                 raise ValueError(f"Statistical.{name}: {value!r} is not one of {allowed}")
 
     def check(self, stack: Stack) -> None:
+        refuse_vmf(stack, "Statistical")
         for index, layer in enumerate(stack.layers):
             if isinstance(layer, Medium) and isinstance(layer.phase, SGGX):
                 raise ValueError(

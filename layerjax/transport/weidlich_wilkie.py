@@ -24,7 +24,7 @@ from layerjax.directions import Factor, Vector, combine, half_vector, select
 from layerjax.distributions import ggx_density, sggx_area
 from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport._transport import Side, Transport
+from layerjax.transport._transport import Side, Transport, refuse_vmf
 from layerjax.transport.first_order import Face
 
 LEAST_SHARE = 0.02
@@ -40,6 +40,7 @@ class WeidlichWilkie(Transport):
     """
 
     def check(self, stack: Stack) -> None:
+        refuse_vmf(stack, "WeidlichWilkie")
         for index, layer in enumerate(stack.layers):
             if isinstance(layer, Medium) and not _only_absorbs(layer):
                 raise ValueError(

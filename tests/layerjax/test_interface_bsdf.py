@@ -130,7 +130,7 @@ def test_samples_follow_their_density(ior):
     f = jnp.where(
         above, interface_reflection(wi, upper, ior, alpha), interface_transmission(wi, lower, jnp.asarray(ior), alpha)
     )
-    density = interface_pdf(f, wo, alpha)
+    density = interface_pdf(f, wi, wo, jnp.asarray(ior), alpha)
     weight = jnp.where(leaves & (density > 0), f * jnp.abs(wo[2]) / jnp.where(density > 0, density, 1.0), 0.0)
     expected = integrated_energies(lj.direction(0.9, 0.3), jnp.asarray(ior), alpha)
     for side, value in zip((above, ~above), expected, strict=True):

@@ -48,6 +48,7 @@ def test_every_range_is_enforced_at_both_ends():
     makers = {
         "Interface.ior": lambda v: lj.Interface(v, 0.1),
         "Interface.alpha": lambda v: lj.Interface(1.5, v),
+        "Interface.alpha, vmf": lambda v: lj.Interface(1.5, v, "vmf"),
         "Medium.thickness": lambda v: lj.Medium(v),
         "Medium.albedo": lambda v: lj.Medium(1.0, v),
         "Medium.f0": lambda v: lj.Medium(1.0, f0=v),
@@ -56,9 +57,12 @@ def test_every_range_is_enforced_at_both_ends():
         "Lambertian.albedo": lj.Lambertian,
         "OrenNayar.albedo": lambda v: lj.OrenNayar(v, 0.5),
         "OrenNayar.roughness": lambda v: lj.OrenNayar(0.5, v),
+        "VMFDiffuse.albedo": lambda v: lj.VMFDiffuse(v, 0.5),
+        "VMFDiffuse.roughness": lambda v: lj.VMFDiffuse(0.5, v),
         "Conductor.ior": lambda v: lj.Conductor(v, 1.0, 0.1),
         "Conductor.k": lambda v: lj.Conductor(1.0, v, 0.1),
         "Conductor.alpha": lambda v: lj.Conductor(1.0, 1.0, v),
+        "Conductor.alpha, vmf": lambda v: lj.Conductor(1.0, 1.0, v, "vmf"),
     }
     assert set(makers) == set(lj.RANGES)
     for name, make in makers.items():

@@ -6,17 +6,16 @@ is found facet by facet: those visible from a node are integrated over by quadra
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax import fresnel
+from layerjax import facets, fresnel
 from layerjax._numerics import at_least, safe_div, safe_sqrt
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, dot, normalize, reflect, refract
-from layerjax.distributions import ggx_masking
 from layerjax.quadrature import gauss_legendre
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import interface_reflection
@@ -34,8 +33,22 @@ LEAST_SHARE, MOST_OFF = 1e-6, 50.0
 """Energies below this share of the largest, or deposited that many times wrong, are left as they are deposited."""
 
 
+class Normals(NamedTuple):
+    """Normals of an interface or a base."""
+
+    alpha: Array
+    distribution: facets.Distribution
+
+
 def interface_layer(
-    grid: Grid, above: Region, below: Region, alpha: Array, modes: int, microfacets: Microfacets, *, enters: bool = True
+    grid: Grid,
+    above: Region,
+    below: Region,
+    normals: Normals,
+    modes: int,
+    microfacets: Microfacets,
+    *,
+    enters: bool = True,
 ) -> Layer:
     """Rough dielectric interface between two regions, as Fourier modes (Walter 2007).
 
@@ -44,16 +57,16 @@ def interface_layer(
     from above counts as entering.
     """
     near, far = (above, below) if enters else (below, above)
-    outside, refracted, lost_outside = _shares(grid, near, far, alpha, modes)
-    outer = _face(near, outside, far.ior / near.ior, alpha, modes)
-    inside, (_, passed), lost_inside = _shares(grid, far, near, alpha, modes)
+    outside, refracted, lost_outside = _shares(grid, near, far, normals, modes)
+    outer = _face(near, outside, far.ior / near.ior, normals, modes)
+    inside, (_, passed), lost_inside = _shares(grid, far, near, normals, modes)
     through = _deposit(grid, *refracted, far, near, modes)
     through = _balanced(through, near, far, jnp.sum(refracted[1], axis=-1), jnp.sum(passed, axis=-1))
-    inner = _face(far, inside, near.ior / far.ior, alpha, modes)
+    inner = _face(far, inside, near.ior / far.ior, normals, modes)
     operators = [outer, through, _adjoint(through, near, far), inner]
     if microfacets == "multiple":
         turned = [
-            _turned_back(a, b.ior / a.ior, alpha, level, lost)
+            _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
         operators = _returned(operators, (lost_outside, lost_inside), turned, (near.weight, far.weight))
@@ -75,9 +88,10 @@ def base_layer(grid: Grid, region: Region, base: Surface, modes: int, microfacet
 def _conductor(
     grid: Grid, region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets
 ) -> Array:
-    normals, weight, wi = _visible_normals(grid, region, base.alpha, kernels[0].shape[0])
-    cosine = dot(wi, normals)
-    seen = weight * _masking(reflect(wi, normals), base.alpha)
+    normals = Normals(base.alpha, base.distribution)
+    m, weight, wi = _visible_normals(grid, region, normals, kernels[0].shape[0])
+    cosine = dot(wi, m)
+    seen = weight * _masking(reflect(wi, m), normals)
     ior, k = per_channel(base.ior), per_channel(base.k)
     operators = []
     for c, kernel in enumerate(kernels):
@@ -89,9 +103,9 @@ def _conductor(
     return jnp.stack(operators)
 
 
-def _face(region: Region, energy: Array, ior: Array, alpha: Array, modes: int) -> Array:
+def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:
     """Reflection at an interface, seen from one side."""
-    (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, alpha)], region, region, modes)
+    (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, *normals)], region, region, modes)
     return _scaled(region, kernel, energy)
 
 
@@ -114,30 +128,33 @@ def _adjoint(flux: Array, near: Region, far: Region) -> Array:
 
 
 def _shares(
-    grid: Grid, near: Region, far: Region, alpha: Array, modes: int
+    grid: Grid, near: Region, far: Region, normals: Normals, modes: int
 ) -> tuple[Array, tuple[Vector, Array], Array]:
     """Of light from every near node, by facets: the energy reflected; where to and how much is refracted; the loss."""
     ratio = far.ior / near.ior
-    normals, weight, wi = _visible_normals(grid, near, alpha, modes)
-    level = fresnel.dielectric(dot(wi, normals), ratio)
-    reflected = weight * level * _masking(reflect(wi, normals), alpha)
-    down, exists = refract(wi, normals, ratio)
+    m, weight, wi = _visible_normals(grid, near, normals, modes)
+    level = fresnel.dielectric(dot(wi, m), ratio)
+    reflected = weight * level * _masking(reflect(wi, m), normals)
+    down, exists = refract(wi, m, ratio)
     wo: Vector = (down[0], down[1], -down[2])  # z counted on the far side
-    refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, alpha), 0.0)
+    refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, normals), 0.0)
     lost = at_least(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
     return jnp.sum(reflected, axis=-1), (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
 
 
-def _visible_normals(grid: Grid, region: Region, alpha: Array, modes: int) -> tuple[Vector, Array, Vector]:
-    """Normals visible from every node, (nodes, points), their weights, and the nodes' wi: a spherical cap, stretched.
+def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -> tuple[Vector, Array, Vector]:
+    """Normals visible from every node, (nodes, points), their weights, and the nodes' wi.
 
-    The cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over half a turn (the other half is its
-    mirror image). Denser than what it is put on: light that goes straight through two interfaces meets the points of
-    both, and the nodes and modes between must not tell them apart. Tails are sparse from pole to rim.
+    Of GGX a spherical cap, stretched: the cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over
+    half a turn (the other half is its mirror image). Denser than what it is put on: light that goes straight through
+    two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
+    from pole to rim.
     """
     polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 2), max(LEAST_FACETS, 3 * modes // 4)
-    alpha = jnp.asarray(alpha, region.cosine.dtype)
+    alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
+    if normals.distribution == "vmf":
+        return *facets.seen_normals(wi, alpha, polar_facets, azimuth_facets), wi
     v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
     s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(polar_facets))
     rim = jnp.arctan2(safe_sqrt(v[0] * v[0]), -v[2])  # cosine -v_z
@@ -152,10 +169,10 @@ def _visible_normals(grid: Grid, region: Region, alpha: Array, modes: int) -> tu
     return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi
 
 
-def _masking(wo: Vector, alpha: Array) -> Array:
+def _masking(wo: Vector, normals: Normals) -> Array:
     """Smith masking of the outgoing direction, 0 below the horizon."""
     above = wo[2] > 0
-    return jnp.where(above, ggx_masking((wo[0], wo[1], jnp.where(above, wo[2], 0.5)), alpha), 0.0)
+    return jnp.where(above, facets.masking((wo[0], wo[1], jnp.where(above, wo[2], 0.5)), *normals), 0.0)
 
 
 def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int) -> Array:

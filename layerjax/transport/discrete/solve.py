@@ -16,7 +16,7 @@ from layerjax.phase import SGGX
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.discrete.grid import Grid, make_grid
-from layerjax.transport.discrete.interfaces import Microfacets, base_layer, interface_layer
+from layerjax.transport.discrete.interfaces import Microfacets, Normals, base_layer, interface_layer
 from layerjax.transport.discrete.media import doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.discrete.operators import Layer, add
 
@@ -62,7 +62,8 @@ def solve(stack: Stack, plan: Plan) -> tuple[Grid, Layer]:
             region += 1
             leaves = stack.base is None and 1 < region == len(interfaces)
             below, alpha = grid.regions[region], jnp.asarray(layer.alpha, dtype)
-            found = interface_layer(grid, here, below, alpha, plan.modes, plan.microfacets, enters=not leaves)
+            normals = Normals(alpha, layer.distribution)
+            found = interface_layer(grid, here, below, normals, plan.modes, plan.microfacets, enters=not leaves)
             solved.append((found, False))
         elif plan.azimuths is not None and is_tilted(layer):
             kernel = kernel_ordinates(layer, here, plan.azimuths)

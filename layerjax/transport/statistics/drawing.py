@@ -8,9 +8,9 @@ from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.distributions import ggx_sample
+from layerjax.facets import facet_density
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import facet_density
 from layerjax.transport.first_order import mirror
 from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistics.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
