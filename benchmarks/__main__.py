@@ -1,7 +1,9 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
 ``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
-beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk) and
-``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits)."""
+beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
+``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
+coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other) and ``side-by-side``
+(which transport when: a page of docs from the results of error-vs-time)."""
 
 import argparse
 import importlib
@@ -11,12 +13,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+NAMES = ("throughput", "recovery", "error-vs-time", "references", "statistics", "spongecake", "endf", "rough-diffuse",
+         "side-by-side")  # fmt: skip
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="benchmark", required=True)
-    for name in ("throughput", "recovery", "error-vs-time", "references", "statistics", "spongecake"):
+    for name in NAMES:
         command = commands.add_parser(name)
         command.add_argument("--quick", action="store_true", help="fewer repeats: a look, no result to quote")
         command.add_argument("--out", type=Path, help="directory to write into (default: benchmarks/results)")

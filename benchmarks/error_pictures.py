@@ -14,7 +14,7 @@ from benchmarks.suite import FAMILIES
 from benchmarks.truth import Judged
 from fits.pictures import CYCLE, GREY, INK, STYLE
 
-MARKERS = "osD^vP*"
+MARKERS = "osD^v<>P*"
 HIGHEST = 10.0
 """Larger errors are drawn as this: they only say that the model is of no use there."""
 

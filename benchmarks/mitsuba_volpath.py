@@ -188,7 +188,7 @@ def _interface(interface: Any, above: float) -> dict[str, Any]:
         raise ValueError("Mitsuba's roughdielectric needs two different indices")
     return {
         "type": "roughdielectric",
-        "distribution": "ggx",
+        "distribution": _normals(interface),
         "alpha": float(interface.alpha),
         "int_ior": below,
         "ext_ior": above,
@@ -200,8 +200,14 @@ def _base(base: Any, above: float) -> dict[str, Any]:
         return {"type": "diffuse", "reflectance": _rgb(base.albedo)}
     if isinstance(base, lj.Conductor):
         index = {"eta": _rgb(base.ior / above), "k": _rgb(base.k / above)}
-        return {"type": "roughconductor", "distribution": "ggx", "alpha": float(base.alpha), **index}
+        return {"type": "roughconductor", "distribution": _normals(base), "alpha": float(base.alpha), **index}
     raise ValueError(f"base: Mitsuba has no {type(base).__name__}")
+
+
+def _normals(surface: Any) -> str:
+    if surface.distribution != "ggx":
+        raise ValueError(f"{type(surface).__name__}.distribution: Mitsuba has no {surface.distribution!r} normals")
+    return "ggx"
 
 
 def _volume(value: Any) -> dict[str, Any]:

@@ -34,6 +34,8 @@ MODELS = (
     Model("SpongeCake", {"two lobes": lj.SpongeCake()}),
     Model("statistics, forward", {"2018": lj.Statistical(symmetric=False, microfacets="single")}),
     Model("statistics, symmetric", {"2018": lj.Statistical(microfacets="single")}),
+    Model("ENDF, paper", {"one bounce": lj.ENDF(form="paper")}),
+    Model("ENDF, reciprocal", {"one bounce": lj.ENDF()}),
     Model("Weidlich & Wilkie", {"one half vector": lj.WeidlichWilkie()}),
     Model(
         "adding-doubling",
