@@ -241,10 +241,16 @@ def _lift(grid: Grid, region: Region, modes: int, azimuths: int | None) -> Array
     odd = sine[:, None] * even / region.sine
     if azimuths is None:
         return jnp.stack([even, odd])[np.arange(modes) % 2]
+    # even ones but the mean vanish like its square, so that there is one value at the pole; with Fourier modes, whose
+    # lobes may be narrow, the quotient by the square costs more than it gives
+    turning = sine[:, None] * odd / region.sine
     ordinates, points = np.arange(azimuths), np.arange(AZIMUTH_DENSITY * azimuths) / AZIMUTH_DENSITY
     apart = 2.0 * np.pi * (points[:, None] - ordinates) / azimuths
     orders = np.arange(azimuths // 2 + 1)
     share = np.where((orders == 0) | (2 * orders == azimuths), 1.0, 2.0) / azimuths
     waves = np.cos(apart[..., None] * orders) * share
-    parts = [jnp.asarray(waves[..., parity::2].sum(-1), even.dtype) for parity in (0, 1)]
-    return (jnp.kron(even, parts[0]) + jnp.kron(odd, parts[1]))[None]
+    parts = [
+        jnp.asarray(waves[..., chosen].sum(-1), even.dtype)
+        for chosen in (slice(1), slice(1, None, 2), slice(2, None, 2))
+    ]
+    return sum(map(jnp.kron, (even, odd, turning), parts), jnp.zeros((), even.dtype))[None]
