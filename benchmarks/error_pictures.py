@@ -95,4 +95,4 @@ def _legend(panel: Axes, models: Sequence[Model]) -> None:
         handles.append(Line2D([], [], color=INK, marker="o", markerfacecolor=face, markersize=size, label=label))
         handles[-1].set_linestyle("none")
     handles.append(Line2D([], [], color=GREY, linestyle=":", label="limit of the truth, median"))
-    panel.legend(handles=handles, loc="center left", fontsize=8, labelspacing=0.9)
+    panel.legend(handles=handles, loc="center left", fontsize=7, labelspacing=0.35)
