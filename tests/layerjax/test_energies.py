@@ -156,7 +156,8 @@ def with_slopes(function, arguments):
     return compiled(*arguments)
 
 
-@pytest.mark.parametrize("dtype", ["float32", pytest.param("float64", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_values_and_derivatives_are_finite_over_the_box(dtype):
     cosine, alpha, ior = box(dtype)
     k = jnp.asarray(np.resize([0.0, 1.0, 20.0], cosine.size), dtype)

@@ -125,7 +125,7 @@ COATED = {
         ("paint", "multiple"),
         pytest.param("haze on varnish", "single", marks=pytest.mark.slow),
         ("plate", "multiple"),
-        ("two coats on metal", "single"),
+        pytest.param("two coats on metal", "single", marks=pytest.mark.slow),
         pytest.param("two coats on metal", "multiple", marks=pytest.mark.slow),
     ],
 )

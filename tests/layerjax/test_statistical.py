@@ -116,7 +116,7 @@ def test_what_nothing_meets_is_not_in_the_albedo():
         (DIFFUSE, FORWARD, 1.2),
         pytest.param(SLAB, FORWARD, 0.5, marks=pytest.mark.slow),
         pytest.param(SLAB, FORWARD, 2.4, marks=pytest.mark.slow),
-        (SLAB, SYMMETRIC, 2.4),
+        pytest.param(SLAB, SYMMETRIC, 2.4, marks=pytest.mark.slow),
     ],
 )
 def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, transport, theta):
@@ -200,7 +200,7 @@ BOX = {
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        ("coated metal", jnp.float32),
+        pytest.param("coated metal", jnp.float32, marks=pytest.mark.slow),
         pytest.param("over metal", jnp.float32, marks=pytest.mark.slow),
         pytest.param("over metal", jnp.float64, marks=pytest.mark.slow),
         pytest.param("through", jnp.float32, marks=pytest.mark.slow),

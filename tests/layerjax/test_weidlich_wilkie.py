@@ -128,7 +128,9 @@ def test_smooth_coat_over_a_mirror(theta, ior):
     assert not transmitted.any()
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize(
+    "name", [name if name in ("metal", "two coats") else pytest.param(name, marks=pytest.mark.slow) for name in STACKS]
+)
 def test_samples_weights_and_albedo(name):
     stack = STACKS[name]
     prepared = lj.prepare(stack, WW)
