@@ -36,6 +36,7 @@ from fits.likelihood import (
 )
 from fits.measurements import Measurements
 from fits.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
+from layerjax.stack import with_known
 
 Transport = Any
 """`"auto"`, a layerjax transport, or a function `(stack, wi, wo) -> (N, C)` that stands in for one."""
@@ -191,7 +192,9 @@ class Problem:
         variance, relative, floor = _noise_levels(self.noise, used)
         levels = {"relative": relative, "floor": floor}
         parts = tuple(x if is_free(x) else jnp.asarray(x) for x in (scale, relative, floor))
-        template, names, free = split((self.stack, *parts), _parameter_name)
+        # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
+        known = with_known(self.stack) if isinstance(self.stack, lj.Stack) else self.stack
+        template, names, free = split((known, *parts), _parameter_name)
         if not names:
             raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
         if self.objective != "likelihood":
@@ -236,7 +239,7 @@ class Problem:
 
     def build(self, vector: ArrayLike) -> Parts:
         """Stack, scale and noise levels with the physical vector (P,)."""
-        return self.model.build(jnp.asarray(vector))
+        return jax.tree.map(jnp.asarray, self.model.build(jnp.asarray(vector)))
 
     def predict(self, vector: ArrayLike) -> Array:
         """Scaled BSDF of the used samples, (N, C), in 1/sr."""

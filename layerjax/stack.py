@@ -139,15 +139,9 @@ def simplify(stack: Stack) -> Stack:
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
-            f0: Any = layer.f0
-            if f0 is not None and _is_everywhere(f0, 1.0):
-                f0 = None
-            elif f0 is not None and _is_everywhere(f0, 0.0):
-                f0 = 0.0
-            albedo: Any = layer.albedo
-            for known in (0.0, 1.0):
-                albedo = known if _is_everywhere(albedo, known) else albedo
-            layer = eqx.tree_at(lambda m: (m.albedo, m.f0), layer, (albedo, f0), is_leaf=lambda leaf: leaf is None)
+            layer = _with_known(layer)
+            if is_known(layer.f0, 1.0):
+                layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
     return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
 
@@ -159,6 +153,12 @@ def place_of_vmf(stack: Stack) -> str | None:
         if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
             return f"{name}.distribution"
     return None
+
+
+def with_known(stack: Stack) -> Stack:
+    """The same stack with albedos and f0 that are 0 or 1 for all channels as Python floats: known also under `jit`."""
+    layers = tuple(_with_known(layer) if isinstance(layer, Medium) else layer for layer in stack.layers)
+    return eqx.tree_at(lambda s: s.layers, stack, layers)
 
 
 def media_of(stack: Stack) -> list[Medium]:
@@ -180,6 +180,15 @@ def is_known(value: Any, number: float) -> bool:
     return isinstance(value, float) and value == number
 
 
+def _with_known(medium: Medium) -> Medium:
+    known = [_known(medium.albedo), None if medium.f0 is None else _known(medium.f0)]
+    return eqx.tree_at(lambda m: (m.albedo, m.f0), medium, known, is_leaf=lambda leaf: leaf is None)
+
+
+def _known(value: Any) -> Any:
+    return next((number for number in (0.0, 1.0) if _is_everywhere(value, number)), value)
+
+
 def _are_equal(one: Any, other: Any) -> bool:
     """Whether both are known to be the same number."""
     known = not isinstance(one, jax.core.Tracer) and not isinstance(other, jax.core.Tracer)
@@ -187,6 +196,6 @@ def _are_equal(one: Any, other: Any) -> bool:
 
 
 def _is_everywhere(value: Any, known: float) -> bool:
-    if isinstance(value, jax.core.Tracer | float):
+    if isinstance(value, jax.core.Tracer | float) or is_placeholder(value):
         return False
     return bool(np.all(np.asarray(value) == known))

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -304,3 +305,18 @@ def test_jaxopt_and_the_sampler_wait_until_it_is_needed() -> None:
     code = "import sys, fits.optimise; print([m for m in ('jaxopt', 'arviz', 'emcee', 'h5py') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("transport", [lj.ENDF(), lj.WeidlichWilkie()])
+def test_what_is_known_of_the_stack_stays_known_in_a_fit(transport):
+    """A dye that scatters nothing: these transports refuse a medium whose albedo might be anything."""
+
+    def coat(depth):
+        return lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(depth, 0.0)], lj.Conductor(0.2, 3.9, 0.3))
+
+    geometry = slices(incidence=(30,), outgoing=(-20, 20))
+    data = simulate(coat(0.3), geometry, transport=transport, noise=0.01)
+    problem = Problem(coat(Free(0.3, 0.0, 1.0)), data, transport)
+    exact = simulate(coat(0.3), geometry, transport=transport).values
+    np.testing.assert_allclose(problem.predict([0.3]), exact, rtol=1e-9)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(problem.build([0.3]).stack))
