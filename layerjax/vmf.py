@@ -43,8 +43,8 @@ def hemisphere_norm(kappa: Array) -> Array:
     series = jnp.ones_like(inner)
     for n in range(14, 2, -1):
         series = 1.0 - series * inner * (1.0 / n)
-    # 2 (kappa - 1 + exp(-kappa)) / kappa^2
-    share = jnp.where(small, series, 2.0 * (outer + jnp.expm1(-outer)) / (outer * outer))
+    # 2 (kappa - 1 + exp(-kappa)) / kappa^2, without the square: its own square overflows in derivatives
+    share = jnp.where(small, series, 2.0 * (1.0 + jnp.expm1(-outer) / outer) / outer)
     return 0.25 * share / exprel(2.0 * kappa)
 
 
