@@ -138,3 +138,9 @@ def test_gradients_are_finite_and_right(dtype):
         up, down = (evaluated(cosine, kappa * (1 + sign * step)) for sign in (1, -1))
         difference = ((up - down) / (2 * step * kappa[:, None]) - slopes[1]) * kappa[:, None] / value
         np.testing.assert_array_less(np.abs(difference[:, smooth]), 2e-6)
+
+
+def test_the_norm_has_finite_derivatives_at_any_concentration():
+    kappa = jnp.logspace(-4, 12, 33, dtype=jnp.float32)
+    for derivative in (jax.grad, jax.jacfwd):
+        assert jnp.all(jnp.isfinite(jax.vmap(derivative(vmf.hemisphere_norm))(kappa)))
