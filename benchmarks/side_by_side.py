@@ -218,7 +218,7 @@ def examples(models: Sequence[Model], rows: Sequence[Row]) -> str:
 
 
 def _over_all(rows: Sequence[Row], model: Model) -> str:
-    """Median error at the finest step, over all stacks that the model carries and that it may be judged by."""
+    """Median error at the finest step, over all stacks that the model carries."""
     finest = {row.stack: row for row in rows if row.model == model.name and row.l2 is not None}
     errors = [row.l2 for row in finest.values() if row.l2 is not None]
     return f" (median error of {len(errors)} stacks {figure(100 * float(np.median(errors)), digits=2)} %)"

@@ -3,7 +3,7 @@
     python examples/sand.py --out DIR
 
 Slices of a porous surface of flakes with the colours of sand (albedo 0.518, 0.331, 0.184, roughness 0.5; d'Eon &
-Weidlich 2024, Fig. 1) are simulated by the exact solution of light between the flakes, with 3 % noise, and fitted by
+Weidlich 2024, Fig. 1) are simulated by the table of light between the flakes, with 3 % noise, and fitted by
 `VMFDiffuse` in both forms, `OrenNayar` in both and `Lambertian`. Prints each fit beside the truth and which surface
 the data prefer, and writes a report.
 """

@@ -28,8 +28,8 @@ class Interface(eqx.Module):
     ============ ====== ========== ======= ==========================================================================
     ior          eta    [0.25, 4]          index of what lies below, relative to what surrounds the stack
     alpha        alpha  [1e-4, 1]          width of the normals; for ``"vmf"`` [1e-4, 15], with kappa = 2 / alpha^2
-    distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (which `AddingDoubling` and
-                        "vmf"              `RandomWalk` carry, with ``microfacets="single"``)
+    distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (carried by `ENDF`, and, with
+                        "vmf"              ``microfacets="single"``, `AddingDoubling`, `RandomWalk`)
     ============ ====== ========== ======= ==========================================================================
     """
 

@@ -73,7 +73,7 @@ def resultant_slope(kappa: Array) -> Array:
     small = kappa < 0.5 * SERIES
     x = jnp.where(small, kappa * kappa, 0.25)
     terms = (
-        -3.3321912e-7,
+        -3617.0 / 10854718875.0,
         4.0 / 1403325.0,
         -1382.0 / 58046625.0,
         2.0 / 10395.0,
