@@ -89,9 +89,10 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     return Grid(edges, squared.ravel(), tuple(regions), nodes)
 
 
-def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> Array:
-    """Interpolation weights of directions on the nodes, shape ``cosine.shape + (grid.size,)``: they sum to 1.
+def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, Array]:
+    """Interpolation weights of directions on the nodes of their panel, and 1 for that panel and 0 for the others.
 
+    Shapes ``cosine.shape + (grid.nodes,)`` and ``cosine.shape + (panels,)``: the products of the two sum to 1.
     Polynomials of the panel's coordinate. Summed against a distribution of directions they *deposit* it on the nodes,
     with its total and its moments kept.
 
@@ -102,13 +103,10 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> Array:
     """
     low, high = _bounds(grid)
     panel = _panel(grid, ior * ior * sine2)
-    parts = []
-    for k in range(grid.edges.shape[0]):
-        inside = (panel == k) & (high[k] > low[k])
-        x2, _ = _coordinate(ior, cosine, sine2, low[k], high[k])
-        x = safe_sqrt(jnp.where(inside, x2, 0.25))
-        parts.append(jnp.where(inside[..., None], lagrange(x, grid.nodes), 0.0))
-    return jnp.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
+    chosen = (panel[..., None] == np.arange(low.shape[0])) & (high > low)
+    x2, _ = _coordinate(ior, cosine, sine2, low[panel], high[panel])
+    x = safe_sqrt(jnp.where(jnp.any(chosen, axis=-1), x2, 0.25))
+    return lagrange(x, grid.nodes), chosen.astype(x.dtype)
 
 
 def _bounds(grid: Grid) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ is found facet by facet: those visible from a node are integrated over by quadra
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -178,16 +179,26 @@ def _masking(wo: Vector, normals: Normals) -> Array:
 def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int) -> Array:
     """Flux operator (modes, out, in) of light that goes from node j to the directions wo_jq, a share of it each.
 
-    Odd modes vanish at the pole like the sine: there the quotient by the sine is what polynomials interpolate.
+    Odd modes vanish at the pole like the sine: there the quotient by the sine is what polynomials interpolate. One
+    panel of nodes after the other: their facets times the nodes of a panel are the largest arrays of a solution.
     """
-    planar = safe_sqrt(wo[0] * wo[0] + wo[1] * wo[1])
-    turn = jnp.arctan2(wo[1], jnp.where(planar > 0, wo[0], 1.0))
-    stencil = spread(grid, far.ior, jnp.abs(wo[2]), planar * planar)
-    share = jnp.where(near.weight[:, None] > 0, share, 0.0)
-    angle = turn[..., None] * np.arange(modes)
     odd = np.arange(modes) % 2 == 1
-    spun = jnp.cos(angle) * jnp.where(odd, (share * planar)[..., None], share[..., None])
-    flux = jnp.einsum("jqi,jqm->mij", stencil, spun)
+    share = jnp.where(near.weight[:, None] > 0, share, 0.0)
+
+    def deposit(rays: tuple[Vector, Array]) -> Array:
+        wo, share = rays
+        planar = safe_sqrt(wo[0] * wo[0] + wo[1] * wo[1])
+        turn = jnp.arctan2(wo[1], jnp.where(planar > 0, wo[0], 1.0))
+        weights, panel = spread(grid, far.ior, jnp.abs(wo[2]), planar * planar)
+        angle = turn[..., None] * np.arange(modes)
+        spun = jnp.cos(angle) * jnp.where(odd, (share * planar)[..., None], share[..., None])
+        spun = panel[..., None] * spun[..., None, :] if panel.shape[-1] > 1 else spun[..., None, :]
+        return jnp.einsum("jqi,jqpm->jmpi", weights, spun)
+
+    panels = grid.edges.shape[0]
+    rays = jax.tree.map(lambda x: jnp.reshape(x, (panels, grid.nodes, -1)), (wo, share))
+    flux = jax.lax.map(deposit, rays) if panels > 1 else deposit(jax.tree.map(lambda x: x[0], rays))
+    flux = jnp.moveaxis(flux.reshape(grid.size, modes, grid.size), 0, -1)
     flux = flux / jnp.where(odd[:, None], far.sine, 1.0)[:, :, None]
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
