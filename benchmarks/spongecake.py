@@ -28,7 +28,7 @@ from layerjax.precomputed.spongecake import PLANS, SEED
 from layerjax.precomputed.spongecake_training import ENERGY, Parts
 
 KINDS: tuple[Kind, ...] = ("surface", "fiber")
-CAKE, FIRST = lj.SpongeCake(), lj.SingleScattering()
+CAKE, BALANCED, FIRST = lj.SpongeCake(), lj.SpongeCake(energy="balanced"), lj.SingleScattering()
 COUNTS, QUICK_COUNTS = PLANS[False].test, (64, 64)
 
 GAINS, QUICK_GAINS = (1024, 150), (64, 5)
@@ -139,7 +139,7 @@ def groups(samples: materials.Samples, media: int) -> dict[str, NDArray[np.bool_
 
 def held_out(samples: materials.Samples, media: int) -> list[Errors]:
     """Errors of all kinds of materials."""
-    cake, first = (_values(samples, how) for how in (CAKE, FIRST))
+    cake, balanced, first = (_values(samples, how) for how in (CAKE, BALANCED, FIRST))
     truth = first + samples.values
     weight = np.abs(samples.wi[..., 2])[:, (0, 1, 0), :, None]
 
@@ -172,6 +172,7 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
                 both(relative(cake, (0,), samples.values)),
                 both(through[1]),
                 both(relative(first, lit)),
+                both(relative(balanced, lit)),
             )
         )
     return rows
@@ -180,19 +181,19 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
 def furnace(samples: materials.Samples, media: int) -> list[Furnace]:
     """Energy of the same materials without absorption."""
     wi = jnp.asarray(lj.direction(jnp.deg2rad(jnp.asarray(ANGLES)), 0.4), jnp.float32)
-    found = np.zeros((len(samples.values), len(ANGLES)))
+    found = np.zeros((2, len(samples.values), len(ANGLES)))
     for rows, make, numbers in _structures(samples):
 
         def total(numbers: dict, make: Callable = make) -> jax.Array:
             white = {**numbers, "albedo": jnp.ones_like(numbers["albedo"]), "f0": jnp.ones_like(numbers["f0"])}
             stack = make(white)
-            near, far = lj.albedo(stack, wi, CAKE, nodes=NODES)
-            return (near + far + lj.unscattered(stack, wi))[:, 0]
+            scattered = [sum(lj.albedo(stack, wi, how, nodes=NODES)) for how in (CAKE, BALANCED)]
+            return (jnp.stack(scattered) + lj.unscattered(stack, wi))[..., 0]
 
-        found[rows] = jax.lax.map(jax.jit(total), numbers)
+        found[:, rows] = jnp.swapaxes(jax.lax.map(jax.jit(total), numbers), 0, 1)
     apart = 100 * np.abs(found - 1.0)
     return [
-        Furnace(name, media, int(rows.sum()), _middle_and_high(apart[rows]))
+        Furnace(name, media, int(rows.sum()), *(_middle_and_high(each[rows]) for each in apart))
         for name, rows in groups(samples, media).items()
     ]
 

@@ -16,13 +16,14 @@ TEXT = """\
 Relative L2 error of the BSDF over 12 directions of light a side and 24 of view a hemisphere each (weighted with both
 cosines), beside `AddingDoubling` at ordinates (10, 24), for {one} slabs of one medium and {two} of two, drawn as those
 that were learned from but never seen: median and 95th percentile, in percent. *Single* is the error of
-`SingleScattering` alone.
+`SingleScattering` alone, *balanced* that of `SpongeCake(energy="balanced")`.
 
 {errors}
 ## White furnace
 
 The same materials with albedo 1 and no Fresnel term, light at {angles} degrees:
-|R + T + unscattered - 1| in percent, over materials and angles.
+|R + T + unscattered - 1| in percent, over materials and angles, median and 95th percentile: by the network as it has
+learned (the default), and with `energy="balanced"`.
 
 {furnace}
 ## What each step is worth
@@ -65,6 +66,7 @@ class Errors:
     reflected_multiple: tuple[float, float]
     transmitted_multiple: tuple[float, float]
     single: tuple[float, float]
+    balanced: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,8 @@ class Furnace:
     kind: str
     media: int
     count: int
-    error: tuple[float, float]
+    learned: tuple[float, float]
+    balanced: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -131,8 +134,8 @@ def markdown(
     def two(values: Sequence[float]) -> str:
         return f"{figure(values[0], 2)} / {figure(values[1], 2)}"
 
-    names = ("full", "multiple", "reflected", "transmitted", "reflected_multiple", "transmitted_multiple", "single")
-    heads = ("full", "multiple", "R, full", "T, full", "R, multiple", "T, multiple", "single, full")
+    names = ("full", "multiple", "reflected", "transmitted", "reflected_multiple", "transmitted_multiple")
+    heads = ("full", "multiple", "R, full", "T, full", "R, multiple", "T, multiple", "single, full", "balanced, full")
     return TEXT.format(
         environment=environment_lines(surroundings),
         one=counts[0],
@@ -144,13 +147,18 @@ def markdown(
         errors=table(
             ("materials", "media", "count", *heads),
             [
-                (row.kind, str(row.media), str(row.count), *(two(getattr(row, name)) for name in names))
+                (
+                    row.kind,
+                    str(row.media),
+                    str(row.count),
+                    *(two(getattr(row, name)) for name in (*names, "single", "balanced")),
+                )
                 for row in errors
             ],
         ),
         furnace=table(
-            ("materials", "media", "count", "median / 95th percentile"),
-            [(row.kind, str(row.media), str(row.count), two(row.error)) for row in furnaces],
+            ("materials", "media", "count", "learned", "balanced"),
+            [(row.kind, str(row.media), str(row.count), two(row.learned), two(row.balanced)) for row in furnaces],
         ),
         gains=table(
             ("second lobe", "full", "multiple", "energy"),

@@ -63,6 +63,7 @@ LAYERS = [
     "layerjax.transport.spongecake_mapping",
     "layerjax.transport.spongecake_layers",
     "layerjax.transport.spongecake_lobes",
+    "layerjax.transport.spongecake_energy",
     "layerjax.transport.spongecake",
     "layerjax.transport.endf_warping",
     "layerjax.transport.endf_chains",

@@ -32,6 +32,9 @@ from layerjax.transport.spongecake_mapping import Numbers, Weights, shape_of, we
 
 ABOVE, BELOW, THROUGH = range(3)
 
+BEND_DEGREE = 3
+"""Of log c in the cosine."""
+
 
 class BlurredSGGX(SGGX):
     """Flakes with a blurred density, see the top of the file."""
@@ -54,14 +57,26 @@ class BlurredSGGX(SGGX):
         return self.sharp(wi, wo) / self.cross_section(wi)
 
 
+class Bend(eqx.Module):
+    """log c, a sum of `bend_terms`: its coefficients for light from above and below, (C or 1, 2 or 1, terms).
+
+    One medium looks the same from opposite directions, and has one set. share: what counts of it, (C or 1,).
+    """
+
+    coefficients: Array
+    share: Array
+
+
 class SecondLobe(eqx.Module):
     """What several collisions leave. slab: media with other parameters and no albedo of their own.
 
-    weights: for each channel, see `layerjax.transport.spongecake_mapping.Weights`, stacked (C, ...).
+    weights: for each channel, see `layerjax.transport.spongecake_mapping.Weights`, stacked (C, ...). bend: a factor c
+    of either direction, see `layerjax.transport.spongecake_energy`; None for 1.
     """
 
     slab: Media
     weights: Weights
+    bend: Bend | None = None
 
 
 def second_lobe(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> SecondLobe:
@@ -93,7 +108,44 @@ def second_lobe(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -
 def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
     """BSDF of what several collisions leave. opaque: there is a base, and light from above alone is answered."""
     terms = [_level(second, wi, wo, side, opaque), *_lobes(second, wi, wo, side, opaque).values()]
-    return tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
+    values = tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
+    if second.bend is None:
+        return values
+    factors = _factors(second.bend, wi, wo, opaque or side == "reflection")
+    return tuple(value * pick(factors, c) for c, value in enumerate(values))
+
+
+def bend_terms(w: Vector, turning: bool, opposite: bool) -> list[Array]:
+    """What log c is a sum of: powers of the cosine, and with `turning` azimuthal terms times some.
+
+    `opposite`: the same for opposite directions.
+    """
+    x, y, z = w[0], w[1], jnp.abs(w[2])
+    parts = [(jnp.ones_like(z), BEND_DEGREE)]
+    if turning:
+        if opposite:
+            above = w[2] > 0
+            x, y = jnp.where(above, x, -x), jnp.where(above, y, -y)
+        twice = BEND_DEGREE - 2
+        parts += [(x, BEND_DEGREE - 1), (y, BEND_DEGREE - 1), (x * x - y * y, twice), (x * y, twice)]
+    return [part * z**k if k else part for part, degree in parts for k in range(degree + 1)]
+
+
+def _factors(bend: Bend, wi: Vector, wo: Vector, from_above: bool) -> Channels:
+    """c of both directions."""
+    logs = [_bent(each, wi, from_above) + _bent(each, wo, from_above) for each in bend.coefficients]
+    channels = max(len(logs), bend.share.shape[0])
+    return tuple(jnp.exp(pick(per_channel(bend.share), c) * pick(logs, c)) for c in range(channels))
+
+
+def _bent(coefficients: Array, w: Vector, from_above: bool) -> Array:
+    """log c of a direction, from its coefficients (2 or 1, terms)."""
+    opposite = coefficients.shape[0] == 1
+    terms = bend_terms(w, coefficients.shape[-1] > BEND_DEGREE + 1, opposite and not from_above)
+    if opposite or from_above:
+        return sum(term * value for term, value in zip(terms, coefficients[0], strict=True))
+    above = w[2] > 0
+    return sum(term * jnp.where(above, high, low) for term, high, low in zip(terms, *coefficients, strict=True))
 
 
 def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> dict[int, Channels]:
@@ -143,35 +195,51 @@ def _rising(slopes: Array, rises: list[Array], wi: Vector, wo: Vector, side: Sid
 
 
 def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
-    """Energy of `evaluate_second` on wi's side and on the other, by quadrature with `nodes` points a dimension.
+    """Energy of `evaluate_second` on wi's side and on the other, by quadrature with `nodes` points a dimension."""
+    spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
+    near, far = [], []
+    for wo, values in flux(second, wi, nodes, opaque):
+        if second.bend is not None:
+            factors = _factors(second.bend, spread, wo, opaque)
+            values = tuple(value * pick(factors, c) for c, value in enumerate(values))
+        same = spread[2] * wo[2] > 0
+        near.append(tuple(jnp.sum(jnp.where(same, value, 0.0), -1) for value in values))
+        far.append(tuple(jnp.sum(jnp.where(same, 0.0, value), -1) for value in values))
+    sums = [
+        tuple(sum((part[c] for part in parts[1:]), parts[0][c]) for c in range(len(near[0]))) for parts in (near, far)
+    ]
+    return sums[0], sums[1]
+
+
+def flux(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> list[tuple[Vector, Channels]]:
+    """What leaves on wi's side and on the other (not if `opaque`), with c = 1: nodes wo, and the energy at each.
 
     Where the unblurred kernel of flakes peaks, nodes follow it; the rest is taken over the hemispheres evenly.
     """
     side = jnp.where(wi[2] < 0, -1.0, 1.0)[..., None]
     spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
-    x, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
-    phi = jnp.asarray((np.arange(2 * nodes) + 0.5) * np.pi / nodes, wi[2].dtype)
-    cosine, turn = (array.ravel() for array in jnp.meshgrid(x, phi, indexing="ij"))
+    signs = [1.0] if opaque else [1.0, -1.0]
+    nodes_z, weights_z = gauss_legendre(nodes)
+    phi = (np.arange(2 * nodes) + 0.5) * np.pi / nodes
+    turn, cosine, sign = (jnp.asarray(a.ravel(), wi[2].dtype) for a in np.meshgrid(phi, nodes_z, signs, indexing="ij"))
+    weight = jnp.asarray(np.tile(np.repeat(weights_z * nodes_z * np.pi / nodes, len(signs)), 2 * nodes), wi[2].dtype)
     sine = safe_sqrt(1.0 - cosine * cosine)
-    weight = jnp.repeat(w, 2 * nodes) * (np.pi / nodes)
-    sums = []
-    for sign in (1.0,) if opaque else (1.0, -1.0):
-        wo: Vector = (sine * jnp.cos(turn), sine * jnp.sin(turn), sign * side * cosine)
-        terms = [_level(second, spread, wo, "all", opaque)]
-        parts = []
-        for k, lobe in _lobes(second, spread, wo, "all", opaque).items():
-            phase = second.slab.media[k].phase
-            near, far = phase.rule(wi, nodes)
-            peaked, solid_angle = near if sign > 0 else far
-            share = jnp.ones_like(solid_angle)  # a Henyey-Greenstein lobe is followed whole
-            if not isinstance(phase, HenyeyGreenstein):
-                share, rest = _peaked(phase, spread, peaked), 1.0 - _peaked(phase, spread, wo)
-                terms.append(tuple(rest * value for value in lobe))
-            there = _lobes(second, spread, peaked, "all", opaque)[k]
-            parts.append(tuple(jnp.sum(v * share * jnp.abs(peaked[2]) * solid_angle, -1) for v in there))
-        parts += [tuple(jnp.sum(v * cosine * weight, -1) for v in term) for term in terms]
-        sums.append(tuple(sum((part[c] for part in parts[1:]), parts[0][c]) for c in range(_channels(second))))
-    return sums[0], sums[1] if len(sums) > 1 else (jnp.zeros_like(wi[2]),)
+    wo: Vector = (sine * jnp.cos(turn), sine * jnp.sin(turn), sign * side * cosine)
+    terms, parts = [_level(second, spread, wo, "all", opaque)], []
+    for k, lobe in _lobes(second, spread, wo, "all", opaque).items():
+        phase = second.slab.media[k].phase
+        rule = phase.rule(wi, nodes)[: len(signs)]
+        x, y, z = (jnp.concatenate(axis, axis=-1) for axis in zip(*(w for w, _ in rule), strict=True))
+        peaked: Vector = (x, y, z)
+        solid_angle = jnp.concatenate([solid_angle for _, solid_angle in rule], axis=-1)
+        share = jnp.ones_like(solid_angle)  # a Henyey-Greenstein lobe is followed whole
+        if not isinstance(phase, HenyeyGreenstein):
+            share, rest = _peaked(phase, spread, peaked), 1.0 - _peaked(phase, spread, wo)
+            terms.append(tuple(rest * value for value in lobe))
+        there = _lobes(second, spread, peaked, "all", opaque)[k]
+        parts.append((peaked, tuple(v * share * jnp.abs(peaked[2]) * solid_angle for v in there)))
+    even = [sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(_channels(second))]
+    return [*parts, (wo, tuple(value * weight for value in even))]
 
 
 def _peaked(phase: SGGX, wi: Vector, wo: Vector) -> Array:

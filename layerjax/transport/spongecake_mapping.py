@@ -140,8 +140,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
         rims.append(LEAST_SLOPE * (1.0 - strength[:, 2 * count + 2] / LN2))
     above, below = 0, len(lobes) - 1
     through = (sum(lobe[1] for lobe in lobes) / len(lobes), sum(level[1] for level in levels) / len(levels))
-    kept = _kept(media.albedo, media.f0)
-    share = jnp.sum(kept * media.thickness / (1.0 + media.thickness)) ** 2
+    share = jnp.sum(kept(media.albedo, media.f0) * media.thickness / (1.0 + media.thickness)) ** 2
     return Weights(
         share * jnp.stack([lobes[above][0], lobes[below][0], through[0]]),
         LEVEL * share * jnp.stack([levels[above][0], levels[below][0], through[1]]),
@@ -175,8 +174,8 @@ def _features(medium: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     return jnp.concatenate([medium.kind, jnp.stack(numbers)])
 
 
-def _kept(albedo: Array, f0: Array) -> Array:
-    """About the share of light that survives a collision."""
+def kept(albedo: Array, f0: Array) -> Array:
+    """About the share of light that survives a collision, between 0 and 1."""
     return albedo * (0.1 + 0.9 * f0)
 
 

@@ -24,7 +24,7 @@ def drawn(media, shards=3, seed=1):
     return data.Samples(layers, *(array.astype(np.float32) for array in (wi, wo, values)))
 
 
-@pytest.mark.parametrize("media", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize("media", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_lobes_that_are_trained_are_those_of_the_transport(media):
     samples, net = drawn(media), network(media, jax.random.key(4))
     net = jax.tree.map(lambda leaf: 3.0 * leaf if eqx.is_inexact_array(leaf) else leaf, net)

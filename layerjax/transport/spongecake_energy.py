@@ -1,0 +1,134 @@
+"""Energy of SpongeCake's second lobe, put right (beyond Wang et al. 2022).
+
+How much light several collisions leave is known of media that absorb nothing: 1 less what passes untouched and what one
+collision scatters. The same media without absorption therefore tell by how much the second lobe is off. It is
+multiplied by c(wi) c(wo), which keeps it reciprocal, with log c a polynomial of the direction on either side,
+
+    log c = sum a_k z^k + terms in cos and sin of the azimuth and of twice the azimuth, in proportion to sin and sin^2,
+
+found by scaling again and again (Sinkhorn) at a few directions, each against all directions of the other end.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import at_least
+from layerjax.directions import Vector
+from layerjax.phase import SGGX
+from layerjax.quadrature import gauss_legendre
+from layerjax.stack import Medium, optical_depths
+from layerjax.transport.single_scattering import Media, SingleScattering
+from layerjax.transport.spongecake_lobes import Bend, bend_terms, flux, second_lobe
+from layerjax.transport.spongecake_mapping import LEAST_ALPHA, kept
+
+NODES = 8
+"""Of the quadrature over the other end."""
+
+COSINES, AZIMUTHS = 4, 6
+"""Directions at which energies are balanced, on each side; one azimuth where nothing depends on it."""
+
+BATCH = 8
+"""Directions at a time: what they scatter is found again on the way back, so that no more of it is held."""
+
+ROUNDS = 5
+"""Each halves the logarithm of what is off, as far as the polynomial can follow."""
+
+FADING = 4
+"""Power of what survives a collision (in each medium) by which log c fades: what absorbs has errors of its own."""
+
+LEAST = 1e-3
+"""Energies much smaller are not put right."""
+
+STIFFNESS = 1e-4
+"""What keeps a coefficient at 0 that the directions do not tell, beside the mean of those they do."""
+
+
+@eqx.filter_jit
+def bend_of(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> Bend:
+    """log c of one medium or two."""
+    thickness = jnp.broadcast_arrays(*(jnp.atleast_1d(jnp.asarray(medium.thickness)) for medium in media))
+
+    def one_channel(thickness: list[Array]) -> Array:
+        return _balanced(tuple(_white(m, tau) for m, tau in zip(media, thickness, strict=True)), networks)
+
+    found = jax.vmap(one_channel)(thickness)
+    return Bend(found, _share(media).astype(found.dtype))
+
+
+def _share(media: tuple[Medium, ...]) -> Array:
+    """Share of log c that counts where light is absorbed, (C or 1,)."""
+    share = jnp.ones(1)
+    for medium in media:
+        f0 = 1.0 if medium.f0 is None else medium.f0
+        share = share * kept(jnp.asarray(medium.albedo), jnp.asarray(f0)) ** FADING
+    return share
+
+
+def _balanced(white: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> Array:
+    """Coefficients of log c, (2 or 1, terms), of media without absorption."""
+    first, second = Media(white, None), second_lobe(white, networks)
+    turning = any(isinstance(medium.phase, SGGX) and medium.phase.axis is not None for medium in white)
+    opposite = len(white) == 1
+    dtype = second.weights.levels.dtype
+    wi, weight = _directions(turning, opposite, dtype)
+
+    @jax.checkpoint
+    def one(wi: Vector) -> tuple[Array, list[tuple[Array, Array]]]:
+        near, far = SingleScattering().albedo(first, wi, NODES)
+        depths = [depth for (depth,) in optical_depths(white, wi)]
+        wanted = 1.0 - near[0] - far[0] - jnp.exp(-sum(depths[1:], depths[0]))
+        there = [(_terms(wo, turning, opposite), value) for wo, (value,) in flux(second, wi, NODES, opaque=False)]
+        # nodes that follow a lobe come in double precision where there is any
+        return jax.tree.map(lambda x: x.astype(dtype), (at_least(wanted, 0.0), there))
+
+    wanted, there = jax.lax.map(one, wi, batch_size=BATCH)
+    here = _terms(wi, turning, opposite)
+    sure = (weight * wanted)[:, None] * here
+    normal = sure.T @ here
+    stiffness = STIFFNESS * (jnp.trace(normal) / normal.shape[0] + LEAST)
+    solution = jnp.linalg.inv(normal + stiffness * jnp.eye(normal.shape[0], dtype=dtype)) @ sure.T
+
+    def again(coefficients: Array, _: None) -> tuple[Array, None]:
+        found = sum(jnp.sum(value * jnp.exp(terms @ coefficients), axis=-1) for terms, value in there)
+        found = found * jnp.exp(here @ coefficients)
+        apart = jnp.tanh(jnp.log((wanted + LEAST) / (found + LEAST)))
+        return coefficients + 0.5 * solution @ apart, None
+
+    coefficients, _ = jax.lax.scan(again, jnp.zeros(here.shape[-1], dtype), length=ROUNDS)
+    return coefficients.reshape(1 if opposite else 2, -1)
+
+
+def _white(medium: Medium, thickness: Array) -> Medium:
+    """The same without absorption, and with lobes no narrower than any that the networks know."""
+    phase = medium.phase
+    if isinstance(phase, SGGX):
+        phase = SGGX(phase.kind, at_least(jnp.asarray(phase.alpha), LEAST_ALPHA), phase.axis)
+    white = Medium(thickness, 1.0, phase)
+    return eqx.tree_at(lambda m: m.albedo, white, 1.0)  # known: nothing to multiply by
+
+
+def _directions(turning: bool, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
+    """Where energies are balanced, above and (unless the same there) below, with weights of their cosine."""
+    x, w = gauss_legendre(COSINES)
+    count = AZIMUTHS if turning else 1
+    sides = [1.0] if opposite else [1.0, -1.0]
+    turns = (np.arange(count) + 0.5) * (2.0 * np.pi / count)
+    side, z, phi = (array.ravel() for array in np.meshgrid(sides, x, turns, indexing="ij"))
+    sine = np.sqrt(1.0 - z * z)
+    wi = [jnp.asarray(part, dtype) for part in (sine * np.cos(phi), sine * np.sin(phi), side * z)]
+    return (wi[0], wi[1], wi[2]), jnp.asarray(np.tile(np.repeat(w * x, count), len(sides)), dtype)
+
+
+def _terms(w: Vector, turning: bool, opposite: bool) -> Array:
+    """The terms, (..., terms); where sides differ, above and below, 0 on the side where w is not."""
+    terms = jnp.stack(bend_terms(w, turning, opposite), axis=-1)
+    if opposite:
+        return terms
+    above = (w[2] > 0)[..., None]
+    return jnp.concatenate([jnp.where(above, terms, 0.0), jnp.where(above, 0.0, terms)], axis=-1)
