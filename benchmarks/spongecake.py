@@ -60,7 +60,7 @@ def study(
     for media, count in enumerate(counts, start=1):
         for there in materials.make(work, count, media, "test", SEED):
             report(f"media {media}: truth of {there} of {count}")
-        samples = materials.load(work, count, media, "test")
+        samples = materials.load(work, count, media, "test", SEED)
         errors += held_out(samples, media)
         report(f"media {media}: errors")
         furnaces += furnace(samples, media)
@@ -93,7 +93,7 @@ def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) ->
     """What each step beyond the paper is worth: the same short training with more and more of them, one medium."""
     for _ in materials.make(work, count, 1, "train", SEED):
         pass
-    learned, test = materials.load(work, count, 1, "train"), materials.load(work, count // 2, 1, "test")
+    learned, test = materials.load(work, count, 1, "train", SEED), materials.load(work, count // 2, 1, "test", SEED)
     lossless = np.minimum(test.layers.albedo, test.layers.f0).min(axis=1) == 1.0
     none = Parts(False, False, False, False)
     steps = {

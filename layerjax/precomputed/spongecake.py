@@ -56,10 +56,10 @@ def make(
             for there in make_samples(work, count, media, split, SEED):
                 report(f"media {media}: {split} {there}/{count}")
         schedule = plan.schedule
-        state = work / f"state-{media}-{counts[0]}-{schedule.epochs}-{schedule.batch}.eqx"
+        state = work / f"state-{media}-{SEED}-{counts[0]}-{schedule.epochs}-{schedule.batch}.eqx"
         with jax.enable_x64(False):
-            net, curve = train(media, load(work, counts[0], media, "train"), SEED, schedule, state, report)
-            full, multiple = relative_errors(batch_of(load(work, counts[1], media, "test")), net)
+            net, curve = train(media, load(work, counts[0], media, "train", SEED), SEED, schedule, state, report)
+            full, multiple = relative_errors(batch_of(load(work, counts[1], media, "test", SEED)), net)
         table |= pack(net, media)
         table[f"{media}-materials"] = np.asarray(counts)
         table[f"{media}-schedule"] = np.asarray([schedule.epochs, schedule.batch, schedule.rate])

@@ -104,11 +104,11 @@ def stack_of(kinds: tuple[str, ...], tilted: bool, numbers: dict[str, Array]) ->
 def make(folder: Path, count: int, media: int, split: Split, seed: int) -> Iterator[int]:
     """Make the shards of `count` materials that the folder lacks; yields the number of materials that are there.
 
-    A folder is for one seed: shards that are there are taken as they are.
+    Shards of this seed that are there are taken as they are.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for number in range(-(-count // SHARD)):
-        path = _path(folder, media, split, number)
+        path = _path(folder, media, split, seed, number)
         if not path.exists():
             samples = shard(number, media, split, seed)
             temporary = path.with_suffix(".part")
@@ -118,11 +118,11 @@ def make(folder: Path, count: int, media: int, split: Split, seed: int) -> Itera
         yield (number + 1) * SHARD
 
 
-def load(folder: Path, count: int, media: int, split: Split) -> Samples:
+def load(folder: Path, count: int, media: int, split: Split, seed: int) -> Samples:
     """The first materials that `make` has left in the folder, all shards put together."""
     parts = []
     for number in range(-(-count // SHARD)):
-        with np.load(_path(folder, media, split, number)) as archive:
+        with np.load(_path(folder, media, split, seed, number)) as archive:
             parts.append(dict(archive))
     whole = {name: np.concatenate([part[name] for part in parts])[:count] for name in parts[0]}
     layers = Layers(**{field.name: whole.pop(field.name) for field in fields(Layers)})
@@ -193,8 +193,8 @@ def _direction(
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), side * cosine], -1)
 
 
-def _path(folder: Path, media: int, split: Split, number: int) -> Path:
-    return folder / f"{split}-{media}-{number:05d}.npz"
+def _path(folder: Path, media: int, split: Split, seed: int, number: int) -> Path:
+    return folder / f"{split}-{media}-{seed}-{number:05d}.npz"
 
 
 @eqx.filter_jit

@@ -63,12 +63,14 @@ def test_a_shard_is_made_once_and_always_the_same(tmp_path, monkeypatch):
     assert list(data.make(tmp_path, 4, 1, "test", 7)) == [2, 4]
     files = sorted(tmp_path.iterdir())
     stamps = [path.stat().st_mtime_ns for path in files]
-    before = data.load(tmp_path, 4, 1, "test")
+    before = data.load(tmp_path, 4, 1, "test", 7)
     files[1].unlink()
     list(data.make(tmp_path, 4, 1, "test", 7))
     assert files[0].stat().st_mtime_ns == stamps[0]
-    again = data.load(tmp_path, 4, 1, "test")
+    again = data.load(tmp_path, 4, 1, "test", 7)
     np.testing.assert_array_equal(before.values, again.values)
+    with pytest.raises(FileNotFoundError):  # of another seed
+        data.load(tmp_path, 4, 1, "test", 8)
     stack = data.stack_of(
         (data.KINDS[again.layers.kind[3, 0]],), False, {k: jnp.asarray(v[3]) for k, v in vars(again.layers).items()}
     )
