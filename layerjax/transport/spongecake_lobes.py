@@ -10,7 +10,7 @@ flakes is blurred by b, with s = wi + wo in place of h,
 which is D at b = 0, reciprocal, and leads over to a lobe straight on.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -153,11 +153,9 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
     _, cosine = half_vector(wi, wo)
     edge = (1.0 - cosine) ** 2
     edge = edge * edge * (1.0 - cosine)  # Schlick's term
-    rises = [(1.0 - jnp.abs(w[2])) ** 2 for w in (wi, wo)]
-    rims = [
-        _rising(second.weights.rims[c], [rise * rise for rise in rises], wi, wo, side, opaque)
-        for c in range(_channels(second))
-    ]
+    rises = [rise**2 for rise in _rises(wi, wo)]
+    rises = [rise * rise for rise in rises]
+    rims = [_rising(second.weights.rims[c], rises, wi, wo, side, opaque) for c in range(_channels(second))]
     found = {}
     for k, lobe in layer_lobes(second.slab, wi, wo, "reflection" if opaque else side).items():
         values = []
@@ -171,7 +169,7 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
 def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
     """The Lambertian term, for all channels."""
     valid = answered(wi, wo, side, opaque)
-    rises = [1.0 - jnp.abs(w[2]) for w in (wi, wo)]
+    rises = _rises(wi, wo)
     values = []
     for c in range(_channels(second)):
         level = _of_side(second.weights.levels[c], wi, wo, side, opaque)
@@ -180,18 +178,22 @@ def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
     return tuple(values)
 
 
-def _rising(slopes: Array, rises: list[Array], wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+def _rises(wi: Vector, wo: Vector) -> tuple[Array, Array]:
+    """1 - |cos| of both directions; if they are on different sides, of the upper one first."""
+    into, out = (1.0 - jnp.abs(w[2]) for w in (wi, wo))
+    above = wi[2] > 0
+    return jnp.where(above, into, out), jnp.where(above, out, into)
+
+
+def _rising(slopes: Array, rises: Sequence[Array], wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
     """(1 + slope rise) of both directions, with the slopes that hold for their sides, (2, 2) as in `Weights`."""
+    high, low = slopes[1]
     if opaque or side == "reflection":
-        return (1.0 + slopes[0, 0] * rises[0]) * (1.0 + slopes[0, 0] * rises[1])
-    product = jnp.ones_like(rises[0] * rises[1])
-    for w, rise in zip((wi, wo), rises, strict=True):
-        above = w[2] > 0
-        through = jnp.where(above, slopes[1, 0], slopes[1, 1])
-        if side == "all":
-            through = jnp.where(wi[2] * wo[2] > 0, jnp.where(above, slopes[0, 0], slopes[0, 1]), through)
-        product = product * (1.0 + through * rise)
-    return product
+        high = low = slopes[0, 0]
+    elif side == "all":
+        same, both = wi[2] * wo[2] > 0, jnp.where(wi[2] > 0, slopes[0, 0], slopes[0, 1])
+        high, low = jnp.where(same, both, high), jnp.where(same, both, low)
+    return (1.0 + high * rises[0]) * (1.0 + low * rises[1])
 
 
 def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
