@@ -20,6 +20,7 @@ import fits
 import layerjax as lj
 from benchmarks import environment
 from benchmarks.results import DIRECTORY, write
+from benchmarks.spongecake_cost import ROUNDS, costs
 from benchmarks.spongecake_tables import Errors, Figure, Fitted, Furnace, Gain, markdown
 from layerjax.distributions import Kind
 from layerjax.precomputed import spongecake_data as materials
@@ -75,8 +76,10 @@ def study(
     for name, phase, truth in thick()[:: 5 if quick else 1]:
         fitted.append(fit(name, phase, truth))
         report(f"fits: {name}: bias {fitted[-1].cake_bias:.3f}, single scattering {fitted[-1].first_bias:.3f}")
+    cost = list(costs(quick))
+    report(f"costs: at most {max(row.ratio for row in cost):.2f} times single scattering")
     surroundings = environment.describe()
-    text = markdown(surroundings, counts, errors, furnaces, steps, drawn, fitted, walks, ANGLES, gain)
+    text = markdown(surroundings, counts, errors, furnaces, steps, drawn, fitted, cost, ROUNDS, walks, ANGLES, gain)
     content: dict[str, Any] = {
         "environment": surroundings,
         "quick": quick,
@@ -85,6 +88,7 @@ def study(
         "gains": [asdict(row) for row in steps],
         "figures": [asdict(row) for row in drawn],
         "fits": [asdict(row) for row in fitted],
+        "costs": [asdict(row) for row in cost],
     }
     return text, write("spongecake", content, text, directory)
 
