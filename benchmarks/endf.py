@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,6 +19,11 @@ PATHS, QUICK_PATHS = 1_000_000, 100_000
 
 PAPER, RECIPROCAL = lj.ENDF(form="paper"), lj.ENDF()
 FORMS: tuple[Form, ...] = ("paper", "reciprocal")
+
+STRAIGHT_THROUGH, ONE_BOUNCE = 1, 2
+"""Events less one: in and out; in, off the base, and out. Every further bounce has two more."""
+
+MOST_BOUNCES = 4
 
 MIRROR = 0.01, 20.0
 """Index of a base that absorbs 1e-4."""
@@ -42,10 +48,11 @@ TEXT = """\
 
 {environment}
 `ENDF(form="paper")`, the corrected paper, and `ENDF(form="reciprocal")` beside {paths:,} paths through von Mises-Fisher
-facets (`benchmarks/endf_truth.py`: plain numpy, Fresnel at every facet, separable masking). *Distance* is the sum of
-|model - truth| over 41 by 41 cells of the projected lobe by the sum of the truth; *floor* is what the noise of the
-truth alone makes of it. Angles in degrees; kappa = 2 / alpha^2, of the coat and of the base. Standard errors of
-energies are below {error:.1g}.
+facets (`benchmarks/endf_truth.py`: plain numpy, Fresnel at every facet, separable masking). *RandomWalk* is the energy
+of the same paths, told apart by their number of events, among as many of the library's own walk (`lj.goniophotometer`).
+*Distance* is the sum of |model - truth| over 41 by 41 cells of the projected lobe by the sum of the truth; *floor* is
+what the noise of the truth alone makes of it. Angles in degrees; kappa = 2 / alpha^2, of the coat and of the base.
+Standard errors of energies are below {error:.1g}.
 
 ## One bounce under a coat on a mirror
 
@@ -110,7 +117,7 @@ def _coats(paths: int) -> list[dict[str, Any]]:
         bare = _values(_coat(above, below, ior), angle, lj.ENDF(bounces=0))
         rows.append(
             {"kappa": _named(above, below), "angle": angle, "index": ior}
-            | _compared(truth, _coat(above, below, ior), angle, bare)
+            | _compared(truth, _coat(above, below, ior), angle, bare, paths)
         )
     return rows
 
@@ -120,11 +127,11 @@ def _slabs(paths: int) -> list[dict[str, Any]]:
     for above, below, angle in SLABS:
         truth = endf_truth.slab(1.5, above, below, angle, paths)
         stack = lj.Stack([_face(1.5, above), _face(1.0, below)])
-        rows.append({"kappa": _named(above, below), "angle": angle} | _compared(truth, stack, angle, None))
+        rows.append({"kappa": _named(above, below), "angle": angle} | _compared(truth, stack, angle, None, paths))
     return rows
 
 
-def _compared(truth: endf_truth.Walked, stack: lj.Stack, angle: float, bare: Any) -> dict[str, Any]:
+def _compared(truth: endf_truth.Walked, stack: lj.Stack, angle: float, bare: Any, paths: int) -> dict[str, Any]:
     """Energy and shape of the lobe below the surface (`bare`: values of the surface) or of what passes (None)."""
     wi = lj.direction(np.radians(angle), 0.0)
     lobe = endf_truth.lobe(truth)
@@ -141,9 +148,12 @@ def _compared(truth: endf_truth.Walked, stack: lj.Stack, angle: float, bare: Any
             both = _values(stack, angle, transport)
             distances[form] = lobe.distance(_difference(both, bare))
     energy, error = truth.energy
+    reflected, transmitted = _walked(stack, angle, paths)
+    walk, noise = transmitted[STRAIGHT_THROUGH] if bare is None else reflected[ONE_BOUNCE]
     return {
         "Monte Carlo": energy,
-        "error": error,
+        "RandomWalk": walk,
+        "error": max(error, noise),
         **{f"energy, {form}": value for form, value in energies.items()},
         **{f"distance, {form}": value for form, value in distances.items()},
         "floor": lobe.floor,
@@ -178,13 +188,18 @@ def _bounces(paths: int) -> list[dict[str, Any]]:
     rows = []
     for above, below, angle in BOUNCES:
         reflectance = endf_truth.conductor(MIRROR[0] / 1.5, MIRROR[1] / 1.5)
-        truth = endf_truth.coat(1.5, above, below, angle, paths, bounces=4, reflectance=reflectance)
+        truth = endf_truth.coat(1.5, above, below, angle, paths, bounces=MOST_BOUNCES, reflectance=reflectance)
         wi, stack = lj.direction(np.radians(angle), 0.0), _coat(above, below, 1.5)
-        sums = {form: [float(lj.albedo(stack, wi, lj.ENDF(k, form))[0][0]) for k in range(5)] for form in FORMS}
+        sums = {
+            form: [float(lj.albedo(stack, wi, lj.ENDF(k, form))[0][0]) for k in range(MOST_BOUNCES + 1)]
+            for form in FORMS
+        }
+        near, _ = _walked(stack, angle, paths)
         for k, order in enumerate(truth, 1):
             energy, error = order.energy
+            walk, noise = near[ONE_BOUNCE + 2 * (k - 1)]
             row = {"kappa": _named(above, below), "angle": angle, "bounce": k}
-            row |= {"Monte Carlo": energy, "error": error}
+            row |= {"Monte Carlo": energy, "RandomWalk": walk, "error": max(error, noise)}
             rows.append(row | {form: sums[form][k] - sums[form][k - 1] for form in FORMS})
     return rows
 
@@ -213,6 +228,14 @@ def _tinted(paths: int) -> list[dict[str, Any]]:
                 row |= {"error": float(np.hypot(noise, error))}
                 rows.append(row | {model: float(values[place]) for model, values in models.items()})
     return rows
+
+
+def _walked(stack: lj.Stack, angle: float, paths: int) -> tuple[list[tuple[float, float]], list[tuple[float, float]]]:
+    """Energies and their errors by the number of events less one, reflected and transmitted."""
+    wi, key = lj.direction(np.radians(angle), 0.0), jax.random.key(0)
+    seen = lj.goniophotometer(stack, wi, key=key, paths=paths, polar=1, azimuth=1, orders=2 * MOST_BOUNCES + 2)
+    sides = np.stack([np.asarray(seen.orders)[..., 0], np.asarray(seen.orders_error)[..., 0]], axis=-1).tolist()
+    return sides[0], sides[1]
 
 
 def _values(stack: lj.Stack, angle: float, transport: lj.Transport, below: bool = False) -> Any:

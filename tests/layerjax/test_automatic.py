@@ -36,6 +36,7 @@ def test_an_albedo_that_is_not_known_may_scatter():
     jax.eval_shape(chosen, 0.0)
 
 
+@pytest.mark.slow
 def test_closed_form_is_exact():
     """Within the error that `prepare` states, 5e-3: mostly that of the solver at 24 nodes."""
     cosine = np.array([0.1, 0.5, 0.9])

@@ -72,6 +72,21 @@ def test_the_monte_carlo_counts_bounces():
     np.testing.assert_allclose([order.energy[0] for order in rough], [0.457, 0.148, 0.080], atol=5e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [(1e4, 1e3, 75.0, 1.5), (1e2, 1e2, 60.0, 1.5), (1e4, 10.0, 0.0, 2.0)])
+def test_the_monte_carlo_is_what_the_walk_finds(case):
+    """Bounce by bounce: a path has three events for the first, and two more for every other."""
+    above, below, degrees, ior = case
+    wi = lj.direction(np.radians(degrees), 0.0)
+    seen = lj.goniophotometer(
+        on_mirror(above, below, ior), wi, key=jax.random.key(0), paths=1 << 19, polar=1, azimuth=1
+    )
+    for bounce, order in enumerate(walked(*case, 500_000, bounces=3)):
+        energy, error = order.energy
+        place = 0, 2 + 2 * bounce, 0
+        assert abs(seen.orders[place] - energy) < 4.5 * np.hypot(seen.orders_error[place], error)
+
+
 # kappa above and below, degrees, index; energy by "paper" and "reciprocal"; distance of the shape of the latter
 TABLE = {
     (1e4, 1e3, 75.0, 1.5): (0.535, 0.398, 0.033),

@@ -96,9 +96,8 @@ def test_walk_that_loses_masked_light():
     np.testing.assert_array_less(np.abs(found - [0.25888, 0.24790]), 4 * np.hypot(noise, [3.8e-4, 3.6e-4]))
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(0, marks=pytest.mark.slow), 3, pytest.param(4, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 3, 4])
 def test_lobes_have_the_shape_that_they_can_have(number):
     """Total variation from the walk at four angles: within 0.02, and the walk's noise, of what is to be expected."""
     for row in compare(cases()[number], PATHS, jax.random.key(number)):
