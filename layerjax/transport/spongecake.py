@@ -53,8 +53,8 @@ class SpongeCake(Transport):
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
         energy: whether the network's word stands, or the energy of the second lobe is put right at once, by that of
             the same media without absorption, whose energy is known. That takes 1 to 20 ms a stack in `prepare`
-            (about 100 times as long as the network; derivatives compile for tens of seconds), and turns about the
-            normal change values by about 0.1 %.
+            (about 100 times as long as the network; derivatives compile for tens of seconds), and a turn about the
+            normal changes values by 0.1 to 0.5 %.
     """
 
     proposal: Proposal = eqx.field(static=True, default="first")

@@ -76,7 +76,7 @@ def _balanced(white: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> 
     turning = any(isinstance(medium.phase, SGGX) and medium.phase.axis is not None for medium in white)
     opposite = len(white) == 1
     dtype = second.weights.levels.dtype
-    wi, weight = _directions(turning, opposite, dtype)
+    wi, weight = _directions(_azimuth(white) if turning else None, opposite, dtype)
 
     @jax.checkpoint
     def one(wi: Vector) -> tuple[Array, list[tuple[Array, Array]]]:
@@ -113,15 +113,28 @@ def _white(medium: Medium, thickness: Array) -> Medium:
     return eqx.tree_at(lambda m: m.albedo, white, 1.0)  # known: nothing to multiply by
 
 
-def _directions(turning: bool, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
+def _azimuth(media: tuple[Medium, ...]) -> Array:
+    """Azimuth of the axes, modulo half a turn: what turns with them gives the same wherever they point."""
+    across, along = jnp.zeros(()), jnp.zeros(())
+    for k, medium in enumerate(media):
+        if isinstance(medium.phase, SGGX) and medium.phase.axis is not None:
+            x, y, _ = medium.phase.axis
+            share = 0.5**k  # so that two at right angles do not cancel
+            across, along = across + share * 2.0 * x * y, along + share * (x * x - y * y)
+    upright = (across == 0.0) & (along == 0.0)
+    return 0.5 * jnp.arctan2(across, jnp.where(upright, 1.0, along))
+
+
+def _directions(azimuth: Array | None, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
     """Where energies are balanced, above and (unless the same there) below, with weights of their cosine."""
     x, w = gauss_legendre(COSINES)
-    count = AZIMUTHS if turning else 1
+    count = 1 if azimuth is None else AZIMUTHS
     sides = [1.0] if opposite else [1.0, -1.0]
     turns = (np.arange(count) + 0.5) * (2.0 * np.pi / count)
-    side, z, phi = (array.ravel() for array in np.meshgrid(sides, x, turns, indexing="ij"))
+    side, z, turn = (array.ravel() for array in np.meshgrid(sides, x, turns, indexing="ij"))
+    phi = turn + (0.0 if azimuth is None else azimuth)
     sine = np.sqrt(1.0 - z * z)
-    wi = [jnp.asarray(part, dtype) for part in (sine * np.cos(phi), sine * np.sin(phi), side * z)]
+    wi = [jnp.asarray(part, dtype) for part in (sine * jnp.cos(phi), sine * jnp.sin(phi), side * z)]
     return (wi[0], wi[1], wi[2]), jnp.asarray(np.tile(np.repeat(w * x, count), len(sides)), dtype)
 
 

@@ -127,7 +127,7 @@ def bend_terms(w: Vector, turning: bool, opposite: bool) -> list[Array]:
             above = w[2] > 0
             x, y = jnp.where(above, x, -x), jnp.where(above, y, -y)
         twice = BEND_DEGREE - 2
-        parts += [(x, BEND_DEGREE - 1), (y, BEND_DEGREE - 1), (x * x - y * y, twice), (x * y, twice)]
+        parts += [(x, BEND_DEGREE - 1), (y, BEND_DEGREE - 1), (x * x - y * y, twice), (2.0 * x * y, twice)]
     return [part * z**k if k else part for part, degree in parts for k in range(degree + 1)]
 
 

@@ -89,6 +89,28 @@ def test_balanced_is_reciprocal_and_white_where_nothing_absorbs(name):
     np.testing.assert_allclose(lj.evaluate(black, wi, wo, BALANCED), learned, rtol=5e-3)
 
 
+@pytest.mark.slow
+def test_balanced_turns_with_its_axes():
+    """Within 1 %: energies are balanced at directions that turn too, by a quadrature that does not."""
+    turn = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
+    wi, wo = pairs()
+
+    def values(axis, wi, wo):
+        return np.asarray(lj.evaluate(lj.Stack([lj.Medium(5.0, 1.0, lj.SGGX("fiber", 0.1, axis))]), wi, wo, BALANCED))
+
+    axis = np.array([0.7, 0.0, 0.7])
+    expected = values(axis, wi, wo)
+    apart = values(turn @ axis, wi @ turn.T, wo @ turn.T) - expected
+    assert np.sqrt(np.mean(apart**2)) < 0.01 * np.sqrt(np.mean(expected**2))
+    upright = np.array([0.0, 0.0, 1.0])
+    slope = jax.grad(
+        lambda axis: jnp.sum(
+            lj.evaluate(lj.Stack([lj.Medium(5.0, 1.0, lj.SGGX("fiber", 0.1, axis))]), wi[:5], wo[:5], BALANCED)
+        )
+    )(upright)
+    assert np.isfinite(slope).all()
+
+
 def test_balanced_tells_channels_apart():
     """Each channel as if it were alone, but for the shape of the lobe, which follows their mean."""
     wi, wo = pairs(50)
