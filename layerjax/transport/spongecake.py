@@ -47,7 +47,7 @@ class SpongeCake(Transport):
     Relative L2 error of the BSDF over random materials: 2 % for one medium and 4 % for two (median), 11 % and 22 %
     (95th percentile); most where fibers are narrow (`benchmarks/results/spongecake.md`). Reciprocal, and finite over
     the box. Albedos of lossless slabs are off by 0.6 % and 2.8 % (median), 9 % and 21 % (95th percentile), and with
-    `energy` balanced by 0.2 % and 0.4 %, 2 % and 5 %.
+    `energy` balanced by 0.2 % and 0.4 %, 2 % and 6 %.
 
     Args:
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
