@@ -39,6 +39,9 @@ BATCH = 8
 ROUNDS = 5
 """Each halves the logarithm of what is off, as far as the polynomial can follow."""
 
+UPRIGHT = 1e-12
+"""Squared sine of an axis below which it has no azimuth: the square of less has no float32."""
+
 FADING = 4
 """Power of what survives a collision (in each medium) by which log c fades: what absorbs has errors of its own."""
 
@@ -121,8 +124,8 @@ def _azimuth(media: tuple[Medium, ...]) -> Array:
             x, y, _ = medium.phase.axis
             share = 0.5**k  # so that two at right angles do not cancel
             across, along = across + share * 2.0 * x * y, along + share * (x * x - y * y)
-    upright = (across == 0.0) & (along == 0.0)
-    return 0.5 * jnp.arctan2(across, jnp.where(upright, 1.0, along))
+    upright = jnp.abs(across) + jnp.abs(along) < UPRIGHT
+    return 0.5 * jnp.arctan2(jnp.where(upright, 0.0, across), jnp.where(upright, 1.0, along))
 
 
 def _directions(azimuth: Array | None, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
