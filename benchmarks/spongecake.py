@@ -7,6 +7,7 @@ scattering is solved once and kept in the folder given as `work`.
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,12 @@ from benchmarks.spongecake_tables import Errors, Figure, Fitted, Furnace, Gain, 
 from layerjax.distributions import Kind
 from layerjax.precomputed import spongecake_data as materials
 from layerjax.precomputed import spongecake_training as training
+from layerjax.precomputed.learning import Schedule
 from layerjax.precomputed.spongecake import PLANS, SEED
 from layerjax.precomputed.spongecake_training import ENERGY, Parts
 
 KINDS: tuple[Kind, ...] = ("surface", "fiber")
-CAKE, BALANCED, FIRST = lj.SpongeCake(), lj.SpongeCake(energy="balanced"), lj.SingleScattering()
+CAKE, FIRST = lj.SpongeCake(), lj.SingleScattering()
 COUNTS, QUICK_COUNTS = PLANS[False].test, (64, 64)
 
 GAINS, QUICK_GAINS = (1024, 150), (64, 5)
@@ -93,6 +95,15 @@ def study(
     return text, write("spongecake", content, text, directory)
 
 
+def lobes_alone(stack: lj.Stack) -> lj.Prepared:
+    """The stack made ready for SpongeCake without the factor that puts energies right."""
+    return eqx.tree_at(lambda ready: ready.state.second.bend, lj.prepare(stack, CAKE), None)
+
+
+Ready = Callable[[lj.Stack], lj.Prepared]
+WAYS: tuple[Ready, ...] = (lobes_alone, partial(lj.prepare, transport=CAKE))
+
+
 def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) -> list[Gain]:
     """What each step beyond the paper is worth: the same short training with more and more of them, one medium."""
     for _ in materials.make(work, count, 1, "train", SEED):
@@ -112,7 +123,7 @@ def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) ->
     with jax.enable_x64(False):
         batch = training.batch_of(test)
         for name, (parts, energy) in steps.items():
-            schedule = training.Schedule(epochs=epochs)
+            schedule = Schedule(epochs=epochs)
             net, _ = training.train(1, learned, SEED, schedule, None, lambda line: None, energy, parts)
             norms, albedos = training.errors(net, batch, parts)
             size = np.sqrt(np.sum(norms**2, axis=1))
@@ -143,7 +154,8 @@ def groups(samples: materials.Samples, media: int) -> dict[str, NDArray[np.bool_
 
 def held_out(samples: materials.Samples, media: int) -> list[Errors]:
     """Errors of all kinds of materials."""
-    cake, balanced, first = (_values(samples, how) for how in (CAKE, BALANCED, FIRST))
+    lobes, cake = (_values(samples, ready) for ready in WAYS)
+    first = _values(samples, partial(lj.prepare, transport=FIRST))
     truth = first + samples.values
     weight = np.abs(samples.wi[..., 2])[:, (0, 1, 0), :, None]
 
@@ -176,7 +188,7 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
                 both(relative(cake, (0,), samples.values)),
                 both(through[1]),
                 both(relative(first, lit)),
-                both(relative(balanced, lit)),
+                both(relative(lobes, lit)),
             )
         )
     return rows
@@ -185,13 +197,13 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
 def furnace(samples: materials.Samples, media: int) -> list[Furnace]:
     """Energy of the same materials without absorption."""
     wi = jnp.asarray(lj.direction(jnp.deg2rad(jnp.asarray(ANGLES)), 0.4), jnp.float32)
-    found = np.zeros((2, len(samples.values), len(ANGLES)))
+    found = np.zeros((len(WAYS), len(samples.values), len(ANGLES)))
     for rows, make, numbers in _structures(samples):
 
         def total(numbers: dict, make: Callable = make) -> jax.Array:
             white = {**numbers, "albedo": jnp.ones_like(numbers["albedo"]), "f0": jnp.ones_like(numbers["f0"])}
             stack = make(white)
-            scattered = [sum(lj.albedo(stack, wi, how, nodes=NODES)) for how in (CAKE, BALANCED)]
+            scattered = [sum(lj.albedo(ready(stack), wi, nodes=NODES)) for ready in WAYS]
             return (jnp.stack(scattered) + lj.unscattered(stack, wi))[..., 0]
 
         found[:, rows] = jnp.swapaxes(jax.lax.map(jax.jit(total), numbers), 0, 1)
@@ -216,7 +228,7 @@ def _structures(samples: materials.Samples) -> Any:
         yield rows, lambda numbers, names=names, flat=flat: materials.stack_of(names, not flat, numbers), numbers
 
 
-def _values(samples: materials.Samples, transport: lj.Transport) -> NDArray[np.float64]:
+def _values(samples: materials.Samples, ready: Ready) -> NDArray[np.float64]:
     """BSDF at the pairs of the samples, (n, 3, i, o)."""
     found = np.zeros(samples.values.shape)
     lit = samples.wi[:, (0, 1, 0)]
@@ -225,7 +237,7 @@ def _values(samples: materials.Samples, transport: lj.Transport) -> NDArray[np.f
         @eqx.filter_jit
         def one(given: tuple, make: Callable = make) -> jax.Array:
             numbers, wi, wo = given
-            return lj.evaluate(make(numbers), wi[..., None, :], wo, transport)[..., 0]
+            return lj.evaluate(ready(make(numbers)), wi[..., None, :], wo)[..., 0]
 
         found[rows] = jax.lax.map(one, (numbers, jnp.asarray(lit[rows]), jnp.asarray(samples.wo[rows])))
     return found

@@ -16,14 +16,14 @@ TEXT = """\
 Relative L2 error of the BSDF over 12 directions of light a side and 24 of view a hemisphere each (weighted with both
 cosines), beside `AddingDoubling` at ordinates (10, 24), for {one} slabs of one medium and {two} of two, drawn as those
 that were learned from but never seen: median and 95th percentile, in percent. *Single* is the error of
-`SingleScattering` alone, *balanced* that of `SpongeCake(energy="balanced")`.
+`SingleScattering` alone, *lobes alone* that of `SpongeCake` without the factor that puts energies right.
 
 {errors}
 ## White furnace
 
 The same materials with albedo 1 and no Fresnel term, light at {angles} degrees:
-|R + T + unscattered - 1| in percent, over materials and angles, median and 95th percentile: by the network as it has
-learned (the default), and with `energy="balanced"`.
+|R + T + unscattered - 1| in percent, over materials and angles, median and 95th percentile: of the lobes
+alone, and of `SpongeCake` as it is, with the factor that puts energies right.
 
 {furnace}
 ## What each step is worth
@@ -73,7 +73,7 @@ class Errors:
     reflected_multiple: tuple[float, float]
     transmitted_multiple: tuple[float, float]
     single: tuple[float, float]
-    balanced: tuple[float, float]
+    lobes: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class Furnace:
     kind: str
     media: int
     count: int
-    learned: tuple[float, float]
-    balanced: tuple[float, float]
+    lobes: tuple[float, float]
+    both: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def markdown(
         return f"{figure(values[0], 2)} / {figure(values[1], 2)}"
 
     names = ("full", "multiple", "reflected", "transmitted", "reflected_multiple", "transmitted_multiple")
-    heads = ("full", "multiple", "R, full", "T, full", "R, multiple", "T, multiple", "single, full", "balanced, full")
+    heads = ("full", "multiple", "R, full", "T, full", "R, multiple", "T, multiple", "single", "lobes alone")
     return TEXT.format(
         environment=environment_lines(surroundings),
         one=counts[0],
@@ -173,14 +173,14 @@ def markdown(
                     row.kind,
                     str(row.media),
                     str(row.count),
-                    *(two(getattr(row, name)) for name in (*names, "single", "balanced")),
+                    *(two(getattr(row, name)) for name in (*names, "single", "lobes")),
                 )
                 for row in errors
             ],
         ),
         furnace=table(
-            ("materials", "media", "count", "learned", "balanced"),
-            [(row.kind, str(row.media), str(row.count), two(row.learned), two(row.balanced)) for row in furnaces],
+            ("materials", "media", "count", "lobes alone", "SpongeCake"),
+            [(row.kind, str(row.media), str(row.count), two(row.lobes), two(row.both)) for row in furnaces],
         ),
         gains=table(
             ("second lobe", "full", "multiple", "energy"),

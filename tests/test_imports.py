@@ -62,8 +62,8 @@ LAYERS = [
     "layerjax.transport.adding_doubling",
     "layerjax.transport.spongecake_mapping",
     "layerjax.transport.spongecake_layers",
+    "layerjax.transport.spongecake_bend",
     "layerjax.transport.spongecake_lobes",
-    "layerjax.transport.spongecake_energy",
     "layerjax.transport.spongecake",
     "layerjax.transport.endf_warping",
     "layerjax.transport.endf_chains",
@@ -90,8 +90,11 @@ LAYERS = [
     "layerjax",
     "layerjax.gallery",
     "layerjax.precomputed.microsurface",
+    "layerjax.precomputed.learning",
     "layerjax.precomputed.spongecake_data",
     "layerjax.precomputed.spongecake_training",
+    "layerjax.precomputed.spongecake_energy",
+    "layerjax.precomputed.spongecake_bending",
     "layerjax.precomputed.spongecake",
     "layerjax.precomputed.__main__",
 ]
@@ -122,7 +125,7 @@ def test_layerjax_imports_point_downward(path):
     assert name in LAYERS, f"{name} has no place in LAYERS"
     for other in imported(path):
         root = other.split(".")[0]
-        trains = {"optax"} if name == "layerjax.precomputed.spongecake_training" else set()  # inside a function there
+        trains = {"optax"} if name == "layerjax.precomputed.learning" else set()  # inside a function there
         assert root in {*sys.stdlib_module_names, "jax", "equinox", "numpy", "layerjax", *trains}
         if root == "layerjax":
             assert LAYERS.index(other) < LAYERS.index(name), f"{name} imports {other}"

@@ -132,7 +132,7 @@ def load(folder: Path, count: int, media: int, split: Split, seed: int) -> Sampl
 def shard(number: int, media: int, split: Split, seed: int) -> Samples:
     """Samples of one shard: the same for the same number and seed."""
     random = np.random.default_rng([seed, media, int(split == "test"), number])
-    layers, tilted = draw_layers(random, media)
+    layers, tilted = draw_layers(random, media, SHARD)
     wi, wo = draw_directions(random, SHARD)
     sides = 3 if media > 1 else 2
     order = np.asarray((0, 1, 2) if media > 1 else (0, 2))
@@ -148,16 +148,18 @@ def shard(number: int, media: int, split: Split, seed: int) -> Samples:
     return Samples(layers, wi.astype(np.float32), wo.astype(np.float32), values)
 
 
-def draw_layers(random: np.random.Generator, media: int) -> tuple[Layers, bool]:
-    """Parameters of a shard, and whether any of its media has an axis of its own."""
+def draw_layers(
+    random: np.random.Generator, media: int, count: int, widths: dict[bool, tuple[float, float]] = WIDTHS
+) -> tuple[Layers, bool]:
+    """Parameters of `count` materials of one structure, and whether any of their media has an axis of its own."""
     kinds = random.choice(len(KINDS), size=media, p=SHARES)
     tilted = (kinds != KINDS.index("hg")) & (random.uniform(size=media) < TILTED)
-    size = (SHARD, media)
+    size = (count, media)
 
     def between(low: float, high: float) -> NDArray[np.float64]:
         return np.exp(random.uniform(np.log(low), np.log(high), size))
 
-    alpha = between(*WIDTHS[bool(tilted.any())])
+    alpha = between(*widths[bool(tilted.any())])
     alpha = np.where(kinds == 2, random.uniform(*MEAN_COSINES, size), alpha)
     thickness = np.where(random.uniform(size=size) < DEEP, between(*DEEPEST), between(*DEPTHS))
     albedo = np.where(random.uniform(size=size) < LOSSLESS, 1.0, 1.0 - 0.95 * random.uniform(size=size) ** 2)

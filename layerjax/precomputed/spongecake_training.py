@@ -6,12 +6,11 @@ that; a test holds them against those of the transport.
 Loss of a material: the relative L2 error of its BSDF, first order included (weighted with both cosines; all sides
 together, and half of each side by itself), a fifth of that of its multiple scattering alone, and `ENERGY` times the
 error of its directional albedos. The mean of the channels that decides the lobe's shape is drawn at random for half of
-the materials, so that a channel may differ from it. Adam, with a rate that falls as a cosine.
+the materials, so that a channel may differ from it.
 """
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -22,7 +21,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from layerjax.precomputed.spongecake_data import KINDS, Samples
+from layerjax.precomputed.learning import Schedule, learn
+from layerjax.precomputed.spongecake_data import KINDS, Layers, Samples
 from layerjax.transport.spongecake_mapping import Numbers, Shape, Weights, network, shape_of, weights_of
 
 HG = KINDS.index("hg")
@@ -37,16 +37,6 @@ MULTIPLE, APART = 0.2, 0.5
 
 SPREAD = 0.2
 """How far mean albedos are drawn from those of the channel, standard deviation; half of it for f0."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How long to learn. kept: epochs between states that are written down."""
-
-    epochs: int = 300
-    batch: int = 64
-    rate: float = 2e-3
-    kept: int = 10
 
 
 class Parts(NamedTuple):
@@ -84,11 +74,23 @@ def sides_of(media: int) -> tuple[int, ...]:
 
 def batch_of(samples: Samples) -> Batch:
     """The samples with their first order and norms."""
-    layers, kind = samples.layers, samples.layers.kind
+    numbers = numbers_of(samples.layers)
+    sides = sides_of(samples.layers.kind.shape[1])
+    wi = samples.wi[:, [1 if side == 1 else 0 for side in sides]]
+    wo, values = samples.wo[:, sides], samples.values[:, sides]
+    first = _in_parts(jax.vmap(_first), (jax.tree.map(jnp.asarray, numbers), wi, wo))
+    weight = np.abs(wi[..., 2])[..., None]
+    size, multiple = (np.sqrt(np.mean(weight * v * v, (2, 3))) for v in (values + first, values))
+    return Batch(numbers, *(cast(Array, array) for array in (wi, wo, values, first, size, multiple)))
+
+
+def numbers_of(layers: Layers) -> Numbers:
+    """The materials as the networks take them, on the host, where rows are picked."""
+    kind = layers.kind
     hg = kind == HG
-    numbers = Numbers(
+    return Numbers(
         *(
-            jnp.asarray(part, jnp.float32)
+            cast(Array, np.asarray(part, np.float32))
             for part in (
                 kind[..., None] == np.arange(len(KINDS)),
                 np.where(hg, 1.0, layers.alpha),
@@ -100,14 +102,6 @@ def batch_of(samples: Samples) -> Batch:
             )
         )
     )
-    sides = sides_of(kind.shape[1])
-    wi = samples.wi[:, [1 if side == 1 else 0 for side in sides]]
-    wo, values = samples.wo[:, sides], samples.values[:, sides]
-    first = _in_parts(lambda media, wi, wo: jax.vmap(_first)(media, wi, wo), (numbers, wi, wo))
-    weight = np.abs(wi[..., 2])[..., None]
-    size, multiple = (np.sqrt(np.mean(weight * v * v, (2, 3))) for v in (values + first, values))
-    numbers = jax.tree.map(np.asarray, numbers)  # rows are picked on the host
-    return Batch(numbers, *(cast(Array, array) for array in (wi, wo, values, first, size, multiple)))
 
 
 def predict(
@@ -149,46 +143,18 @@ def train(
     energy: float = ENERGY,
     parts: Parts = ALL_PARTS,
 ) -> tuple[eqx.nn.MLP, NDArray[np.float32]]:
-    """The trained network, and the mean loss of each epoch.
-
-    state: a file that the state is kept in, and that an interrupted training goes on from. Needs optax.
-    """
-    import optax  # an extra, for whoever trains
-
+    """The trained network, and the mean loss of each epoch; the rest as in `layerjax.precomputed.learning.learn`."""
     batch = batch_of(samples)
-    count = len(batch.values)
-    steps = max(count // schedule.batch, 1)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adam(optax.cosine_decay_schedule(schedule.rate, schedule.epochs * steps))
-    )
+
+    def drawn(random: np.random.Generator, rows: NDArray[np.int64]) -> tuple[Batch, Array, Array]:
+        part = jax.tree.map(lambda array: array[rows], batch)
+        return part, *_means(random, part.media)
+
+    def loss(net: eqx.nn.MLP, part: Batch, mean_albedo: Array, mean_f0: Array) -> Array:
+        return _loss(net, part, mean_albedo, mean_f0, energy, parts)
+
     net = network(media, jax.random.key(seed))
-    held = (net, optimiser.init(eqx.filter(net, eqx.is_array)), np.zeros(schedule.epochs, np.float32), np.asarray(0))
-    if state is not None and state.exists():
-        held = eqx.tree_deserialise_leaves(state, held)
-    net, memory, curve, begun = held
-
-    @eqx.filter_jit
-    def step(net: eqx.nn.MLP, memory: Any, part: Batch, mean_albedo: Array, mean_f0: Array) -> tuple[Any, Any, Array]:
-        loss, slope = eqx.filter_value_and_grad(_loss)(net, part, mean_albedo, mean_f0, energy, parts)
-        update, memory = optimiser.update(slope, memory)
-        return eqx.apply_updates(net, update), memory, loss
-
-    for epoch in range(int(begun), schedule.epochs):
-        random = np.random.default_rng([seed, media, epoch])
-        losses = []
-        for rows in random.permutation(count)[: steps * schedule.batch].reshape(steps, -1):
-            part = jax.tree.map(lambda array, rows=rows: array[rows], batch)
-            means = _means(random, part.media)
-            net, memory, loss = step(net, memory, part, *means)
-            losses.append(loss)
-        curve[epoch] = np.mean(losses)
-        if (epoch + 1) % schedule.kept == 0 or epoch + 1 == schedule.epochs:
-            report(f"media {media}: epoch {epoch + 1}/{schedule.epochs}, loss {curve[epoch]:.4f}")
-            if state is not None:
-                temporary = state.with_suffix(".part")
-                eqx.tree_serialise_leaves(temporary, (net, memory, curve, np.asarray(epoch + 1)))
-                temporary.replace(state)
-    return net, curve
+    return learn(net, loss, drawn, len(batch.values), [seed, media], schedule, state, report)
 
 
 def _loss(net: eqx.nn.MLP, batch: Batch, mean_albedo: Array, mean_f0: Array, energy: float, parts: Parts) -> Array:

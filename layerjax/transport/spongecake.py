@@ -1,7 +1,7 @@
 """SpongeCake with multiple scattering (Wang et al. 2022, Sec. 5): single scattering, a second lobe, and a constant."""
 
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -14,13 +14,12 @@ from layerjax.precomputed import load
 from layerjax.stack import Interface, Stack, is_known, media_of, simplify
 from layerjax.transport._transport import Side, Transport
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
-from layerjax.transport.spongecake_energy import bend_of
+from layerjax.transport.spongecake_bend import bend_network
 from layerjax.transport.spongecake_layers import MOST, is_traced, pair_of
 from layerjax.transport.spongecake_lobes import Hemisphere, SecondLobe, evaluate_second, second_albedo, second_lobe
-from layerjax.transport.spongecake_mapping import unpack
+from layerjax.transport.spongecake_mapping import network, unpack
 
 Proposal = Literal["first", "both"]
-Energy = Literal["learned", "balanced"]
 
 
 SECOND_SHARE = 1.0 / 3.0
@@ -42,30 +41,23 @@ class SpongeCake(Transport):
     from `AddingDoubling`, one medium and two (``python -m layerjax.precomputed spongecake``). Of more than two, for
     the multiple scattering alone, neighbours are put together to a pair first; which ones depends on their numbers, so
     that these must be known: under ``jit`` or ``grad`` with traced parameters more than two are refused. A base is seen
-    through the media, without inter-reflection.
+    through the media, without inter-reflection. Beyond the paper, the second lobe is multiplied by a factor of either
+    direction that puts its energy right; a second network has learned it of media that absorb nothing.
 
     Relative L2 error of the BSDF over random materials: 2 % for one medium and 4 % for two (median), 11 % and 22 %
     (95th percentile); most where fibers are narrow (`benchmarks/results/spongecake.md`). Reciprocal, and finite over
-    the box. Albedos of lossless slabs are off by 0.6 % and 2.8 % (median), 9 % and 21 % (95th percentile), and with
-    `energy` balanced by 0.2 % and 0.4 %, 2 % and 6 %.
+    the box. Albedos of lossless slabs are off by AAA % and BBB % (median), CCC % and DDD % (95th percentile).
 
     Args:
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
-        energy: whether the network's word stands, or the energy of the second lobe is put right at once, by that of
-            the same media without absorption, whose energy is known. That takes 1 to 20 ms a stack in `prepare`
-            (about 100 times as long as the network; derivatives compile for tens of seconds), and a turn about the
-            normal changes values by 0.1 to 0.5 %.
     """
 
     proposal: Proposal = eqx.field(static=True, default="first")
-    energy: Energy = eqx.field(static=True, default="learned")
 
     def __check_init__(self) -> None:
-        for name, options in (("proposal", Proposal), ("energy", Energy)):
-            value = getattr(self, name)
-            if value not in get_args(options):
-                allowed = ", ".join(map(repr, get_args(options)))
-                raise ValueError(f"SpongeCake.{name}: {value!r} is not one of {allowed}")
+        if self.proposal not in get_args(Proposal):
+            allowed = ", ".join(map(repr, get_args(Proposal)))
+            raise ValueError(f"SpongeCake.proposal: {self.proposal!r} is not one of {allowed}")
 
     def check(self, stack: Stack) -> None:
         for index, layer in enumerate(stack.layers):
@@ -84,7 +76,7 @@ class SpongeCake(Transport):
     def prepare(self, stack: Stack) -> Mapped:
         first = SingleScattering().prepare(stack)
         scatters = any(not is_known(medium.albedo, 0.0) for medium in first.media)
-        second = _second(pair_of(first.media), networks(), self.energy == "balanced") if scatters else None
+        second = _second(pair_of(first.media), networks(), bends()) if scatters else None
         return Mapped(first, second, first.base is not None)
 
     def evaluate(self, state: Mapped, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -123,15 +115,18 @@ class SpongeCake(Transport):
 @cache
 def networks() -> Mapping[int, eqx.nn.MLP]:
     """The trained networks that are shipped, by the number of media."""
-    return {media: unpack(load("spongecake"), media) for media in range(1, MOST + 1)}
+    table = load("spongecake")
+    return {media: unpack(table, str(media), partial(network, media)) for media in range(1, MOST + 1)}
 
 
-@eqx.filter_jit
-def _second(media: tuple, nets: Mapping[int, eqx.nn.MLP], balanced: bool) -> SecondLobe:
-    second = second_lobe(media, nets)
-    if not balanced:
-        return second
-    return eqx.tree_at(lambda lobe: lobe.bend, second, bend_of(media, nets), is_leaf=lambda leaf: leaf is None)
+@cache
+def bends() -> Mapping[int, eqx.nn.MLP]:
+    """The trained networks of `layerjax.transport.spongecake_bend` that are shipped, by the number of media."""
+    table = load("spongecake")
+    return {media: unpack(table, f"{media}-bend", partial(bend_network, media)) for media in range(1, MOST + 1)}
+
+
+_second = eqx.filter_jit(second_lobe)
 
 
 def _sum(a: Channels, b: Channels) -> Channels:

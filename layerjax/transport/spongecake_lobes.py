@@ -28,12 +28,10 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium
 from layerjax.transport._transport import Side
 from layerjax.transport.single_scattering import Media, answered, layer_lobes
+from layerjax.transport.spongecake_bend import Bend, coefficients_of, factors, share_of
 from layerjax.transport.spongecake_mapping import Numbers, Weights, shape_of, weights_of
 
 ABOVE, BELOW, THROUGH = range(3)
-
-BEND_DEGREE = 3
-"""Of log c in the cosine."""
 
 
 class BlurredSGGX(SGGX):
@@ -57,21 +55,11 @@ class BlurredSGGX(SGGX):
         return self.sharp(wi, wo) / self.cross_section(wi)
 
 
-class Bend(eqx.Module):
-    """log c, a sum of `bend_terms`: its coefficients for light from above and below, (C or 1, 2 or 1, terms).
-
-    One medium looks the same from opposite directions, and has one set. share: what counts of it, (C or 1,).
-    """
-
-    coefficients: Array
-    share: Array
-
-
 class SecondLobe(eqx.Module):
     """What several collisions leave. slab: media with other parameters and no albedo of their own.
 
     weights: for each channel, see `layerjax.transport.spongecake_mapping.Weights`, stacked (C, ...). bend: a factor c
-    of either direction, see `layerjax.transport.spongecake_energy`; None for 1.
+    of either direction, see `layerjax.transport.spongecake_bend`; None for 1.
     """
 
     slab: Media
@@ -79,12 +67,12 @@ class SecondLobe(eqx.Module):
     bend: Bend | None = None
 
 
-def second_lobe(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> SecondLobe:
-    """The second lobe of one medium or two."""
+def second_lobe(
+    media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], bends: Mapping[int, eqx.nn.MLP] | None = None
+) -> SecondLobe:
+    """The second lobe of one medium or two, by networks for so many; without `bends` its energy is left as it is."""
     dtype = jnp.result_type(*jax.tree.leaves(media))
-    net = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, networks[len(media)]
-    )
+    net = _of_type(networks[len(media)], dtype)
     channels = max(count(*(per_channel(jnp.asarray(value)) for value in _optics(medium))) for medium in media)
     numbers = [_numbers(media, c, dtype) for c in range(channels)]
     albedo = mean([number.albedo for number in numbers])
@@ -95,14 +83,29 @@ def second_lobe(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -
     slab = []
     for k, medium in enumerate(media):
         taus = [shape.thickness[k] for shape in shapes]
-        thickness = jnp.stack(taus) if coloured else taus[0]
+        # of a medium of one thickness the mean: as exact as one for each channel, and costs less
+        thickness = jnp.stack(taus) if jnp.ndim(medium.thickness) else mean(taus)
         phase: SGGX | HenyeyGreenstein = HenyeyGreenstein(alpha[k])
         if isinstance(medium.phase, SGGX):
             phase = BlurredSGGX(medium.phase.kind, alpha[k], medium.phase.axis, blur[k])
         plain = Medium(thickness, 1.0, phase)
         slab.append(eqx.tree_at(lambda m: m.albedo, plain, 1.0))  # known: nothing to multiply by
     weights = [weights_of(net, number, albedo, f0) for number in numbers]
-    return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights))
+    bend = None
+    if bends is not None:
+        turning, bending = has_axes(media), _of_type(bends[len(media)], dtype)
+        found = [coefficients_of(bending, number, turning) for number in (numbers if coloured else numbers[:1])]
+        bend = Bend(jnp.stack(found), share_of(media).astype(dtype))
+    return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights), bend)
+
+
+def has_axes(media: tuple[Medium, ...]) -> bool:
+    """Whether anything may depend on the azimuth."""
+    return any(isinstance(medium.phase, SGGX) and medium.phase.axis is not None for medium in media)
+
+
+def _of_type(net: eqx.nn.MLP, dtype: Any) -> eqx.nn.MLP:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype) if eqx.is_inexact_array(leaf) else leaf, net)
 
 
 def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
@@ -111,41 +114,8 @@ def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaq
     values = tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
     if second.bend is None:
         return values
-    factors = _factors(second.bend, wi, wo, opaque or side == "reflection")
-    return tuple(value * pick(factors, c) for c, value in enumerate(values))
-
-
-def bend_terms(w: Vector, turning: bool, opposite: bool) -> list[Array]:
-    """What log c is a sum of: powers of the cosine, and with `turning` azimuthal terms times some.
-
-    `opposite`: the same for opposite directions.
-    """
-    x, y, z = w[0], w[1], jnp.abs(w[2])
-    parts = [(jnp.ones_like(z), BEND_DEGREE)]
-    if turning:
-        if opposite:
-            above = w[2] > 0
-            x, y = jnp.where(above, x, -x), jnp.where(above, y, -y)
-        twice = BEND_DEGREE - 2
-        parts += [(x, BEND_DEGREE - 1), (y, BEND_DEGREE - 1), (x * x - y * y, twice), (2.0 * x * y, twice)]
-    return [part * z**k if k else part for part, degree in parts for k in range(degree + 1)]
-
-
-def _factors(bend: Bend, wi: Vector, wo: Vector, from_above: bool) -> Channels:
-    """c of both directions."""
-    logs = [_bent(each, wi, from_above) + _bent(each, wo, from_above) for each in bend.coefficients]
-    channels = max(len(logs), bend.share.shape[0])
-    return tuple(jnp.exp(pick(per_channel(bend.share), c) * pick(logs, c)) for c in range(channels))
-
-
-def _bent(coefficients: Array, w: Vector, from_above: bool) -> Array:
-    """log c of a direction, from its coefficients (2 or 1, terms)."""
-    opposite = coefficients.shape[0] == 1
-    terms = bend_terms(w, coefficients.shape[-1] > BEND_DEGREE + 1, opposite and not from_above)
-    if opposite or from_above:
-        return sum(term * value for term, value in zip(terms, coefficients[0], strict=True))
-    above = w[2] > 0
-    return sum(term * jnp.where(above, high, low) for term, high, low in zip(terms, *coefficients, strict=True))
+    bent = factors(second.bend, wi, wo, opaque or side == "reflection")
+    return tuple(value * pick(bent, c) for c, value in enumerate(values))
 
 
 def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> dict[int, Channels]:
@@ -202,8 +172,8 @@ def second_albedo(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> t
     near, far = [], []
     for wo, values in flux(second, wi, nodes, opaque):
         if second.bend is not None:
-            factors = _factors(second.bend, spread, wo, opaque)
-            values = tuple(value * pick(factors, c) for c, value in enumerate(values))
+            bent = factors(second.bend, spread, wo, opaque)
+            values = tuple(value * pick(bent, c) for c, value in enumerate(values))
         same = spread[2] * wo[2] > 0
         near.append(tuple(jnp.sum(jnp.where(same, value, 0.0), -1) for value in values))
         far.append(tuple(jnp.sum(jnp.where(same, 0.0, value), -1) for value in values))

@@ -16,7 +16,7 @@ Beyond the paper: weights of reflection and transmission are apart, since one fo
 factors, which bend both towards grazing; and Henyey-Greenstein media.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import equinox as eqx
@@ -41,7 +41,8 @@ LN2 = float(np.log(2.0))
 LEVEL = 0.3 / jnp.pi
 """Scale of the constant term."""
 
-MEDIUM_FEATURES, PAIR_FEATURES = 20, 2
+GEOMETRY_FEATURES, PAIR_FEATURES = 12, 2
+MEDIUM_FEATURES = GEOMETRY_FEATURES + 8
 
 
 class Numbers(NamedTuple):
@@ -84,28 +85,34 @@ class Weights(NamedTuple):
 
 def network(media: int, key: Array) -> eqx.nn.MLP:
     """A network for so many media that has learned nothing yet: the second lobe is the first, spread a little."""
-    inputs = media * MEDIUM_FEATURES + (PAIR_FEATURES if media > 1 else 0)
-    outputs = 3 * media + 2 * (2 * media + 3)
+    return perceptron(media * MEDIUM_FEATURES + pair_features(media), 3 * media + 2 * (2 * media + 3), key)
+
+
+def perceptron(inputs: int, outputs: int, key: Array) -> eqx.nn.MLP:
+    """A network that answers next to 0 whatever it is asked."""
     fresh = eqx.nn.MLP(inputs, outputs, WIDTH, DEPTH, activation=jax.nn.silu, key=key)
     last = fresh.layers[-1]
     small = (0.1 * last.weight, jnp.zeros(outputs))
     return eqx.tree_at(lambda net: (net.layers[-1].weight, net.layers[-1].bias), fresh, small)
 
 
-def pack(net: eqx.nn.MLP, media: int) -> dict[str, np.ndarray]:
+def pack(net: eqx.nn.MLP) -> dict[str, np.ndarray]:
     """The network's numbers by name, for a file."""
     return {
-        f"{media}-{n}-{name}": np.asarray(getattr(layer, name), np.float32)
+        f"{n}-{name}": np.asarray(getattr(layer, name), np.float32)
         for n, layer in enumerate(net.layers)
         for name in ("weight", "bias")
     }
 
 
-def unpack(table: Mapping[str, np.ndarray], media: int) -> eqx.nn.MLP:
-    """The network whose numbers `pack` has named, as numpy arrays."""
-    empty = eqx.filter_eval_shape(network, media, jax.random.key(0))
+def unpack(table: Mapping[str, np.ndarray], prefix: str, fresh: Callable[[Array], eqx.nn.MLP]) -> eqx.nn.MLP:
+    """The network whose numbers `pack` has named, as numpy arrays.
+
+    prefix: of the names, with a dash. fresh: makes a network like it, from a key.
+    """
+    empty = eqx.filter_eval_shape(fresh, jax.random.key(0))
     places = [(n, name) for n in range(len(empty.layers)) for name in ("weight", "bias")]
-    numbers = [table[f"{media}-{n}-{name}"] for n, name in places]
+    numbers = [table[f"{prefix}-{n}-{name}"] for n, name in places]
     return eqx.tree_at(lambda net: [getattr(net.layers[n], name) for n, name in places], empty, numbers)
 
 
@@ -113,8 +120,8 @@ def shape_of(net: eqx.nn.MLP, media: Numbers) -> Shape:
     """The second lobe's parameters, from `media` with the mean albedo and f0 of all channels."""
     count = len(media.thickness)
     found = []
-    for order in _orders(count):
-        turned = _in_order(media, order)
+    for order in orders(count):
+        turned = in_order(media, order)
         raw = _answer(net, turned, turned.albedo, turned.f0)[: 3 * count].reshape(count, 3)
         found.append(raw[jnp.asarray(order)])  # an order of two is its own inverse
     raw = sum(found[1:], found[0]) / len(found)
@@ -130,9 +137,9 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
     """The second lobe's strength in one channel. mean_albedo, mean_f0: over all channels, (k,) each."""
     count = len(media.thickness)
     lobes, levels, slopes, rims = [], [], [], []
-    for order in _orders(count):
+    for order in orders(count):
         index = jnp.asarray(order)
-        raw = _answer(net, _in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
+        raw = _answer(net, in_order(media, order), mean_albedo[index], mean_f0[index])[3 * count :]
         strength = jax.nn.softplus(raw.reshape(2, 2 * count + 3))
         lobes.append(strength[:, : 2 * count].reshape(2, count, 2)[:, index])
         levels.append(strength[:, 2 * count])
@@ -151,16 +158,15 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
 
 def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     count = len(media.thickness)
-    features = [_features(Numbers(*(part[k] for part in media)), mean_albedo[k], mean_f0[k]) for k in range(count)]
-    if count > 1:
-        flakes = (1.0 - media.kind[0, 2]) * (1.0 - media.kind[1, 2])
-        cosine = jnp.sum(media.axis[0] * media.axis[1])
-        features.append(flakes * jnp.stack([cosine * cosine, cosine * media.axis[0, 2] * media.axis[1, 2]]))
-    return net(jnp.concatenate(features))
+    features = []
+    for k in range(count):
+        medium = medium_of(media, k)
+        features += [geometry(medium), _optics(medium, mean_albedo[k], mean_f0[k])]
+    return net(jnp.concatenate([*features, *between(media)]))
 
 
-def _features(medium: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
-    """What the network is told of a medium, (MEDIUM_FEATURES,)."""
+def geometry(medium: Numbers) -> Array:
+    """What networks are told of a medium apart from what it absorbs, (GEOMETRY_FEATURES,)."""
     alpha = at_least(medium.alpha, LEAST_ALPHA)
     is_hg = medium.kind[2]
     tilt = (1.0 - is_hg) * medium.axis[2] * medium.axis[2]
@@ -169,9 +175,28 @@ def _features(medium: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     tau = medium.thickness
     numbers = [alpha, 0.5 * jnp.log(alpha), medium.g, medium.g * medium.g, tilt, area]
     numbers += [jnp.log(tau + 1e-2) / 3.0, tau / (1.0 + tau), jnp.exp(-tau * area)]
+    return jnp.concatenate([medium.kind, jnp.stack(numbers)])
+
+
+def between(media: Numbers) -> list[Array]:
+    """What networks are told of how two axes lie to each other, one array or none."""
+    if len(media.thickness) == 1:
+        return []
+    flakes = (1.0 - media.kind[0, 2]) * (1.0 - media.kind[1, 2])
+    cosine = jnp.sum(media.axis[0] * media.axis[1])
+    return [flakes * jnp.stack([cosine * cosine, cosine * media.axis[0, 2] * media.axis[1, 2]])]
+
+
+def pair_features(media: int) -> int:
+    """How many numbers `between` makes."""
+    return PAIR_FEATURES if media > 1 else 0
+
+
+def _optics(medium: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
+    numbers: list[Array] = []
     for albedo, f0 in ((medium.albedo, medium.f0), (mean_albedo, mean_f0)):
         numbers += [2.0 * albedo - 1.0, jnp.sqrt(1.0 - albedo + 1e-3), 2.0 * f0 - 1.0, albedo * f0]
-    return jnp.concatenate([medium.kind, jnp.stack(numbers)])
+    return jnp.stack(numbers)
 
 
 def kept(albedo: Array, f0: Array) -> Array:
@@ -179,10 +204,15 @@ def kept(albedo: Array, f0: Array) -> Array:
     return albedo * (0.1 + 0.9 * f0)
 
 
-def _orders(count: int) -> tuple[tuple[int, ...], ...]:
+def orders(count: int) -> tuple[tuple[int, ...], ...]:
     """The media as they lie, and upside down."""
     return ((0,),) if count == 1 else ((0, 1), (1, 0))
 
 
-def _in_order(media: Numbers, order: tuple[int, ...]) -> Numbers:
+def in_order(media: Numbers, order: tuple[int, ...]) -> Numbers:
     return Numbers(*(part[jnp.asarray(order)] for part in media))
+
+
+def medium_of(media: Numbers, k: int) -> Numbers:
+    """The numbers of one of the media."""
+    return Numbers(*(part[k] for part in media))

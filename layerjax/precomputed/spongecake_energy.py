@@ -1,16 +1,13 @@
-"""Energy of SpongeCake's second lobe, put right (beyond Wang et al. 2022).
+"""What the energy of SpongeCake's second lobe has to be (beyond Wang et al. 2022).
 
 How much light several collisions leave is known of media that absorb nothing: 1 less what passes untouched and what one
-collision scatters. The same media without absorption therefore tell by how much the second lobe is off. It is
-multiplied by c(wi) c(wo), which keeps it reciprocal, with log c a polynomial of the direction on either side,
-
-    log c = sum a_k z^k + terms in cos and sin of the azimuth and of twice the azimuth, in proportion to sin and sin^2,
-
-found by scaling again and again (Sinkhorn) at a few directions, each against all directions of the other end.
+collision scatters. The same media without absorption therefore tell by how much the second lobe is off. The factor c of
+`layerjax.transport.spongecake_bend` is found by scaling again and again (Sinkhorn) at a few directions, each against
+all directions of the other end.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,26 +21,27 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium, optical_depths
 from layerjax.transport.single_scattering import Media, SingleScattering
-from layerjax.transport.spongecake_lobes import Bend, bend_terms, flux, second_lobe
-from layerjax.transport.spongecake_mapping import LEAST_ALPHA, kept
+from layerjax.transport.spongecake_bend import log_bend, terms_of
+from layerjax.transport.spongecake_lobes import flux, has_axes, second_lobe
+from layerjax.transport.spongecake_mapping import LEAST_ALPHA
 
-NODES = 8
-"""Of the quadrature over the other end."""
 
-COSINES, AZIMUTHS = 4, 6
-"""Directions at which energies are balanced, on each side; one azimuth where nothing depends on it."""
+class Rule(NamedTuple):
+    """How finely energies are balanced.
+
+    nodes: of the quadrature over the other end. cosines, azimuths: directions at which energies are balanced, on each
+    side; one azimuth where nothing depends on it. rounds: each halves the logarithm of what is off, as far as the
+    polynomial can follow.
+    """
+
+    nodes: int
+    cosines: int
+    azimuths: int
+    rounds: int
+
 
 BATCH = 8
-"""Directions at a time: what they scatter is found again on the way back, so that no more of it is held."""
-
-ROUNDS = 5
-"""Each halves the logarithm of what is off, as far as the polynomial can follow."""
-
-UPRIGHT = 1e-12
-"""Squared sine of an axis below which it has no azimuth: the square of less has no float32."""
-
-FADING = 4
-"""Power of what survives a collision (in each medium) by which log c fades: what absorbs has errors of its own."""
+"""Directions at a time."""
 
 LEAST = 1e-3
 """Energies much smaller are not put right."""
@@ -52,41 +50,27 @@ STIFFNESS = 1e-4
 """What keeps a coefficient at 0 that the directions do not tell, beside the mean of those they do."""
 
 
-@eqx.filter_jit
-def bend_of(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> Bend:
-    """log c of one medium or two."""
-    thickness = jnp.broadcast_arrays(*(jnp.atleast_1d(jnp.asarray(medium.thickness)) for medium in media))
+class Balance(NamedTuple):
+    """log c of media without absorption at directions wi, and the energy that several collisions leave, (n,) each."""
 
-    def one_channel(thickness: list[Array]) -> Array:
-        return _balanced(tuple(_white(m, tau) for m, tau in zip(media, thickness, strict=True)), networks)
-
-    found = jax.vmap(one_channel)(thickness)
-    return Bend(found, _share(media).astype(found.dtype))
+    wi: Vector
+    energy: Array
+    log: Array
 
 
-def _share(media: tuple[Medium, ...]) -> Array:
-    """Share of log c that counts where light is absorbed, (C or 1,)."""
-    share = jnp.ones(1)
-    for medium in media:
-        f0 = 1.0 if medium.f0 is None else medium.f0
-        share = share * kept(jnp.asarray(medium.albedo), jnp.asarray(f0)) ** FADING
-    return share
-
-
-def _balanced(white: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> Array:
-    """Coefficients of log c, (2 or 1, terms), of media without absorption."""
+def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule: Rule) -> Balance:
+    """Find log c of one medium or two, whatever they absorb."""
+    white = tuple(_white(medium) for medium in media)
     first, second = Media(white, None), second_lobe(white, networks)
-    turning = any(isinstance(medium.phase, SGGX) and medium.phase.axis is not None for medium in white)
-    opposite = len(white) == 1
+    turning, opposite = has_axes(white), len(white) == 1
     dtype = second.weights.levels.dtype
-    wi, weight = _directions(_azimuth(white) if turning else None, opposite, dtype)
+    wi, weight = _directions(rule, _azimuth(white) if turning else None, opposite, dtype)
 
-    @jax.checkpoint
     def one(wi: Vector) -> tuple[Array, list[tuple[Array, Array]]]:
-        near, far = SingleScattering().albedo(first, wi, NODES)
+        near, far = SingleScattering().albedo(first, wi, rule.nodes)
         depths = [depth for (depth,) in optical_depths(white, wi)]
         wanted = 1.0 - near[0] - far[0] - jnp.exp(-sum(depths[1:], depths[0]))
-        there = [(_terms(wo, turning, opposite), value) for wo, (value,) in flux(second, wi, NODES, opaque=False)]
+        there = [(_terms(wo, turning, opposite), value) for wo, (value,) in flux(second, wi, rule.nodes, opaque=False)]
         # nodes that follow a lobe come in double precision where there is any
         return jax.tree.map(lambda x: x.astype(dtype), (at_least(wanted, 0.0), there))
 
@@ -103,16 +87,16 @@ def _balanced(white: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP]) -> 
         apart = jnp.tanh(jnp.log((wanted + LEAST) / (found + LEAST)))
         return coefficients + 0.5 * solution @ apart, None
 
-    coefficients, _ = jax.lax.scan(again, jnp.zeros(here.shape[-1], dtype), length=ROUNDS)
-    return coefficients.reshape(1 if opposite else 2, -1)
+    coefficients, _ = jax.lax.scan(again, jnp.zeros(here.shape[-1], dtype), length=rule.rounds)
+    return Balance(wi, wanted, here @ coefficients)
 
 
-def _white(medium: Medium, thickness: Array) -> Medium:
+def _white(medium: Medium) -> Medium:
     """The same without absorption, and with lobes no narrower than any that the networks know."""
     phase = medium.phase
     if isinstance(phase, SGGX):
         phase = SGGX(phase.kind, at_least(jnp.asarray(phase.alpha), LEAST_ALPHA), phase.axis)
-    white = Medium(thickness, 1.0, phase)
+    white = Medium(medium.thickness, 1.0, phase)
     return eqx.tree_at(lambda m: m.albedo, white, 1.0)  # known: nothing to multiply by
 
 
@@ -124,14 +108,13 @@ def _azimuth(media: tuple[Medium, ...]) -> Array:
             x, y, _ = medium.phase.axis
             share = 0.5**k  # so that two at right angles do not cancel
             across, along = across + share * 2.0 * x * y, along + share * (x * x - y * y)
-    upright = jnp.abs(across) + jnp.abs(along) < UPRIGHT
-    return 0.5 * jnp.arctan2(jnp.where(upright, 0.0, across), jnp.where(upright, 1.0, along))
+    return 0.5 * jnp.arctan2(across, along)
 
 
-def _directions(azimuth: Array | None, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
+def _directions(rule: Rule, azimuth: Array | None, opposite: bool, dtype: Any) -> tuple[Vector, Array]:
     """Where energies are balanced, above and (unless the same there) below, with weights of their cosine."""
-    x, w = gauss_legendre(COSINES)
-    count = 1 if azimuth is None else AZIMUTHS
+    x, w = gauss_legendre(rule.cosines)
+    count = 1 if azimuth is None else rule.azimuths
     sides = [1.0] if opposite else [1.0, -1.0]
     turns = (np.arange(count) + 0.5) * (2.0 * np.pi / count)
     side, z, turn = (array.ravel() for array in np.meshgrid(sides, x, turns, indexing="ij"))
@@ -142,8 +125,9 @@ def _directions(azimuth: Array | None, opposite: bool, dtype: Any) -> tuple[Vect
 
 
 def _terms(w: Vector, turning: bool, opposite: bool) -> Array:
-    """The terms, (..., terms); where sides differ, above and below, 0 on the side where w is not."""
-    terms = jnp.stack(bend_terms(w, turning, opposite), axis=-1)
+    """What log c is a sum of, (..., terms); where sides differ, for above and below, 0 on the side where w is not."""
+    each = jnp.eye(terms_of(turning), dtype=w[2].dtype)
+    terms = jax.vmap(lambda coefficients: log_bend(coefficients, w, opposite), out_axes=-1)(each)
     if opposite:
         return terms
     above = (w[2] > 0)[..., None]
