@@ -32,7 +32,7 @@ def panels(edges: Array, nodes: int) -> tuple[Array, Array]:
 
     The edges are where an integrand kinks or, towards grazing, changes quickly.
     """
-    s, w = gauss_legendre(nodes)
+    s, w = (jnp.asarray(array, edges.dtype) for array in gauss_legendre(nodes))
     smooth, slope = s * s * (3.0 - 2.0 * s), 6.0 * s * (1.0 - s)
     begin, length = edges[..., :-1, None], jnp.diff(edges)[..., None]
     shape = (*edges.shape[:-1], -1)
@@ -41,7 +41,7 @@ def panels(edges: Array, nodes: int) -> tuple[Array, Array]:
 
 def hemisphere_rule(wi: Vector, nodes: int) -> Nodes:
     """Nodes over the upper hemisphere, split where theta_o = theta_i and where the azimuth differs by +-pi/2."""
-    s, w = gauss_legendre(nodes)
+    s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
     psi, w_psi = panels(_half_turns(wi[2].dtype), nodes)
     planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])[..., None, None]
     theta_i = jnp.arctan2(planar, jnp.abs(wi[2])[..., None, None])
@@ -86,7 +86,7 @@ def flake_rule(wi: Vector, radial: Array, axial: Array, axis: Vector | None, nod
     last = jnp.arctan2(dot(v, pole), -dot(v, e))  # wi . m = 0
 
     def segment(begin: Array, end: Array) -> Nodes:
-        s, w = gauss_legendre(nodes)
+        s, w = (jnp.asarray(array, begin.dtype) for array in gauss_legendre(nodes))
         begin, length = begin[..., None], (end - begin)[..., None]
         t = begin + length * s
         y = combine(jnp.cos(t), _expand(pole, 1), jnp.sin(t), _expand(e, 1))
@@ -127,7 +127,7 @@ def henyey_greenstein_rule(wi: Vector, g: Array, nodes: int) -> Rule:
 
     def segment(pole: float, end: Array) -> Nodes:
         # s runs as a square from the pole, where the direction depends on the root of s
-        t, w = gauss_legendre(nodes)
+        t, w = (jnp.asarray(array, end.dtype) for array in gauss_legendre(nodes))
         length = (end - pole)[..., None]
         c, sine = henyey_greenstein_inverse(g, pole + length * t * t)
         wo = add(scale(c, _expand(axis, 1)), scale(sine, _expand(e, 1)))

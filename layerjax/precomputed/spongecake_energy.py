@@ -71,8 +71,7 @@ def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule:
         depths = [depth for (depth,) in optical_depths(white, wi)]
         wanted = 1.0 - near[0] - far[0] - jnp.exp(-sum(depths[1:], depths[0]))
         there = [(_terms(wo, turning, opposite), value) for wo, (value,) in flux(second, wi, rule.nodes, opaque=False)]
-        # nodes that follow a lobe come in double precision where there is any
-        return jax.tree.map(lambda x: x.astype(dtype), (at_least(wanted, 0.0), there))
+        return at_least(wanted, 0.0), there
 
     wanted, there = jax.lax.map(one, wi, batch_size=BATCH)
     here = _terms(wi, turning, opposite)
