@@ -8,7 +8,7 @@ square.
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -83,7 +83,7 @@ def shard(number: int, media: int, nets: Mapping[int, eqx.nn.MLP], seed: int) ->
         given = {name: jnp.asarray(array, jnp.float32) for name, array in vars(layers).items() if name != "kind"}
         wi, energy, log = _balances(names, nets, given)
     turns = RULE.azimuths if set(names) == {"hg"} else 1  # as many directions for all
-    return Bent(numbers_of(layers), *(np.repeat(part, turns, axis=1) for part in (wi, energy, log)))  # type: ignore
+    return Bent(numbers_of(layers), *(cast(Array, np.repeat(part, turns, axis=1)) for part in (wi, energy, log)))
 
 
 def train(
