@@ -151,7 +151,10 @@ def shard(number: int, media: int, split: Split, seed: int) -> Samples:
 def draw_layers(
     random: np.random.Generator, media: int, count: int, widths: dict[bool, tuple[float, float]] = WIDTHS
 ) -> tuple[Layers, bool]:
-    """Parameters of `count` materials of one structure, and whether any of their media has an axis of its own."""
+    """Parameters of `count` materials of one structure, and whether any of their media has an axis of its own.
+
+    widths: range of alpha, as `WIDTHS`.
+    """
     kinds = random.choice(len(KINDS), size=media, p=SHARES)
     tilted = (kinds != KINDS.index("hg")) & (random.uniform(size=media) < TILTED)
     size = (count, media)

@@ -41,7 +41,7 @@ FADING = 4
 """Power of what survives a collision (in each medium) by which c - 1 fades."""
 
 LARGEST = 3.0
-"""Of a coefficient that the network answers with, before it is a polynomial's."""
+"""Bound of what the network answers, coefficients of Legendre's polynomials: no factor overflows."""
 
 
 class Bend(eqx.Module):

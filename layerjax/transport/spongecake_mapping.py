@@ -108,7 +108,7 @@ def pack(net: eqx.nn.MLP) -> dict[str, np.ndarray]:
 def unpack(table: Mapping[str, np.ndarray], prefix: str, fresh: Callable[[Array], eqx.nn.MLP]) -> eqx.nn.MLP:
     """The network whose numbers `pack` has named, as numpy arrays.
 
-    prefix: of the names, with a dash. fresh: makes a network like it, from a key.
+    prefix: what stands before the names and a dash. fresh: makes a network like it, from a key.
     """
     empty = eqx.filter_eval_shape(fresh, jax.random.key(0))
     places = [(n, name) for n in range(len(empty.layers)) for name in ("weight", "bias")]
