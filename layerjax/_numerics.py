@@ -4,6 +4,9 @@ Every guard here sanitises the *input* of the branch that is not taken (with an 
 selects: a clamp or a ``where`` after the fact still gives NaN gradients.
 """
 
+import math
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -32,9 +35,8 @@ def decay_between(a: Array, b: Array) -> Array:
     difference, middle = a - b, 0.5 * (a + b)
     near = jnp.abs(difference) < 1.0
     square = jnp.where(near, 0.25 * difference * difference, 0.25)
-    total = jnp.ones_like(square)
-    for n in range(7, 0, -1):  # sinh(x) / x
-        total = 1.0 + square * total * (1.0 / (2 * n * (2 * n + 1)))
+    terms = 7 if jnp.finfo(square.dtype).bits == 64 else 4
+    total = _horner([1.0 / math.factorial(2 * n + 1) for n in range(terms)], square)  # sinh(x) / x
     smaller, apart = jnp.where(a < b, a, b), jnp.where(near, 2.0, jnp.abs(difference))
     ratio = jnp.where(near, total, (1.0 - jnp.exp(-apart)) / apart)
     return jnp.exp(-jnp.where(near, middle, smaller)) * ratio
@@ -89,9 +91,14 @@ def horizon(dtype: jnp.dtype) -> float:
 
 
 def _series(x: Array) -> Array:
-    # sum of (-x)^n / (n + 1)!; the first term left out is below half a unit of rounding at SERIES_LIMIT
-    terms = 13 if jnp.finfo(x.dtype).bits == 64 else 7
-    total = jnp.ones_like(x)
-    for n in range(terms, 1, -1):
-        total = 1.0 - (x * (1.0 / n)) * total
+    """Sum of (-x)^n / (n + 1)!; what is left out is below half a unit of rounding up to SERIES_LIMIT."""
+    terms = 12 if jnp.finfo(x.dtype).bits == 64 else 7
+    return _horner([(-1.0) ** n / math.factorial(n + 1) for n in range(terms)], x)
+
+
+def _horner(coefficients: Sequence[float], x: Array) -> Array:
+    """Polynomial in x, from the coefficients of its powers."""
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + x * total
     return total
