@@ -16,7 +16,7 @@ from benchmarks.timing import interleaved
 Side = Literal["all", "reflection"]
 
 PAIRS, QUICK_PAIRS = 100_000, 2_000
-ROUNDS = 40
+ROUNDS = 300
 SIDES: tuple[Side, ...] = ("all", "reflection")
 FLAKES = lj.Medium(2.0, [0.95, 0.8, 0.4], lj.SGGX("surface", 0.4, (0.3, 0.1, 0.9)), f0=0.6)
 FIBERS = lj.Medium(1.5, 0.9, lj.SGGX("fiber", 0.3, (1.0, 0.2, 0.0)))

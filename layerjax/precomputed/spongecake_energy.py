@@ -21,7 +21,7 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium, optical_depths
 from layerjax.transport.single_scattering import Media, SingleScattering
-from layerjax.transport.spongecake_bend import log_bend, terms_of
+from layerjax.transport.spongecake_bend import polynomial, terms_of
 from layerjax.transport.spongecake_lobes import flux, has_axes, second_lobe
 from layerjax.transport.spongecake_mapping import LEAST_ALPHA
 
@@ -126,7 +126,7 @@ def _directions(rule: Rule, azimuth: Array | None, opposite: bool, dtype: Any) -
 def _terms(w: Vector, turning: bool, opposite: bool) -> Array:
     """What log c is a sum of, (..., terms); where sides differ, for above and below, 0 on the side where w is not."""
     each = jnp.eye(terms_of(turning), dtype=w[2].dtype)
-    terms = jax.vmap(lambda coefficients: log_bend(coefficients, w, opposite), out_axes=-1)(each)
+    terms = jax.vmap(lambda coefficients: polynomial(coefficients, w, opposite), out_axes=-1)(each)
     if opposite:
         return terms
     above = (w[2] > 0)[..., None]

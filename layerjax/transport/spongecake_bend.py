@@ -1,9 +1,11 @@
 """A factor of either direction that puts the energy of SpongeCake's second lobe right (beyond Wang et al. 2022).
 
-The second lobe is multiplied by c(wi) c(wo), which keeps it reciprocal, with log c a polynomial of the direction on
-either side,
+The second lobe is multiplied by c(wi) c(wo), which keeps it reciprocal, with c a power of a polynomial of the
+direction on either side,
 
-    log c = sum a_k z^k + terms in cos and sin of the azimuth and of twice the azimuth, in proportion to sin and sin^2.
+    c = r^16,   r = sum a_k z^k + terms in cos and sin of the azimuth and of twice it, in proportion to sin and sin^2,
+
+which is next to exp(16 (r - 1)), never negative, and costs no exponential.
 
 Media without absorption tell what c has to be (`layerjax.precomputed.spongecake_energy`); a network has learned it from
 them (`layerjax.precomputed.spongecake_bending`). Where light is absorbed less of c counts: what absorbs has errors of
@@ -34,18 +36,21 @@ from layerjax.transport.spongecake_mapping import (
     perceptron,
 )
 
+POWER = 16
+"""c is this power of a polynomial: even, and one of 2."""
+
 DEGREE = 3
-"""Of log c in the cosine."""
+"""Of the polynomial in the cosine."""
 
 FADING = 4
 """Power of what survives a collision (in each medium) by which c - 1 fades."""
 
 LARGEST = 3.0
-"""Bound of what the network answers, coefficients of Legendre's polynomials: no factor overflows."""
+"""Bound of what the network answers, `POWER` times coefficients of Legendre's polynomials: no factor overflows."""
 
 
 class Bend(eqx.Module):
-    """log c: coefficients, as `log_bend` takes them, for light from above and below, (C or 1, 2 or 1, terms).
+    """c: coefficients of its root, as `polynomial` takes them, for light from above and below, (C or 1, 2 or 1, terms).
 
     One medium looks the same from opposite directions, and has one set. share: what counts of c - 1, (C or 1,).
     """
@@ -63,8 +68,8 @@ def share_of(media: tuple[Medium, ...]) -> Array:
     return share
 
 
-def log_bend(coefficients: Array | Sequence[Array], w: Vector, opposite: bool) -> Array:
-    """log c of a direction, from one set of coefficients; `opposite`: the same for opposite directions."""
+def polynomial(coefficients: Array | Sequence[Array], w: Vector, opposite: bool) -> Array:
+    """The polynomial of a direction, from one set of coefficients; `opposite`: the same for opposite directions."""
     x, y, z = w[0], w[1], jnp.abs(w[2])
     turning = len(coefficients) > DEGREE + 1
     if turning and opposite:
@@ -85,7 +90,7 @@ def bend_network(media: int, key: Array) -> eqx.nn.MLP:
 
 
 def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
-    """Coefficients of log c, (2 or 1, terms), by the network. `turning`: any of the media has an axis.
+    """Coefficients of the root of c, (2 or 1, terms), by the network. `turning`: any of the media has an axis.
 
     Azimuths enter by invariants of direction and axis a alone: (w_h . a_h) a_z, and (w_h . a_h)^2 less its mean.
     """
@@ -94,37 +99,37 @@ def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
     for side, order in zip((1.0, -1.0), orders(count), strict=False):
         turned = in_order(media, order)
         raw = net(jnp.concatenate([*(geometry(medium_of(turned, k)) for k in range(count)), *between(turned)]))
-        raw = LARGEST * jnp.tanh(raw / LARGEST)
+        raw = LARGEST / POWER * jnp.tanh(raw / LARGEST)
         level, azimuthal = raw[: DEGREE + 1], raw[DEGREE + 1 :].reshape(count, -1)
-        parts = [_polynomial(level)]
+        parts = [_powers(level).at[0].add(1.0)]
         if turning:
             once, twice = azimuthal[:, :DEGREE], azimuthal[:, DEGREE:]
             x, y, z = turned.axis[:, 0], turned.axis[:, 1], side * turned.axis[:, 2]
             flakes = 1.0 - turned.kind[:, 2]
             for turn, each in ((x * z, once), (y * z, once), (0.5 * (x * x - y * y), twice), (x * y, twice)):
-                parts.append(_polynomial((flakes * turn) @ each))
+                parts.append(_powers((flakes * turn) @ each))
         sides.append(jnp.concatenate(parts))
     return jnp.stack(sides)
 
 
 def factors(bend: Bend, wi: Vector, wo: Vector, from_above: bool) -> Channels:
     """c of both directions, as far as it counts. from_above: both are above."""
-    gains = tuple(jnp.exp(_log(sides, wi, from_above) + _log(sides, wo, from_above)) for sides in bend.coefficients)
+    gains = tuple((_root(sides, wi, from_above) * _root(sides, wo, from_above)) ** POWER for sides in bend.coefficients)
     shares = per_channel(bend.share)
     channels = max(len(gains), len(shares))
     return tuple(1.0 - pick(shares, c) + pick(shares, c) * pick(gains, c) for c in range(channels))
 
 
-def _log(sides: Array, w: Vector, from_above: bool) -> Array:
-    """log c of a direction, from its coefficients, (2 or 1, terms)."""
+def _root(sides: Array, w: Vector, from_above: bool) -> Array:
+    """Root of c of a direction, from its coefficients, (2 or 1, terms)."""
     if len(sides) == 1 or from_above:
-        return log_bend(sides[0], w, not from_above)
+        return polynomial(sides[0], w, not from_above)
     above = w[2] > 0
-    return log_bend([jnp.where(above, high, low) for high, low in zip(*sides, strict=True)], w, False)
+    return polynomial([jnp.where(above, high, low) for high, low in zip(*sides, strict=True)], w, False)
 
 
 def terms_of(turning: bool) -> int:
-    """How many coefficients log c has for light from one side; `turning`: any of the media has an axis."""
+    """How many coefficients the polynomial has for light from one side; `turning`: any of the media has an axis."""
     return sum(degree + 1 for degree in _degrees(turning))
 
 
@@ -138,7 +143,7 @@ def _azimuthal() -> int:
     return DEGREE + DEGREE - 1
 
 
-def _polynomial(values: Array) -> Array:
+def _powers(values: Array) -> Array:
     """Coefficients of the powers of a cosine, from those of Legendre's polynomials over it."""
     rows = np.zeros((len(values), len(values)))
     for k in range(len(values)):

@@ -23,6 +23,8 @@ STACKS = {
     "flakes over fibers": lj.Stack([FLAKES, FIBERS]),
 }
 CAKE, FIRST, TRUTH = lj.SpongeCake(), lj.SingleScattering(), lj.AddingDoubling()
+OFF = {1: 0.02, 2: 0.06}
+"""By how much albedos of lossless slabs are off for 5 in 100 materials never seen, as SpongeCake's docstring has it."""
 
 
 def pairs(n=400, seed=3):
@@ -72,13 +74,13 @@ def test_turned_about_the_normal_is_the_same():
 
 @pytest.mark.parametrize("name", ["haze", "flakes over fibers"])
 def test_white_where_nothing_absorbs(name):
-    """Within 8 %, the bar for the 95th percentile of many materials; what absorbs much is left as it is learned."""
+    """As exact as 95 of 100 materials never seen; what absorbs much is left as it is learned."""
     medium = STACKS[name].layers
     white = lj.Stack([lj.Medium(jnp.mean(m.thickness), 1.0, m.phase) for m in medium])
     theta = np.deg2rad([0.0, 30.0, 50.0, 70.0, 80.0])
     for light in (lj.direction(theta, 0.4), lj.direction(np.pi - theta, 2.0)):
         energy = sum(lj.albedo(white, light, CAKE, nodes=16)) + lj.unscattered(white, light)
-        np.testing.assert_allclose(energy, 1.0, atol=0.08)
+        np.testing.assert_allclose(energy, 1.0, atol=OFF[len(medium)])
     wi, wo = pairs(50)
     np.testing.assert_allclose(lj.evaluate(white, wi, wo, CAKE), lj.evaluate(white, wo, wi, CAKE), rtol=1e-10)
     ready = lj.prepare(lj.Stack([lj.Medium(m.thickness, 0.2, m.phase) for m in medium]), CAKE)
@@ -101,7 +103,7 @@ def test_energies_of_channels_are_apart():
     """Each channel's energy is right as if it were alone, but for the shape of the lobe, which follows their mean."""
     stack = lj.Stack([lj.Medium([6.0, 1.0], 1.0, lj.HenyeyGreenstein(0.5))])
     light = lj.direction(np.deg2rad([0.0, 30.0, 50.0, 70.0, 80.0]), 0.4)
-    np.testing.assert_allclose(sum(lj.albedo(stack, light, CAKE)) + lj.unscattered(stack, light), 1.0, atol=0.08)
+    np.testing.assert_allclose(sum(lj.albedo(stack, light, CAKE)) + lj.unscattered(stack, light), 1.0, atol=OFF[1])
 
 
 def test_gray_channels_are_one():
@@ -223,7 +225,7 @@ def test_refusals():
 @pytest.mark.parametrize("side", ["all", "reflection"])
 def test_costs_one_more_lobe_and_a_constant(name, side):
     """Twice the operations of single scattering, what picks weights by side and channel, and a polynomial of either
-    direction: 3.2 times at most.
+    direction: 3.4 times at most.
 
     The bar, 2.2, is one of time, which is not asserted.
     """
@@ -233,7 +235,7 @@ def test_costs_one_more_lobe_and_a_constant(name, side):
         prepared = lj.prepare(STACKS[name], how)
         return sum(count(lambda wi, wo: lj.evaluate(prepared, wi, wo, side=side), wi, wo).values())
 
-    assert operations(CAKE) < 3.2 * operations(FIRST)
+    assert operations(CAKE) < 3.4 * operations(FIRST)
 
 
 def test_albedo_of_upright_fibers_at_normal_incidence_in_float32():
