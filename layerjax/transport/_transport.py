@@ -69,6 +69,6 @@ def refuse_vmf(stack: Stack, transport: str) -> None:
     place = place_of_vmf(stack)
     if place is not None:
         raise ValueError(
-            f'{place}: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with microfacets="single" do, '
-            "and ENDF for metals, coated metals and slabs"
+            f'{place}: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with microfacets="single" '
+            "do, and ENDF for metals, coated metals and slabs"
         )
