@@ -4,8 +4,10 @@ Every guard here sanitises the *input* of the branch that is not taken (with an 
 selects: a clamp or a ``where`` after the fact still gives NaN gradients.
 """
 
+import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +37,8 @@ def decay_between(a: Array, b: Array) -> Array:
     difference, middle = a - b, 0.5 * (a + b)
     near = jnp.abs(difference) < 1.0
     square = jnp.where(near, 0.25 * difference * difference, 0.25)
-    terms = 7 if jnp.finfo(square.dtype).bits == 64 else 4
-    total = _horner([1.0 / math.factorial(2 * n + 1) for n in range(terms)], square)  # sinh(x) / x
+    terms = 7 if jnp.finfo(square.dtype).bits == 64 else 4  # what is left out is below half a unit of rounding
+    total = horner([1.0 / math.factorial(2 * n + 1) for n in range(terms)], square)  # sinh(x) / x
     smaller, apart = jnp.where(a < b, a, b), jnp.where(near, 2.0, jnp.abs(difference))
     ratio = jnp.where(near, total, (1.0 - jnp.exp(-apart)) / apart)
     return jnp.exp(-jnp.where(near, middle, smaller)) * ratio
@@ -54,6 +56,11 @@ def at_least(x: Array, low: Array | float) -> Array:
 def at_most(x: Array, high: Array | float) -> Array:
     """x, or `high` (with derivative 0 in x) where x is larger."""
     return jnp.where(x < high, x, high)
+
+
+def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:
+    """Polynomial in x, from the coefficients of its powers: numbers, or arrays that broadcast with x."""
+    return functools.reduce(lambda total, coefficient: coefficient + x * total, coefficients[::-1])
 
 
 def exprel(x: Array) -> Array:
@@ -93,12 +100,4 @@ def horizon(dtype: jnp.dtype) -> float:
 def _series(x: Array) -> Array:
     """Sum of (-x)^n / (n + 1)!; what is left out is below half a unit of rounding up to SERIES_LIMIT."""
     terms = 12 if jnp.finfo(x.dtype).bits == 64 else 7
-    return _horner([(-1.0) ** n / math.factorial(n + 1) for n in range(terms)], x)
-
-
-def _horner(coefficients: Sequence[float], x: Array) -> Array:
-    """Polynomial in x, from the coefficients of its powers."""
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in coefficients[-2::-1]:
-        total = coefficient + x * total
-    return total
+    return horner([(-1.0) ** n / math.factorial(n + 1) for n in range(terms)], x)

@@ -12,7 +12,6 @@ them (`layerjax.precomputed.spongecake_bending`). Where light is absorbed less o
 its own.
 """
 
-import functools
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._numerics import horner
 from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector
 from layerjax.stack import Medium
@@ -37,7 +37,7 @@ from layerjax.transport.spongecake_mapping import (
 )
 
 POWER = 16
-"""c is this power of a polynomial: even, and one of 2."""
+"""c is this power of a polynomial. Even: c is never negative; a power of two: four products make it."""
 
 DEGREE = 3
 """Of the polynomial in the cosine."""
@@ -78,7 +78,7 @@ def polynomial(coefficients: Array | Sequence[Array], w: Vector, opposite: bool)
     factors = [None, x, y, x * x - y * y, 2.0 * x * y] if turning else [None]
     found, first = jnp.zeros_like(z), 0
     for factor, degree in zip(factors, _degrees(turning), strict=True):
-        part = functools.reduce(lambda sum, value: sum * z + value, coefficients[first : first + degree + 1][::-1])
+        part = horner(coefficients[first : first + degree + 1], z)
         found, first = part if factor is None else found + factor * part, first + degree + 1
     return found
 

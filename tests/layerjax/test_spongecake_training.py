@@ -143,6 +143,27 @@ def test_energies_are_balanced_once_and_always_the_same(tmp_path, monkeypatch):
     assert curve[-1] < curve[0]
 
 
+def test_what_is_learned_from_is_never_tested_with(monkeypatch):
+    """Materials of one number, seed and count of media are drawn from streams of their own, whatever they are for."""
+    streams = []
+
+    def stop(random, *_):
+        streams.append(random.bit_generator.state["state"]["state"])
+        raise InterruptedError
+
+    monkeypatch.setattr(data, "draw_layers", stop)
+    monkeypatch.setattr(bending, "draw_layers", stop)
+    for number in range(2):
+        for drawn in (
+            lambda number: data.shard(number, 1, "train", 7),
+            lambda number: data.shard(number, 1, "test", 7),
+            lambda number: bending.shard(number, 1, {}, 7),
+        ):
+            with pytest.raises(InterruptedError):
+                drawn(number)
+    assert len(set(streams)) == 6
+
+
 @pytest.mark.slow
 def test_a_short_run_makes_a_table_like_the_one_that_ships(tmp_path):
     """Data and training from end to end. Errors fall as more is learned from: 64 materials give 10 to 40 %."""
