@@ -60,9 +60,11 @@ class Lobe:
         x = (self.x[:-1, None] + dx * inner).ravel()
         y = (self.y[:-1, None] + dy * inner).ravel()
         squared = x[:, None] ** 2 + y**2
-        z = np.sqrt(np.where(squared < 1.0, 1.0 - squared, 1.0))
-        directions = np.stack(np.broadcast_arrays(x[:, None], y[None], z), axis=-1).reshape(-1, 3)
-        values = np.where(squared < 1.0, np.asarray(brdf(directions)).reshape(squared.shape), 0.0)
+        above = squared < 1.0
+        z = np.sqrt(np.where(above, 1.0 - squared, 1.0))
+        directions = np.stack(np.broadcast_arrays(x[:, None], y[None], z), axis=-1)
+        directions = np.where(above[..., None], directions, [0.0, 0.0, 1.0]).reshape(-1, 3)
+        values = np.where(above, np.asarray(brdf(directions)).reshape(squared.shape), 0.0)
         shape = len(self.x) - 1, points, len(self.y) - 1, points
         found = values.reshape(shape).mean(axis=(1, 3)) * dx * dy  # cos d omega = dx dy
         return float(np.sum(np.abs(found - self.energies)) / np.sum(self.energies))

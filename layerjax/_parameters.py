@@ -85,8 +85,8 @@ def floating(name: str, value: Any) -> jax.Array:
                 raise TypeError
             array = array.astype(jnp.result_type(float))
         return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: {value!r} is not a number or an array of real numbers") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: {value!r:.60} is not a number or an array of real numbers") from None
 
 
 def _shaped(name: str, value: Any) -> jax.Array:

@@ -29,14 +29,14 @@ def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
 
     `theta` and `phi` broadcast; the result has shape ``broadcast(theta, phi) + (3,)``. theta > pi/2 points below.
     """
-    theta, phi = jnp.broadcast_arrays(_real(theta), _real(phi))
+    theta, phi = jnp.broadcast_arrays(real_array("theta", theta), real_array("phi", phi))
     sin_theta = jnp.sin(theta)
     return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:
     """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions of shape ``(..., 3)``, in radians."""
-    x, y, z = split(_real(w))
+    x, y, z = split(real_array("w", w))
     planar = x * x + y * y
     at_pole = planar == 0  # the azimuth is undefined there: give 0, with gradient 0
     azimuth = jnp.where(at_pole, 0.0, jnp.arctan2(jnp.where(at_pole, 0.0, y), jnp.where(at_pole, 1.0, x)))
@@ -95,6 +95,14 @@ def normalize(a: Vector) -> Vector:
     )
 
 
+def tangent(a: Vector) -> Vector:
+    """The unit vector in the tangent plane (z = 0) below or above a, +x if a has no azimuth."""
+    squared = a[0] * a[0] + a[1] * a[1]
+    leans = squared > 0
+    inverse = 1.0 / jnp.sqrt(jnp.where(leans, squared, 1.0))
+    return jnp.where(leans, a[0] * inverse, 1.0), jnp.where(leans, a[1] * inverse, 0.0), jnp.zeros_like(squared)
+
+
 def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vector, Array]:
     """Half vector h of wi and wo, and the cosine |wi . h|.
 
@@ -149,6 +157,14 @@ def frame(n: Vector) -> tuple[Vector, Vector]:
     return tangent, bitangent
 
 
-def _real(value: ArrayLike) -> Array:
-    array = jnp.asarray(value)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+def real_array(name: str, value: ArrayLike) -> Array:
+    """The value as an array of a floating type; a ValueError for one that is not made of real numbers."""
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name}: {value!r:.60} is not an array of real numbers") from None
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise ValueError(f"{name}: numbers of type {array.dtype} given, real ones needed")
+    return array.astype(jnp.result_type(float))

@@ -13,12 +13,13 @@ from typing import Any, Literal, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels, pick
-from layerjax.directions import Vector, split
+from layerjax.directions import Vector, dot, real_array, select, split, tangent
 from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
@@ -28,6 +29,9 @@ CHUNK_BYTES = 20_000
 
 BLOCK_CHUNKS = 4
 """Chunks that are transposed together."""
+
+UNIT_SLACK = 2e-3
+"""What the squared length of a direction may differ from 1: directions come rounded from files."""
 
 
 class Prepared(eqx.Module):
@@ -45,8 +49,9 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
         stack: the layered material.
         transport: how light is carried. ``"auto"``: `SingleScattering` where no `Interface` is, which is exact to the
             first order and costs least; ``Statistical(microfacets="single")`` for one `Interface` over a `Lambertian`
-            with media beside it that only absorb, exact but for 5e-3 (2e-2 where the index steps down) and several
-            times faster than `AddingDoubling`, which takes all else.
+            with media beside it that only absorb, exact but for 5e-3 (where the index steps down and light meets it
+            beyond the critical angle, for 5 % of the little that passes) and several times faster than
+            `AddingDoubling`, which takes all else.
 
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
@@ -72,7 +77,9 @@ def evaluate(
 
     Args:
         stack: the layered material, or what `prepare` made of it (`transport` is then the one it was prepared for).
-        wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface.
+        wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface. Concrete ones that
+            are not of unit length are refused; traced ones (under `jit`, `grad`, `vmap`) cannot be, and give wrong
+            numbers.
         wo: unit directions towards the viewer, shape ``(..., 3)``. Same side as wi: reflection; opposite: transmission.
         transport: see `prepare`.
         side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
@@ -134,7 +141,7 @@ def sample(
     Returns:
         ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf``
         of shape ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have
-        weight 0.
+        weight 0, and a direction in the tangent plane if they have none.
     """
     (wi,) = read_directions(wi=wi)
     return _sample(_prepared(stack, transport, wi.dtype), wi, key)
@@ -191,6 +198,8 @@ def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side) -> Array:
 @eqx.filter_jit
 def _estimate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array) -> tuple[Array, Array]:
     batch = jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]
+    if 0 in batch:
+        return (jnp.zeros((*batch, prepared.channels), wi.dtype),) * 2
     pairs = (jnp.broadcast_to(w, (*batch, 3)).reshape(-1, 3) for w in (wi, wo))
     i, o = map(split, pairs)
     values, errors = prepared.transport.estimate(prepared.state, i, o, side, prepared.channels, key)
@@ -199,6 +208,8 @@ def _estimate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array) 
 
 @eqx.filter_jit
 def _estimate_albedo(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array]:
+    if 0 in wi.shape:
+        return (jnp.zeros((*wi.shape[:-1], prepared.channels), wi.dtype),) * 2
     values, _ = prepared.transport.estimate_albedo(prepared.state, split(wi.reshape(-1, 3)), prepared.channels, key)
     near, far = jnp.split(values, 2, axis=-1)
     return near.reshape(*wi.shape[:-1], -1), far.reshape(*wi.shape[:-1], -1)
@@ -209,8 +220,11 @@ def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Ar
     transport, state = prepared.transport, prepared.state
 
     def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
-        wo = transport.sample(state, wi, uniforms)
-        density = transport.pdf(state, wi, wo)
+        drawn = transport.sample(state, wi, uniforms)
+        # what leaves nowhere may be no unit vector: it becomes a direction in the tangent plane, where the BSDF is 0
+        left = jnp.abs(dot(drawn, drawn) - 1.0) < UNIT_SLACK
+        wo = select(left, drawn, tangent(drawn))
+        density = jnp.where(left, transport.pdf(state, wi, wo), 0.0)
         if transport.random:
             return (*wo, density)
         values = transport.evaluate(state, wi, wo, "all")
@@ -242,6 +256,8 @@ def _albedo(prepared: Prepared, wi: Array, nodes: int) -> tuple[Array, Array]:
         return near, far
 
     batch = wi.shape[:-1]
+    if 0 in batch:
+        return (jnp.zeros((*batch, prepared.channels), wi.dtype),) * 2
     near, far = jax.lax.map(one, wi.reshape(-1, 3))
     return near.reshape(*batch, -1), far.reshape(*batch, -1)
 
@@ -322,13 +338,32 @@ def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
 
 
 def read_directions(**named: ArrayLike) -> list[Array]:
-    arrays = []
-    for name, value in named.items():
-        array = jnp.asarray(value)
-        if array.ndim < 1 or array.shape[-1] != 3:
-            raise ValueError(f"{name}: shape {array.shape} given, (..., 3) needed")
-        arrays.append(array)
-    dtype = jnp.result_type(*arrays)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
-    return [array.astype(dtype) for array in arrays]
+    """Directions as arrays of one floating type; a ValueError that says what they are if they are none.
+
+    Concrete ones must be of unit length (within 1e-3). Traced ones have no length yet: it is up to the caller.
+    """
+    with jax.ensure_compile_time_eval():  # what is known while a program is traced is looked at as well
+        arrays = [real_array(name, value) for name, value in named.items()]
+        for name, array in zip(named, arrays, strict=True):
+            if array.ndim < 1 or array.shape[-1] != 3:
+                raise ValueError(f"{name}: shape {array.shape} given, (..., 3) needed")
+        for name, array in zip(named, arrays, strict=True):
+            if array.size and not isinstance(array, jax.core.Tracer):
+                _require_unit(name, array)
+        dtype = jnp.result_type(*arrays)
+        return [array.astype(dtype) for array in arrays]
+
+
+def _require_unit(name: str, array: Array) -> None:
+    if not float(_farthest_from_unit(array)) < UNIT_SLACK:
+        length = np.linalg.norm(np.asarray(array, float).reshape(-1, 3), axis=-1)
+        first = int(np.argmax(~(np.abs(length - 1.0) < 0.5 * UNIT_SLACK)))
+        where = f" ({name}.reshape(-1, 3)[{first}])" if array.ndim > 1 else ""
+        raise ValueError(f"{name}: a direction has length {length[first]:g}{where}, must be 1")
+
+
+@jax.jit
+def _farthest_from_unit(directions: Array) -> Array:
+    """Largest difference of a squared length from 1; NaN if there is one."""
+    flat = directions.reshape(-1, 3)
+    return jnp.max(jnp.abs((flat * flat) @ jnp.ones(3, flat.dtype) - 1.0))

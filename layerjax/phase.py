@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, floating, is_placeholder, parameter
 from layerjax.directions import Vector, add, combine, dot, frame, half_vector, normalize, reflect, scale, split
 from layerjax.distributions import Kind, radii, sggx_area, sggx_density, sggx_sample
@@ -69,7 +70,7 @@ class SGGX(eqx.Module):
     ========= ====== ===================== ======== ===========================================================
     kind             "surface" | "fiber"            normals along the axis (flakes) or across it (fibers)
     alpha     alpha  [1e-4, 1]                      roughness; 1 is isotropic
-    axis      omega  any vector, not 0     None     symmetry axis, normalised when used; None is the normal z,
+    axis      omega  any vector, not 0     None     symmetry axis, of any length; None is the normal z,
                                                     and costs less than a given axis
     ========= ====== ===================== ======== ===========================================================
     """
@@ -100,7 +101,11 @@ class SGGX(eqx.Module):
         return flake_rule(wi, *radii(self.kind, self.alpha), self._axis(), nodes)
 
     def _axis(self) -> Vector | None:
-        return None if self.axis is None else normalize(split(self.axis))
+        if self.axis is None:
+            return None
+        # its square must neither overflow nor vanish
+        longest = jax.lax.stop_gradient(jnp.max(jnp.abs(self.axis)))
+        return normalize(split(safe_div(self.axis, longest)))
 
 
 PhaseFunction = HenyeyGreenstein | SGGX
@@ -109,11 +114,14 @@ PhaseFunction = HenyeyGreenstein | SGGX
 def _axis(axis: Any) -> Any:
     if axis is None or is_placeholder(axis):
         return axis
-    array = floating("SGGX.axis", axis)
+    array = axis if isinstance(axis, jax.Array) else np.asarray(axis)
     if array.shape != (3,):
         raise ValueError(f"SGGX.axis: shape {array.shape} given, (3,) needed")
-    if not isinstance(array, jax.core.Tracer):
-        concrete = np.asarray(array)
-        if not np.isfinite(concrete).all() or not concrete.any():
-            raise ValueError(f"SGGX.axis: {concrete.tolist()} is not a finite vector other than zero")
-    return array
+    if array.dtype.kind not in "iuf" or isinstance(array, jax.core.Tracer):
+        return floating("SGGX.axis", axis)
+    concrete = np.asarray(array, float)
+    longest = np.abs(concrete).max()
+    if not (np.isfinite(longest) and longest > 0):
+        raise ValueError(f"SGGX.axis: {concrete.tolist()} is not a finite vector other than zero")
+    # whatever its length, it may be asked for in single precision
+    return floating("SGGX.axis", axis if 1e-6 < longest < 1e6 else concrete / longest)
