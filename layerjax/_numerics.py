@@ -45,17 +45,18 @@ def decay_between(a: Array, b: Array) -> Array:
 
 
 def at_least(x: Array, low: Array | float) -> Array:
-    """x, or `low` (with derivative 0 in x) where x is smaller.
+    """x, or `low` (with derivative 0 in x) where x is smaller; where they are equal, the derivative is that of x.
 
     In place of jnp.maximum, whose derivative asks which argument *equals* the result: compiled, both may have been
-    computed again and rounded otherwise, and then the derivative is lost.
+    computed again and rounded otherwise, and then the derivative is lost. What is 0 at the end of a range (a rest of
+    several events over a black base, say) has the derivative that leads into the range.
     """
-    return jnp.where(x > low, x, low)
+    return jnp.where(x >= low, x, low)
 
 
 def at_most(x: Array, high: Array | float) -> Array:
-    """x, or `high` (with derivative 0 in x) where x is larger."""
-    return jnp.where(x < high, x, high)
+    """x, or `high` (with derivative 0 in x) where x is larger; where they are equal, the derivative is that of x."""
+    return jnp.where(x <= high, x, high)
 
 
 def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:

@@ -52,8 +52,9 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     # a + i b = sqrt(n^2 - sin^2): the larger part by a sum, the other from their product, so that nothing cancels
     larger = 0.5 * (modulus + jnp.abs(real))
     smaller = safe_div(product * product, larger)
-    a2, b2 = jnp.where(real > 0, larger, smaller), jnp.where(real > 0, smaller, larger)
-    a = safe_sqrt(a2)
+    # the root of a square is written as its base: at k = 0 under total reflection its derivative is not 0
+    root = safe_sqrt(larger)
+    a, b2 = jnp.where(real > 0, root, safe_div(product, root)), jnp.where(real > 0, smaller, larger)
     perpendicular, below = (a - cosine) ** 2 + b2, (a + cosine) ** 2 + b2
     ratio, under = (a * cosine - sin2) ** 2 + b2 * cos2, (a * cosine + sin2) ** 2 + b2 * cos2
     tiny = jnp.finfo(modulus.dtype).tiny

@@ -8,12 +8,13 @@ approximations of it (Eqs. 4-6) disagree by up to 7 % where they meet; here it i
 flakes that face away from the normal, of which every term is positive.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.special import i0e
+from jax.scipy.special import i0e, i1e
 
 from layerjax._numerics import at_least, at_most, exprel, safe_sqrt
 from layerjax.directions import Vector
@@ -22,6 +23,9 @@ from layerjax.vmf import resultant
 
 LEAST_ROUGHNESS = 1e-8
 """Roughness below which flakes count as this rough, so that derivatives of k stay within float32."""
+
+POROUS = 1.0 - 1e-6
+"""Roughness from which k falls to 0 in a straight line: in that of Eq. (2) its slope at r = 1 would be infinite."""
 
 
 class Areas(NamedTuple):
@@ -35,12 +39,19 @@ class Areas(NamedTuple):
 def concentration(roughness: Array) -> Array:
     """k of a roughness r in [0, 1]: alpha = -log(1 - sqrt(r)) (Eq. 2), k = 2 / alpha^2.
 
-    0 at r = 1, where alpha is infinite and dk/dr, which diverges, is given as 0; bounded at r = 0.
+    Bounded at r = 0. It is 0 at r = 1, where alpha is infinite; within 1e-6 of it k is linear (off by 0.006 at most),
+    so that its slope there is large, -9,500, and not infinite.
     """
-    inside = roughness < 1.0
-    r = at_least(jnp.where(inside, roughness, 0.5), LEAST_ROUGHNESS)
+    near_one = roughness > POROUS
+    r = at_least(jnp.where(near_one, 0.5, roughness), LEAST_ROUGHNESS)
     alpha = jnp.log1p(safe_sqrt(r)) - jnp.log1p(-r)
-    return jnp.where(inside, 2.0 / (alpha * alpha), 0.0)
+    return jnp.where(near_one, porous_concentration(roughness), 2.0 / (alpha * alpha))
+
+
+def porous_concentration(roughness: Array) -> Array:
+    """k of a roughness from `POROUS` to 1."""
+    alpha = math.log1p(math.sqrt(POROUS)) - math.log1p(-POROUS)
+    return (2.0 / alpha**2 / (1.0 - POROUS)) * (1.0 - roughness)
 
 
 def areas(w: Vector, k: Array) -> Areas:
@@ -64,5 +75,17 @@ def _behind(cosine: Array, sine: Array, k: Array) -> Array:
     t = end * x
     up, across = jnp.sin(t), jnp.cos(t)
     tilt = jnp.arctan2(cosine, sine)[..., None]
-    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * i0e(k * sine[..., None] * across)
+    ring = jnp.exp(-2.0 * k * jnp.sin(0.5 * (tilt + t)) ** 2) * _decayed_i0(k * sine[..., None] * across)
     return end * jnp.sum(weight * up * across * ring, axis=-1) / (2.0 * exprel(2.0 * k))
+
+
+@jax.custom_jvp
+def _decayed_i0(x: Array) -> Array:
+    """exp(-x) I0(x) for x >= 0: its slope at 0 is -1, where that of `i0e`, which is even, is given as 0."""
+    return i0e(x)
+
+
+@_decayed_i0.defjvp
+def _decayed_i0_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    value = i0e(*primals)
+    return value, (i1e(*primals) - value) * tangents[0]

@@ -106,7 +106,7 @@ def _design(space: HalfSpace, spread: float, mode: int) -> tuple[np.ndarray, np.
     mean, facing = (np.asarray(area) for area in surface.flake_areas(u, t))
     place, narrow = (np.asarray(part) for part in surface.layer_place(u, t))
     polynomials = np.asarray(surface.chebyshev(jnp.asarray(place), surface.PLACES))
-    sine = np.sqrt(narrow * (1.0 - space.cosines) * (1.0 + space.cosines)) ** mode
+    sine = np.sqrt(spread * narrow * (1.0 - space.cosines) * (1.0 + space.cosines)) ** mode
     factor = facing * sine / (2.0 if mode else 1.0)
     ratio = np.outer(factor, facing * sine) / (np.outer(space.cosines, mean) + np.outer(mean, space.cosines))
     row, column = np.triu_indices(surface.PLACES)

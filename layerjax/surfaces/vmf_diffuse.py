@@ -53,9 +53,10 @@ class VMFDiffuse(Surface):
     light back a base that reflects more than 1 has no solution: use "transport" there.
 
     Not smooth at roughness 0: the value there is albedo / pi, but Eq. (9) does not vanish as r -> 0 (0.011 at albedo 1
-    and normal incidence). Derivatives by roughness diverge at 0 (as r^-1/2 near grazing) and at 1 (where alpha does):
-    at 0, and below r = 1e-8, which counts as that, they are given as 0; at 1 as those of the coefficients alone. The
-    derivative by albedo diverges at 1 as (1 - c)^-1/2 (the physical one does too); at 1 itself that term is left out.
+    and normal incidence). Derivatives by roughness would diverge at 0 (as r^-1/2 near grazing) and at 1 (where alpha
+    does): roughness counts from 1e-8, and within 1e-6 of 1 the flakes' concentration is linear in it, so that both are
+    large and lead into the range. The derivative by albedo diverges at 1 as (1 - c)^-1/2 (the physical one does too);
+    at 1 itself that term is left out.
     """
 
     albedo: Parameter = parameter("VMFDiffuse.albedo")
@@ -73,13 +74,20 @@ class VMFDiffuse(Surface):
 
             return transport_brdf(wi, wo, albedos, self.roughness)
         rough = self.roughness > 0
-        r = at_least(jnp.where(rough, self.roughness, 0.5), LEAST_ROUGHNESS)
-        f1, f2, f3 = scattering_orders(wi, wo, r)
+        r = LEAST_ROUGHNESS + (1.0 - LEAST_ROUGHNESS) * self.roughness
+        orders = scattering_orders(wi, wo, r)
         shape = _direction_factor(wi[2] * wo[2], r, self.form)
+
+        def multiple(c: Array) -> Array:
+            return at_least(_albedo_factor(c, r, self.form) * shape, 0.0)
+
+        # at roughness 0, where the value leaps to that of a Lambertian, the slope in roughness is still that of the fit
+        (f1, f2, f3), (s1, s2, s3) = orders, map(_slope_alone, orders)
         values = []
         for c in albedos:
-            multiple = at_least(_albedo_factor(c, r, self.form) * shape, 0.0)
-            values.append(jnp.where(rough, c * (f1 + c * (f2 + c * f3)) + multiple, c / jnp.pi))  # Eq. (7)
+            fitted = c * (f1 + c * (f2 + c * f3)) + multiple(c)  # Eq. (7)
+            flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _slope_alone(multiple(jax.lax.stop_gradient(c)))
+            values.append(jnp.where(rough, fitted, flat))
         return tuple(values)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
@@ -128,6 +136,11 @@ class VMFDiffuse(Surface):
                 raise ValueError(f"VMFDiffuse.from_diffuse_albedo: {name} is not given a value")
         solve = _solved if exact else _mapped
         return cls(solve(target), target.roughness, form)
+
+
+def _slope_alone(x: Array) -> Array:
+    """0, with the derivatives of x."""
+    return x - jax.lax.stop_gradient(x)
 
 
 def scattering_orders(wi: Vector, wo: Vector, r: Array) -> Orders:

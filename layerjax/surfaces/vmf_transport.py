@@ -22,6 +22,7 @@ from layerjax._numerics import at_least, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector
 from layerjax.precomputed import load
+from layerjax.vmf_flakes import POROUS, porous_concentration
 
 PLACES = 10
 """Chebyshev polynomials in the place of a cosine."""
@@ -46,8 +47,9 @@ def transport_brdf(wi: Vector, wo: Vector, albedo: Channels, roughness: Array) -
     both cosines are above 0.1. They fall with roughness, to 0.05 % at 0.1 (single values 1.6 %). Modes cancel where
     light goes on forward at grazing, and what they leave below 0 is cut off. Reciprocal to rounding.
 
-    At roughness 0 it is albedo / pi. At roughness 1 the derivative with respect to roughness is infinite, and 0 is
-    given; that with respect to albedo is infinite where both are 1, and ends at 1e6.
+    At roughness 0 it is albedo / pi. Towards roughness 1 the derivative with respect to roughness would grow without
+    bound; it ends within 1e-6 (see `layerjax.vmf_flakes.concentration`). That with respect to albedo is infinite where
+    both are 1, and ends at 1e6.
 
     Args:
         wi, wo: unit directions with z > 0.
@@ -61,13 +63,14 @@ def transport_brdf(wi: Vector, wo: Vector, albedo: Channels, roughness: Array) -
 
 def flake_spread(roughness: Array) -> Array:
     """t = alpha^2 / (alpha^2 + pi/4) in [0, 1]: even in alpha at 0, smooth in kappa = 2 / alpha^2 at 0."""
-    root, wide = safe_sqrt(roughness), roughness < 1.0
+    root, near_one = safe_sqrt(roughness), roughness > POROUS
     small = root < 1e-3
-    tame = jnp.where(small | ~wide, 0.25, roughness)
+    tame = jnp.where(small | near_one, 0.25, roughness)
     inner = jnp.sqrt(tame)
     slope = jnp.where(small, 1.0 + root * (0.5 + root / 3.0), (jnp.log1p(inner) - jnp.log1p(-tame)) / inner)
     squared = roughness * slope * slope  # alpha^2
-    return jnp.where(wide, squared / (squared + _WIDTH_SQUARED), 1.0)
+    porous = 1.0 / (1.0 + 0.5 * _WIDTH_SQUARED * porous_concentration(roughness))
+    return jnp.where(near_one, porous, squared / (squared + _WIDTH_SQUARED))
 
 
 def flake_areas(cosine: Array, spread: Array) -> tuple[Array, Array]:
@@ -78,11 +81,13 @@ def flake_areas(cosine: Array, spread: Array) -> tuple[Array, Array]:
 
 
 def layer_place(cosine: Array, spread: Array) -> tuple[Array, Array]:
-    """Place u sqrt(1 + a^2) / sqrt(u^2 + a^2) in [0, 1] across the layer at grazing, and q^2 = a^2 / (u^2 + a^2),
-    with a = alpha."""
+    """Place u sqrt(1 + a^2) / sqrt(u^2 + a^2) in [0, 1] across the layer at grazing, and q^2 / t, smooth at t = 0.
+
+    a = alpha, t the spread, and q^2 = a^2 / (u^2 + a^2).
+    """
     wide = _WIDTH_SQUARED * spread
     inverse = 1.0 / ((1.0 - spread) * cosine * cosine + wide)
-    return cosine * jnp.sqrt((1.0 - spread + wide) * inverse), wide * inverse
+    return cosine * jnp.sqrt((1.0 - spread + wide) * inverse), _WIDTH_SQUARED * inverse
 
 
 def chebyshev(x: Array, count: int) -> Array:
@@ -141,8 +146,9 @@ def _evaluate(wi: Vector, wo: Vector, modes: Array, spread: Array) -> tuple[Arra
     halves = jnp.einsum("cmjk,k...->cmj...", modes, chebyshev(place_o, PLACES), precision="highest")
     smooth = jnp.sum(halves * chebyshev(place_i, PLACES), axis=2)  # G_m
     # (q q s s)^m cos(m phi) without the azimuth
-    squared = narrow_i * narrow_o * (wi[0] * wi[0] + wi[1] * wi[1]) * (wo[0] * wo[0] + wo[1] * wo[1])
-    along = safe_sqrt(narrow_i * narrow_o) * (wi[0] * wo[0] + wi[1] * wo[1])
+    narrow = spread * jnp.sqrt(narrow_i * narrow_o)
+    squared = narrow * narrow * (wi[0] * wi[0] + wi[1] * wi[1]) * (wo[0] * wo[0] + wo[1] * wo[1])
+    along = narrow * (wi[0] * wo[0] + wi[1] * wo[1])
     cosines = [jnp.ones_like(ui), along]
     for _ in range(MODES[0] - 2):
         cosines.append(2.0 * along * cosines[-1] - squared * cosines[-2])

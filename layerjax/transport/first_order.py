@@ -5,6 +5,7 @@ behind them; seen from below likewise. Through the stack it is single scattering
 at the interface where there is one only: through two, every path has two events.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -103,13 +104,22 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
 
 
 def caught(state: FirstOrder, w: Vector) -> Channels | None:
-    """Share of light along w that meets an event at all, per channel; None: all of it."""
+    """Share of light along w that meets an event at all, per channel; None: all of it. See `share_met`."""
     if state.layered or state.opaque:
         return None
     edge = horizon(w[2].dtype)
-    depths = optical_depths(state.upper.media, (w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)))
-    zero = jnp.zeros_like(w[2])
-    return tuple(one_minus_exp(sum((pick(depth, c) for depth in depths), zero)) for c in range(max(1, count(*depths))))
+    return share_met(state.upper.media, (w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)))
+
+
+def share_met(media: Sequence[Medium], w: Vector) -> Channels:
+    """Share of light along w that collides in media, 1 - exp(-depth), per channel.
+
+    In media of thickness 0 it is what that is in proportion to: quantities that vanish with it are interpolated as
+    quotients by it, and keep their derivatives.
+    """
+    depths = optical_depths(media, w)
+    totals = [sum((pick(d, c) for d in depths), jnp.zeros_like(w[2])) for c in range(max(1, count(*depths)))]
+    return tuple(jnp.where(total > 0, one_minus_exp(total), 1.0 / jnp.abs(w[2])) for total in totals)
 
 
 def mirror(w: Vector) -> Vector:

@@ -27,6 +27,12 @@ from layerjax.quadrature import gauss_legendre
 COSINE_FLOOR = 1e-7
 """Stands for the cosines of a panel without extent (two equal indices), whose nodes have no weight."""
 
+LEAST_COSINE = 1e-6
+"""Stands for the cosine 0 at the end of a table."""
+
+MERGED = 0.5
+"""Of the first node of a panel: indices whose squares differ by less than its square share one panel."""
+
 TABLE_DENSITY = 2
 """Points of the table of a panel for each of its nodes."""
 
@@ -49,14 +55,27 @@ class Grid(eqx.Module):
     """Nodes of all panels in s, and the regions from top to bottom."""
 
     edges: Array
-    squared: Array
+    apart: Array
     regions: tuple[Region, ...]
     nodes: int = eqx.field(static=True)
 
     @property
     def size(self) -> int:
         """Number of nodes of all panels."""
-        return self.squared.shape[0]
+        return self.edges.shape[0] * self.nodes
+
+    def bounds(self, panel: Array | np.ndarray, own: Array) -> tuple[Array, Array]:
+        """Lower and upper end in s^2 of panels, in regions of index squared `own`.
+
+        A panel that regions share ends for each of them where its own directions do.
+        """
+        low, high = jnp.concatenate([jnp.zeros(1, self.edges.dtype), self.edges[:-1]])[panel], self.edges[panel]
+        return low, jnp.where(jnp.abs(high - own) < self.apart, own, high)
+
+    @property
+    def panels(self) -> np.ndarray:
+        """Numbers of the panels, (panels, 1)."""
+        return np.arange(self.edges.shape[0])[:, None]
 
 
 def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any) -> Grid:
@@ -73,20 +92,33 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     else:
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
-    width = jnp.diff(edges, prepend=0.0)[:, None]
+    apart = (MERGED * x[0]) ** 2
+    grid = Grid(_merged(edges, apart), apart, (), nodes)
     x2 = (x * x)[None]
-    squared = edges[:, None] - x2 * width
-    weight = (x * w)[None] * width
     regions = []
     for n2 in squares:
-        exists = (edges <= n2)[:, None] & (width > 0)
-        cosine2 = jnp.where(exists, (n2 - edges[:, None] + x2 * width) / n2, 0.25)
+        low, high = grid.bounds(grid.panels, n2)
+        width = high - low
+        exists = (high <= n2) & (width > 0)
+        cosine2 = jnp.where(exists, (n2 - high + x2 * width) / n2, 0.25)
         cosine = jnp.sqrt(at_least(cosine2, COSINE_FLOOR**2))
-        sine = jnp.sqrt(jnp.where(exists, squared / n2, 0.75))
-        here = jnp.where(exists, weight, 0.0)
+        sine = jnp.sqrt(jnp.where(exists, (high - x2 * width) / n2, 0.75))
+        here = jnp.where(exists, (x * w)[None] * width, 0.0)
         flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel())
         regions.append(Region(jnp.sqrt(n2), *flat))
-    return Grid(edges, squared.ravel(), tuple(regions), nodes)
+    return eqx.tree_at(lambda g: g.regions, grid, tuple(regions))
+
+
+def _merged(edges: Array, apart: Array) -> Array:
+    """The edges, each moved up to the next one if that is nearer than `apart`.
+
+    Between indices that nearly agree a panel of its own would hold no node that counts, and the values would change
+    like the root of their difference: the derivative at equal indices would be lost.
+    """
+    merged = [edges[-1]]
+    for k in range(edges.shape[0] - 2, -1, -1):
+        merged.insert(0, jnp.where(merged[0] - edges[k] < apart, merged[0], edges[k]))
+    return jnp.stack(merged)
 
 
 def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, Array]:
@@ -101,16 +133,12 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, 
         cosine: their |cos theta|.
         sine2: their sin(theta)^2.
     """
-    low, high = _bounds(grid)
     panel = _panel(grid, ior * ior * sine2)
-    chosen = (panel[..., None] == np.arange(low.shape[0])) & (high > low)
-    x2, _ = _coordinate(ior, cosine, sine2, low[panel], high[panel])
+    low, high = grid.bounds(panel, ior * ior)
+    chosen = (panel[..., None] == grid.panels[:, 0]) & (high > low)[..., None]
+    x2, _ = _coordinate(ior, cosine, sine2, low, high)
     x = safe_sqrt(jnp.where(jnp.any(chosen, axis=-1), x2, 0.25))
     return lagrange(x, grid.nodes), chosen.astype(x.dtype)
-
-
-def _bounds(grid: Grid) -> tuple[Array, Array]:
-    return jnp.concatenate([jnp.zeros(1, grid.edges.dtype), grid.edges[:-1]]), grid.edges
 
 
 def _panel(grid: Grid, squared: Array) -> Array:
@@ -170,15 +198,40 @@ def table_matrix(nodes: int) -> tuple[np.ndarray, np.ndarray]:
 def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, tuple[Array, ...]]:
     """First index and the four weights of the cubic that interpolates a table (panel by panel) at directions."""
     points = TABLE_DENSITY * grid.nodes
-    low, high = _bounds(grid)
     panel = _panel(grid, ior * ior * sine2)
-    x2, rest2 = _coordinate(ior, cosine, sine2, low[panel], high[panel])
+    low, high = grid.bounds(panel, ior * ior)
+    x2, rest2 = _coordinate(ior, cosine, sine2, low, high)
     x = safe_sqrt(x2)
     # t by a half-angle tangent: steep at neither end, as arccos would be
     t = (2.0 / jnp.pi) * jnp.arctan2(safe_sqrt(rest2 / (1.0 + x)), safe_sqrt(x))
     place = t * (points - 1)
     first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)) - 1.0, 0.0, points - 4.0)
     return first.astype(jnp.int32) + panel * points, cubic(place - first)
+
+
+def interpolated(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
+    """Row of a table (points, columns) at directions, shape ``cosine.shape + (columns,)``; see `stencil`."""
+    first, weights = stencil(grid, ior, cosine, sine2)
+    return sum((weights[j][..., None] * rows[first + j] for j in range(1, 4)), weights[0][..., None] * rows[first])
+
+
+def table_region(grid: Grid, region: Region) -> Region:
+    """The points of a table in a region (panels * points,), all of weight 1; the normal where there is none."""
+    x, _ = table_matrix(grid.nodes)
+    own = region.ior**2
+    low, high = grid.bounds(grid.panels, own)
+    rest = jnp.asarray(x * x, high.dtype) * (high - low)
+    exists = (high <= own) & (high > low)
+    cosine = jnp.sqrt(at_least(jnp.where(exists, (own - high + rest) / own, 1.0), LEAST_COSINE**2)).ravel()
+    one = jnp.ones_like(cosine)
+    return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one)
+
+
+def lifted(grid: Grid, values: Array) -> Array:
+    """Values (..., nodes) at the points of a table, by polynomials in each panel."""
+    _, matrix = table_matrix(grid.nodes)
+    split = values.reshape(*values.shape[:-1], -1, grid.nodes) @ jnp.asarray(matrix.T, values.dtype)
+    return split.reshape(*values.shape[:-1], -1)
 
 
 def cubic(place: Array) -> tuple[Array, Array, Array, Array]:

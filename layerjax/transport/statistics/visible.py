@@ -104,7 +104,7 @@ def cone(cap: Cap, sine: Array) -> Region:
 
 def refracting(cap: Cap, ior: Array) -> Region:
     """Facets that do not reflect totally; all of them if ior, the index on the far side over this one's, is >= 1."""
-    squared = at_least((1.0 - ior) * (1.0 + ior), 0.0)  # cosine of the critical angle, squared
+    squared = jnp.where(ior < 1.0, (1.0 - ior) * (1.0 + ior), 0.0)  # cosine of the critical angle, squared
     critical = jnp.arctan2(jnp.where(squared > 0, ior, 1.0), safe_sqrt(squared))
 
     def cut(cap: Cap, t: Array) -> Cut:
