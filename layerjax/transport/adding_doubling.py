@@ -37,6 +37,10 @@ ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28))
 """The same for ordinates."""
 
 
+MOST = 1024
+"""Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
+
+
 class Solved(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the tables of the rest, None if there is none."""
 
@@ -51,10 +55,10 @@ class AddingDoubling(Transport):
     stack is done in `prepare`; a pair then costs microseconds.
 
     Args:
-        nodes: cosines a hemisphere (and for each range of angles between critical angles), >= 2.
-        modes: Fourier modes in azimuth, >= 1, where every medium is symmetric about the normal.
-        ordinates: (cosines, azimuths) a hemisphere where some medium is not; azimuths even. Both are chosen while
-            tracing: an axis that is traced counts as tilted.
+        nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024.
+        modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal.
+        ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. Both are
+            chosen while tracing: an axis that is traced counts as tilted.
         tolerance: relative error to aim at instead: `prepare` climbs through resolutions until two agree to it, which
             needs concrete parameters. The error of the result is then about a quarter of the tolerance or less.
         orders: ``"all"``, only paths with one event (``"first"``, nothing is solved), or those with more
@@ -76,11 +80,13 @@ class AddingDoubling(Transport):
 
     def __check_init__(self) -> None:
         for name, value, least in (("nodes", self.nodes, 2), ("modes", self.modes, 1)):
-            if not isinstance(value, int) or value < least:
-                raise ValueError(f"AddingDoubling.{name}: {value!r} is not a whole number >= {least}")
-        if len(self.ordinates) != 2 or self.ordinates[0] < 2 or self.ordinates[1] < 4 or self.ordinates[1] % 2:
+            if not (isinstance(value, int) and least <= value <= MOST):
+                raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
+        cosines, azimuths = self.ordinates if len(self.ordinates) == 2 else (0, 0)
+        if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
             raise ValueError(
-                f"AddingDoubling.ordinates: {self.ordinates!r} is not (cosines >= 2, an even number of azimuths >= 4)"
+                f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "
+                f"azimuths from 4 to {MOST})"
             )
         if self.tolerance is not None and not 0.0 < self.tolerance < 1.0:
             raise ValueError(f"AddingDoubling.tolerance: {self.tolerance!r} is outside (0, 1)")

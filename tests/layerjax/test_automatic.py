@@ -1,6 +1,7 @@
 """Which transport a stack gets, and that the closed form it may get is the exact answer."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -44,3 +45,53 @@ def test_closed_form_is_exact():
     stack = lj.Stack([FACE, ABSORBS], BASE)
     solved = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=24, modes=16))
     np.testing.assert_allclose(lj.evaluate(stack, wi, wo), solved, rtol=5e-3)
+
+
+STATED = 5e-3
+"""The error that `prepare` states."""
+
+
+@pytest.mark.parametrize(("ior", "alpha"), [(3.027, 0.00137), (2.0, 0.002), (1.5, 0.00137), (1.5, 0.02)])
+def test_a_smooth_varnish_over_white_reflects_all(ior, alpha):
+    """Facets this smooth lose alpha^1.3 of light within 70 degrees of the normal, and it passes them many times."""
+    angles = jnp.radians(jnp.array([0.0, 20.0, 40.0, 60.0, 70.0]))
+    reflected, _ = lj.albedo(lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(1.0)), lj.direction(angles, 0.0))
+    np.testing.assert_allclose(reflected, 1.0, atol=STATED + alpha**1.3)
+
+
+def test_values_under_a_smooth_varnish_are_those_of_a_mirror_of_it():
+    """In closed form, by Snell's and Fresnel's laws alone: f = T(i) T(o) rho / (pi n^2 (1 - rho R))."""
+    ior, albedo = 2.0, 0.7
+    x, w = np.polynomial.legendre.leggauss(200)
+    critical = np.sqrt(1.0 - 1.0 / ior**2)
+    cosine, weight = critical + 0.5 * (1.0 - critical) * (x + 1.0), 0.5 * (1.0 - critical) * w
+    sent_back = critical**2 + np.sum(2.0 * weight * cosine * (1.0 - passed(cosine, 1.0 / ior)))
+    theta_i, theta_o = np.radians([5.0, 25.0, 45.0, 65.0, 75.0]), np.radians([20.0, 40.0, 60.0, 80.0])
+    wi, wo = lj.direction(theta_i[:, None], 0.0), lj.direction(theta_o, 2.0)
+    exact = passed(np.cos(theta_i), ior)[:, None] * passed(np.cos(theta_o), ior)
+    exact *= albedo / (np.pi * ior**2 * (1.0 - albedo * sent_back))
+    values = lj.evaluate(lj.Stack([lj.Interface(ior, 0.0005)], lj.Lambertian(albedo)), wi, wo)
+    np.testing.assert_allclose(values[..., 0], exact, rtol=STATED)
+
+
+def passed(cosine, ior):
+    """Fresnel's transmittance where nothing is totally reflected."""
+    inner = np.sqrt(1.0 - (1.0 - cosine**2) / ior**2)
+    s, p = (cosine - ior * inner) / (cosine + ior * inner), (inner - ior * cosine) / (inner + ior * cosine)
+    return 1.0 - 0.5 * (s**2 + p**2)
+
+
+@pytest.mark.parametrize("transport", ["auto", lj.Statistical()], ids=["auto", "Statistical"])
+def test_no_value_is_negative(transport):
+    """Also where the index steps down, and little passes beyond the critical angle."""
+    generator = np.random.default_rng(5)
+    cosine, azimuth = generator.uniform(0.0, 1.0, (2, 2000)), generator.uniform(0.0, 2.0 * np.pi, (2, 2000))
+    wi, wo = (lj.direction(np.arccos(c), phi) for c, phi in zip(cosine, azimuth, strict=True))
+
+    @jax.jit
+    def least(ior, alpha):
+        return jnp.min(lj.evaluate(lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(1.0)), wi, wo, transport))
+
+    for ior in (0.25, 0.71189, 0.95, 1.00001, 1.5, 4.0):
+        for alpha in (1e-4, 0.0025888, 0.03, 0.3, 1.0):
+            assert least(ior, alpha) >= 0.0, (ior, alpha)

@@ -28,3 +28,25 @@ def test_what_crosses_is_what_the_walk_counts(ior, alpha):
     )
     _, transmitted = lj.albedo(stack, wi, SOLVER)
     assert np.all(np.abs(transmitted[:, 0] - seen.albedo[:, 1, 0]) < 4 * seen.albedo_error[:, 1, 0] + 2e-3)
+
+
+ENDS = {
+    "smooth in dense, on the dense side": ([(2.0, 0.002)], 1e-3),
+    "hazy varnish": ([(3.027, 0.00137), 0.9], 1e-3),
+    "hardly there, peaked back, steps down": ([(1.0001, 0.01), -0.999, (0.25, 1e-4)], 2e-2),
+    "steps down, rough": ([(0.25, 1.0), 0.0], 3e-2),
+}
+"""Interfaces (index, alpha) and media of depth 1 with this g, and by how much lossless energy is off at most."""
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_nothing_is_lost_at_the_ends(name):
+    parts, error = ENDS[name]
+    layers = [
+        lj.Interface(*part) if isinstance(part, tuple) else lj.Medium(1.0, 1.0, lj.HenyeyGreenstein(part))
+        for part in parts
+    ]
+    angle = jnp.array([0.0, 0.5, 1.0, 1.4, 1.56, np.pi - 1.56, 2.2, np.pi])
+    reflected, transmitted = lj.albedo(lj.Stack(layers), lj.direction(angle, 0.3), SOLVER)
+    passed = lj.unscattered(lj.Stack(layers), lj.direction(angle, 0.3))
+    np.testing.assert_allclose(reflected + transmitted + passed, 1.0, atol=error)

@@ -30,8 +30,12 @@ Microfacets = Literal["single", "multiple"]
 LEAST_FACETS = 24
 """Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
 
-LEAST_SHARE, MOST_OFF = 1e-6, 50.0
-"""Energies below this share of the largest, or deposited that many times wrong, are left as they are deposited."""
+AGREEING, RESOLVED, MOST_OFF = 0.3, 0.2, 50.0
+"""Energies of light deposited on nodes are put right where they are off by a share that is well below the first.
+
+It grows with the width of the lobe in distances between nodes, alpha times their number, above the second: what nodes
+resolve is wrong only where little light passes. More times wrong than the third is only what rounding leaves.
+"""
 
 
 class Normals(NamedTuple):
@@ -59,12 +63,17 @@ def interface_layer(
     """
     near, far = (above, below) if enters else (below, above)
     outside, refracted, lost_outside = _shares(grid, near, far, normals, modes)
-    outer = _face(near, outside, far.ior / near.ior, normals, modes)
     inside, (_, passed), lost_inside = _shares(grid, far, near, normals, modes)
+    down, up = jnp.sum(refracted[1], axis=-1), jnp.sum(passed, axis=-1)
+    unresolved = 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
     through = _deposit(grid, *refracted, far, near, modes)
-    through = _balanced(through, near, far, jnp.sum(refracted[1], axis=-1), jnp.sum(passed, axis=-1))
-    inner = _face(far, inside, near.ior / far.ior, normals, modes)
-    operators = [outer, through, _adjoint(through, near, far), inner]
+    through = _balanced(through, near, far, down, up, AGREEING / unresolved)
+    back = _adjoint(through, near, far)
+    outer, inner = (
+        _face(a, level, b.ior / a.ior, normals, modes) + unresolved * _left_over(a, level, wanted, flux)
+        for a, b, level, wanted, flux in ((near, far, outside, down, through), (far, near, inside, up, back))
+    )
+    operators = [outer, through, back, inner]
     if microfacets == "multiple":
         turned = [
             _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
@@ -137,10 +146,21 @@ def _shares(
     level = fresnel.dielectric(dot(wi, m), ratio)
     reflected = weight * level * _masking(reflect(wi, m), normals)
     down, exists = refract(wi, m, ratio)
-    wo: Vector = (down[0], down[1], -down[2])  # z counted on the far side
+    # z counted on the far side; under total reflection what `refract` gives is no direction, and one stands in
+    wo: Vector = (
+        jnp.where(exists, down[0], 0.6),
+        jnp.where(exists, down[1], 0.0),
+        jnp.where(exists, -down[2], 0.8),
+    )
     refracted = jnp.where(exists, weight * (1.0 - level) * _masking(wo, normals), 0.0)
     lost = at_least(1.0 - jnp.sum(reflected + refracted, axis=-1), 0.0)
     return jnp.sum(reflected, axis=-1), (wo, refracted), jnp.where(near.weight > 0, lost, 0.0)
+
+
+def entering_energy(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Array, Array]:
+    """Of light from every near direction: the energy that an interface passes, and what it loses to masking."""
+    _, (_, refracted), lost = _shares(grid, near, far, normals, modes)
+    return jnp.sum(refracted, axis=-1), lost
 
 
 def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -> tuple[Vector, Array, Vector]:
@@ -203,22 +223,31 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
 
-def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
-    """Deposited flux, scaled to pass the energy `down` of light from near nodes, and its adjoint `up` from far ones.
+def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array, agreeing: Array) -> Array:
+    """Deposited flux, scaled towards passing the energy `down` of light from near nodes, and its adjoint `up` from far
+    ones.
 
-    Both are known by quadrature; what is deposited on a node of little weight, at a critical angle, is not exact.
+    Both are known by quadrature at the nodes. Where nodes do not resolve what happens between them (next to a critical
+    angle, on a smooth interface) the two do not agree: there it is left as it is deposited.
     """
     into, out = jnp.ones_like(down), jnp.ones_like(up)
     for _ in range(BALANCING):
-        out = _scale(up * far.weight, flux[0] @ (near.weight * into))
-        into = _scale(down, out @ flux[0])
+        out = _scale(up * far.weight, flux[0] @ (near.weight * into), agreeing)
+        into = _scale(down, out @ flux[0], 10.0 * agreeing)  # it is deposited with the right energy
     return out[:, None] * flux * into
 
 
-def _scale(wanted: Array, found: Array) -> Array:
-    """Their quotient; 1 where hardly anything passes, or was deposited by rounding alone."""
-    known = (wanted > LEAST_SHARE * jnp.max(wanted)) & (found * MOST_OFF > wanted) & (found < MOST_OFF * wanted)
-    return jnp.where(known, wanted / jnp.where(known, found, 1.0), 1.0)
+def _scale(wanted: Array, found: Array, agreeing: Array) -> Array:
+    """Their quotient; it fades to 1 where they differ by a share as large as `agreeing`."""
+    near = (found > 0.0) & (wanted < MOST_OFF * found) & (found < MOST_OFF * wanted)
+    excess = jnp.where(near, (wanted - found) / jnp.where(near, found, 1.0), 0.0)
+    return 1.0 + excess * jnp.exp(-((excess / agreeing) ** 2))
+
+
+def _left_over(region: Region, level: Array, wanted: Array, flux: Array) -> Array:
+    """What nodes that do not resolve an interface let pass too little or too much: it is reflected like by a mirror."""
+    rest = jnp.where(region.weight > 0, wanted - jnp.sum(flux[0], axis=-2), 0.0)
+    return jnp.diag(at_least(rest, -level))
 
 
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:

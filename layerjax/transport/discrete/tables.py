@@ -233,8 +233,8 @@ def _lift(grid: Grid, region: Region, modes: int, azimuths: int | None) -> Array
     x, matrix = table_matrix(grid.nodes)
     panels = grid.edges.shape[0]
     even = jnp.asarray(np.kron(np.eye(panels), matrix), grid.edges.dtype)
-    width = jnp.diff(grid.edges, prepend=0.0)
-    squared = (grid.edges[:, None] - jnp.asarray(x * x, grid.edges.dtype) * width[:, None]) / region.ior**2
+    low, high = grid.bounds(grid.panels, region.ior**2)
+    squared = (high - jnp.asarray(x * x, high.dtype) * (high - low)) / region.ior**2
     positive = squared > 0
     sine = jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0).ravel()
     # odd modes vanish at the pole like the sine: polynomials interpolate the quotient

@@ -15,11 +15,9 @@ times, in T and R, and with R that of light that leaves the base in those propor
 its shape what depends on the azimuth is lost, and what does not is a product.
 """
 
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -28,95 +26,124 @@ from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector
 from layerjax.quadrature import gauss_legendre
-from layerjax.stack import Stack, optical_depths
+from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
-from layerjax.transport.adding_doubling import AddingDoubling, Solved
+from layerjax.transport.discrete.grid import Grid, Region, interpolated, lifted, table_region
+from layerjax.transport.discrete.interfaces import Microfacets, Normals, entering_energy
+from layerjax.transport.discrete.operators import Parts
 from layerjax.transport.discrete.solve import Plan, make_plan, solve
-from layerjax.transport.discrete.tables import Tables, make_tables
-from layerjax.transport.first_order import FirstOrder, caught, first_order
+from layerjax.transport.first_order import share_met
 from layerjax.transport.statistics.diffuse import closed_form, indirect_energy
 from layerjax.transport.statistics.lobes import precision
-from layerjax.transport.statistics.tables import GRAZING, index_below, look_up, points
 
 NODES = 24
-"""Cosines of the solver, and of the mean over diffuse light."""
+"""Cosines of the solver, and of means over diffuse light."""
+
+LEAST_ENTERING = 1e-4
+"""Share of light that an interface lets in below which it counts as light of every other direction behind it."""
 
 AZIMUTHS = 24
 """Azimuths of the albedo of a base that is not Lambertian."""
 
+LEAST_ALBEDO = 1e-6
+"""Stands for the albedo 0 of a base where its shape is asked for."""
 
 LARGEST_RETURN = 1.0 - 1e-4
 """Bound of R, and of rho R, over a base that is not Lambertian: one that reflects too much would amplify on and on."""
 
 
 class DiffuseBase(eqx.Module):
-    """arriving: T at the points of a table, (POINTS, C or 1). level: rho / (pi n^2 (1 - rho R)), (C or 1,).
-
-    energy: albedo over T(i), (C or 1,).
+    """arriving: T at the points of the solver's table, (points, C or 1), whose panels end at critical angles, where T
+    does what no polynomial does. level: rho / (pi n^2 (1 - rho R)), (C or 1,). energy: albedo over T(i), (C or 1,).
     """
 
+    grid: Grid
     arriving: Array
     level: Array
     energy: Array
 
 
-def make_diffuse(stack: Stack, base: Surface, microfacets: Literal["single", "multiple"]) -> DiffuseBase:
+def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> DiffuseBase:
     """The diffuse part of a simplified stack over a diffuse base."""
     bare = Stack(stack.layers, None)
-    solver = AddingDoubling(nodes=NODES, modes=1, microfacets=microfacets)
-    state: Solved | None = None
-    # solved out here: what is known of the layers while tracing saves the solver work
-    if bare.layers and isinstance(base, Lambertian):
-        state = solver.prepare(bare)
-    elif bare.layers:
-        first = first_order(bare)
-        plan = make_plan(bare, NODES, 1, solver.ordinates, microfacets)
-        state = Solved(first, _counted(bare, base, first, plan))
-    return _closed_form(bare, base, solver, state, precision(stack))
+    # planned out here: what is known of the layers while tracing saves the solver work
+    plan = make_plan(bare, NODES, 1, (2, 4), microfacets)
+    return _closed_form(bare, base, plan, precision(stack))
 
 
 @eqx.filter_jit
-def _counted(bare: Stack, base: Surface, first: FirstOrder, plan: Plan) -> Tables:
-    """Tables of the solved layers, with light that arrives below counted by the base's albedo."""
+def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseBase:
     grid, whole = solve(bare, plan)
-    share = _share(base, grid.regions[-1].cosine)[:, None, :, None]
-    every = jnp.ones_like(share[:, :, :1])  # as many channels everywhere
-    whole = whole.map(lambda flux: every * flux, lambda direct: every[..., 0] * direct)
-    arriving = jax.tree.map(lambda flux: share * flux, (whole.reflect_bottom, whole.transmit_down))
-    whole = eqx.tree_at(lambda layer: (layer.reflect_bottom, layer.transmit_down), whole, arriving)
-    return make_tables(grid, whole, plan.azimuths, False, partial(caught, first))
-
-
-@eqx.filter_jit
-def _closed_form(bare: Stack, base: Surface, solver: AddingDoubling, state: Solved | None, dtype: Any) -> DiffuseBase:
-    ior = index_below(bare)
-    x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(NODES))
+    top, bottom = grid.regions[0], grid.regions[-1]
     if isinstance(base, Lambertian):
         albedo = jnp.stack(per_channel(jnp.asarray(base.albedo)))
     else:
+        x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(NODES))
         albedo = jnp.sum(2.0 * w * x * _directional_albedo(base, x), axis=-1)
+    counted = _share(base, bottom.cosine)
 
-    def energies(cosine: Array, side: float) -> tuple[Array, Array]:
-        """Reflected and transmitted, (C or 1, n), with what nothing meets."""
-        if state is None:
-            return jnp.zeros_like(cosine)[None], _share(base, cosine)
-        wi: Vector = (safe_sqrt(1.0 - cosine * cosine), jnp.zeros_like(cosine), side * cosine)
-        near, far = solver.albedo(state, wi, NODES)
-        straight = jnp.zeros_like(cosine)[None]
-        if not state.first.layered:
-            depths = [jnp.stack(depth) for depth in optical_depths(state.first.upper.media, wi)]
-            straight = jnp.exp(-sum(depths[1:], depths[0]))
-        return jnp.stack(near), jnp.stack(far) + straight * _share(base, cosine)
+    def arriving(parts: Parts) -> Array:
+        """Of the diffuse light along every node what arrives at the base, (C or 1, nodes)."""
+        flux = parts.total
+        return jnp.zeros_like(counted) if flux is None else jnp.einsum("cij,ci->cj", *_alike(flux[:, 0], counted))
 
-    _, arriving = energies(at_least(points(dtype), GRAZING), 1.0)
-    back = jnp.sum(2.0 * w * x * _share(base, x) * energies(x, -1.0)[0], axis=-1)
+    scattered, back = arriving(whole.transmit_down), arriving(whole.reflect_bottom)
+    if whole.direct_down is None:
+        there, table = scattered, _refracted_table(bare, grid, scattered, plan)
+    else:
+        straight = whole.direct_down[:, 0] * counted
+        there, table = scattered + straight, _straight_table(bare, base, grid, scattered)
+    # means over diffuse light at the nodes of the solver: they know the critical angles
+    inward, outward = (2.0 * region.weight / region.ior**2 for region in (bottom, top))
+    returned = jnp.sum(inward * counted * back, axis=-1)
     if not isinstance(base, Lambertian):
-        back = at_most(back, LARGEST_RETURN / at_least(albedo, 1.0))
-    leaving = jnp.sum(2.0 * w * x * energies(x, 1.0)[1], axis=-1) / (ior * ior)  # by reciprocity
-    one = jnp.ones_like(back)
-    return DiffuseBase(
-        arriving.T, closed_form(one, one, back, albedo, ior), indirect_energy(one, leaving, back, albedo)
-    )
+        returned = at_most(returned, LARGEST_RETURN / at_least(albedo, 1.0))
+    leaving = jnp.sum(outward * there, axis=-1) / bottom.ior**2  # by reciprocity
+    one = jnp.ones_like(returned)
+    level = closed_form(one, one, returned, albedo, bottom.ior)
+    return DiffuseBase(grid, table.T, level, indirect_energy(one, leaving, returned, albedo))
+
+
+def _refracted_table(bare: Stack, grid: Grid, there: Array, plan: Plan) -> Array:
+    """T at the points of a table, from its values at the nodes, where the first interface is rough.
+
+    What becomes of the light behind that interface varies slowly: it is interpolated. What the interface lets in, which
+    rises within its roughness at a critical angle, is integrated at the points themselves.
+    """
+    face = next(layer for layer in bare.layers if isinstance(layer, Interface))
+    normals = Normals(jnp.asarray(face.alpha, there.dtype), face.distribution)
+    top, below = grid.regions[:2]
+
+    def entering(region: Region) -> Array:
+        passed, lost = entering_energy(grid, region, below, normals, plan.modes)
+        return passed + lost if plan.microfacets == "multiple" else passed
+
+    at_nodes, at_points = entering(top), entering(table_region(grid, top))
+    typical = safe_div(there @ top.weight, at_nodes @ top.weight)[:, None]
+    behind = (there + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
+    return lifted(grid, behind) * at_points
+
+
+def _straight_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
+    """T at the points of a table, where there are media alone: of what is scattered the share of what meets anything
+    is interpolated, and what passes straight is known."""
+    top, media = grid.regions[0], media_of(bare)
+
+    def along(region: Region) -> Vector:
+        return region.sine, jnp.zeros_like(region.sine), region.cosine
+
+    points = table_region(grid, top)
+    at_nodes, at_points = (jnp.stack(share_met(media, along(region))) for region in (top, points))
+    depths = [jnp.stack(depth) for depth in optical_depths(media, along(points))]
+    straight = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
+    scattered, at_nodes = _alike(scattered, at_nodes)
+    return lifted(grid, scattered / at_nodes) * at_points + straight
+
+
+def _alike(a: Array, b: Array) -> tuple[Array, Array]:
+    """Both with as many channels, their first axis."""
+    channels = max(a.shape[0], b.shape[0])
+    return jnp.broadcast_to(a, (channels, *a.shape[1:])), jnp.broadcast_to(b, (channels, *b.shape[1:]))
 
 
 def diffuse_value(part: DiffuseBase, wi: Vector, wo: Vector) -> Channels:
@@ -136,17 +163,19 @@ def diffuse_albedo(part: DiffuseBase, wi: Vector) -> Channels:
 
 
 def _arriving(part: DiffuseBase, w: Vector) -> Channels:
-    rows = look_up(part.arriving, w[2], safe_sqrt(w[0] * w[0] + w[1] * w[1]))
-    return tuple(rows[..., c] for c in range(rows.shape[-1]))
+    rows = interpolated(part.grid, part.arriving, part.grid.regions[0].ior, w[2], w[0] * w[0] + w[1] * w[1])
+    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))
 
 
 def _share(base: Surface, cosine: Array) -> Array:
     """Albedo of the base along cosines (n,) over its mean for diffuse light, (C or 1, n)."""
     if isinstance(base, Lambertian):
         return jnp.ones_like(cosine)[None]
+    diffuse: Any = base
+    base = eqx.tree_at(lambda surface: surface.albedo, diffuse, at_least(jnp.asarray(diffuse.albedo), LEAST_ALBEDO))
     x, w = (jnp.asarray(array, cosine.dtype) for array in gauss_legendre(NODES))
     mean = jnp.sum(2.0 * w * x * _directional_albedo(base, x), axis=-1)
-    return safe_div(_directional_albedo(base, cosine), mean[:, None], 1.0)
+    return _directional_albedo(base, cosine) / mean[:, None]
 
 
 def _directional_albedo(base: Surface, cosine: Array) -> Array:

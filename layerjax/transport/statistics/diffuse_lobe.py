@@ -80,4 +80,4 @@ def lobe_value(part: DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
 def lobe_albedo(part: DiffuseLobe, wi: Vector) -> Channels:
     """Energy of `lobe_value` for light along wi, above."""
     rows = look_up(part.energy, wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1]))
-    return tuple(rows[..., c] for c in range(rows.shape[-1]))
+    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.distributions import ggx_sample
@@ -39,7 +39,8 @@ def take(row: Array, columns: tuple[int, int]) -> Channels:
 
 def read_energies(table: Table, wi: Vector) -> tuple[Channels, Channels]:
     """Energy of all lobes on the side of the light and on the other."""
-    near, far = look_up(table.near, wi[2], planar(wi)), look_up(table.far, wi[2], planar(wi))
+    # a cubic may fall below its points
+    near, far = (at_least(look_up(rows, wi[2], planar(wi)), 0.0) for rows in (table.near, table.far))
     return take(near, (0, near.shape[-1])), take(far, (0, far.shape[-1]))
 
 

@@ -54,7 +54,11 @@ def transmission_scale(cosine: Array, ior: Array, refracted: Array) -> Array:
 
 
 def refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tuple[Array, Array]:
-    """Cosine behind an interface, and whether there is one; `steepest` is the largest sine that stands in beyond it."""
+    """Cosine behind an interface, and whether there is one.
+
+    Where ior < 1 `steepest` is the largest sine, which stands in beyond the critical angle; elsewhere every cosine has
+    its own, grazing ones too.
+    """
     squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
-    floor = 1.0 - steepest * steepest
+    floor = jnp.where(ior < 1.0, 1.0 - steepest * steepest, 0.0)
     return jnp.sqrt(at_least(squared, floor)), squared > 0
