@@ -193,8 +193,11 @@ def test_tolerance_picks_the_resolution():
     ("options", "name"),
     [
         ({"nodes": 1}, "nodes"),
+        ({"nodes": 1025}, "nodes"),
         ({"modes": 0}, "modes"),
+        ({"modes": 10**400}, "modes"),
         ({"ordinates": (4, 5)}, "ordinates"),
+        ({"ordinates": (4, 2000)}, "ordinates"),
         ({"tolerance": 2.0}, "tolerance"),
         ({"orders": "second"}, "orders"),
         ({"microfacets": "none"}, "microfacets"),

@@ -15,6 +15,7 @@ from tests.layerjax.test_samplers import chi_square
 from tests.layerjax.vmf_walks import Face, coated_energies, mean_and_error
 
 DRAWS = 200_000
+STEP = 1e-6  # short, for the facets that a change takes across the critical angle, where the slope is infinite
 MIRROR = (0.01, 20.0)  # of index 1 reflects 0.9999 of the light, under an index of 1.5 as much
 
 
@@ -325,3 +326,15 @@ def test_references_are_finite_over_the_box(dtype):
             given = jnp.asarray(ior, dtype), jnp.sqrt(2.0 / jnp.asarray(kappas, dtype))
             for leaf in (*slopes(*given), walk(*given)):
                 assert np.isfinite(leaf).all(), (ior, kappas)
+
+
+def test_reverse_mode_of_a_varnish():
+    """Against central differences: half of their step changes them by less than 1e-4."""
+
+    def value(x):
+        stack = lj.Stack([lj.Interface(x[0], x[1], "vmf")], lj.Lambertian(0.5))
+        return lj.evaluate(stack, lj.direction(0.5, 0.2), lj.direction(0.7, 2.0))[0]
+
+    x, steps = jnp.array([1.5, 0.3]), STEP * jnp.eye(2)
+    rise = jax.jit(lambda points: jax.lax.map(value, points))(jnp.concatenate([x + steps, x - steps]))
+    np.testing.assert_allclose(jax.jit(jax.grad(value))(x), (rise[:2] - rise[2:]) / (2 * STEP), rtol=1e-4)

@@ -1,0 +1,175 @@
+"""Stacks, and the points of their parameters at which derivatives are compared with differences of values."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import layerjax as lj
+from layerjax import Conductor, HenyeyGreenstein, Interface, Lambertian, Medium, OrenNayar, Stack, VMFDiffuse
+from layerjax._parameters import RANGES, leaves_with_names
+
+HAZE = Medium(0.7, 0.8, HenyeyGreenstein(0.3))
+FLAKES = Medium(0.7, 0.8, lj.SGGX("surface", 0.3), 0.4)
+FIBERS = Medium(0.7, 0.8, lj.SGGX("fiber", 0.3, (0.5, 0.3, 0.7)), 0.4)
+DYE = Medium(0.7, 0.0)
+METAL = Conductor(0.4, 2.0, 0.3)
+FACE = Interface(1.5, 0.3)
+VMF_FACE = Interface(1.5, 0.3, "vmf")
+
+STACKS = {
+    "haze over paint": Stack([Medium(0.7, 0.8, HenyeyGreenstein(0.3), 0.4)], Lambertian(0.5)),
+    "flakes over rough paint": Stack([FLAKES], OrenNayar(0.5, 0.4)),
+    "fibers": Stack([FIBERS]),
+    "two hazes": Stack([HAZE, Medium(0.4, 0.9, HenyeyGreenstein(-0.3))]),
+    "haze over metal": Stack([HAZE], METAL),
+    "haze over flakes' fit": Stack([HAZE], VMFDiffuse(0.5, 0.3)),
+    "flakes' fit": Stack([], VMFDiffuse(0.5, 0.3)),
+    "flakes' fit as printed": Stack([], VMFDiffuse(0.5, 0.3, "literal")),
+    "flakes' transport": Stack([], VMFDiffuse(0.5, 0.3, "transport")),
+    "rough paint": Stack([], OrenNayar(0.5, 0.4)),
+    "metal": Stack([], METAL),
+    "metal, vmf": Stack([], Conductor(0.4, 2.0, 0.3, "vmf")),
+    "face": Stack([FACE]),
+    "varnish": Stack([FACE], Lambertian(0.5)),
+    "varnish, vmf": Stack([VMF_FACE], Lambertian(0.5)),
+    "varnish on rough paint": Stack([FACE], OrenNayar(0.5, 0.4)),
+    "varnish on flakes' fit": Stack([FACE], VMFDiffuse(0.5, 0.3)),
+    "varnish on flakes' transport": Stack([FACE], VMFDiffuse(0.5, 0.3, "transport")),
+    "coated metal": Stack([FACE], METAL),
+    "coated metal, vmf": Stack([VMF_FACE], Conductor(0.4, 2.0, 0.3, "vmf")),
+    "dyed varnish": Stack([FACE, DYE], Lambertian(0.5)),
+    "dyed coat on metal": Stack([FACE, DYE], METAL),
+    "hazy varnish": Stack([FACE, HAZE], Lambertian(0.5)),
+    "hazy coat on metal": Stack([FACE, HAZE], METAL),
+    "fibers in varnish": Stack([FACE, FIBERS], Lambertian(0.5)),
+    "plate": Stack([FACE, HAZE, Interface(1.2, 0.2)]),
+    "clear plate": Stack([FACE, Interface(1.2, 0.2)]),
+    "slab, vmf": Stack([VMF_FACE, Interface(1.0, 0.2, "vmf")]),
+    "two coats on metal": Stack([FACE, Interface(1.2, 0.2)], METAL),
+    "two coats on paint": Stack([FACE, Interface(1.2, 0.2)], Lambertian(0.5)),
+}
+
+ASKED_TO_BE_KNOWN = {"dyed varnish": "layers[1].albedo", "dyed coat on metal": "layers[1].albedo"}
+"""What is concrete: transports that carry no scattering medium must know that it scatters nothing."""
+
+UNBOUNDED = {
+    ("VMFDiffuse.roughness", 0.0): "the value of the fits leaps there, and slopes diverge towards it",
+    ("VMFDiffuse.albedo", 1.0): "the slope diverges as (1 - albedo)^-1/2",
+}
+"""Ends at which no difference converges: derivatives are finite there, and the same in both modes."""
+
+
+class Point(NamedTuple):
+    """One parameter at one value: its place in the vector, a length to step by, and the sides where it may be left.
+
+    kinked: indices are equal there, so that light is totally reflected on one side only, and slopes differ.
+    """
+
+    name: str
+    place: int
+    value: float
+    length: float
+    sides: tuple[float, ...]
+    kinked: bool
+    unbounded: bool
+
+
+def points_of(stack, fixed=None):
+    """Every parameter inside its range, exactly at both its ends, and where it is 0, 1 or the index beside it."""
+    found, place = [], 0
+    for path, leaf in leaves_with_names(stack):
+        owner = stack
+        *parents, field = path.replace("]", "").replace("[", ".").split(".")
+        for part in parents:
+            owner = owner[int(part)] if part.isdigit() else getattr(owner, part)
+        key = f"{type(owner).__name__}.{field}"
+        if path != fixed and key in RANGES:
+            vmf = field == "alpha" and getattr(owner, "distribution", "ggx") == "vmf"
+            low, high = RANGES[f"{key}, vmf" if vmf else key]
+            inside = float(leaf)
+            beside = (1.0, 1.5) if key == "Interface.ior" else ()
+            values = {low, high, inside, *beside, *(number for number in (0.0, 1.0) if low < number < high)}
+            for value in sorted(values):
+                sides = (-1.0,) if value == high else (1.0,) if value == low else (1.0, -1.0)
+                kinked = value in beside and value != inside
+                end = (key, value) in UNBOUNDED
+                found.append(Point(path, place, value, _length(field, value), sides, kinked, end))
+        elif path != fixed:  # an axis
+            for k, value in enumerate(np.ravel(leaf)):
+                found.append(Point(f"{path}[{k}]", place + k, float(value), 1.0, (1.0, -1.0), False, False))
+        place += np.size(leaf)
+    return found
+
+
+def _length(field, value):
+    if field == "g":
+        return min(1.0 - abs(value), 0.5)
+    return max(abs(value), 1.0) if field in ("thickness", "k") else abs(value) if field in ("alpha", "ior") else 1.0
+
+
+def vector_and_build(stack, fixed=None):
+    """The numbers of a stack as a vector, and the stack of a vector; `fixed` stays what it is, and is known."""
+    leaves, structure = jax.tree.flatten(stack)
+    kept = [path == fixed for path, _ in leaves_with_names(stack)]
+
+    def build(vector):
+        parts, place = [], 0
+        for leaf, keep in zip(leaves, kept, strict=True):
+            size = int(np.size(leaf))
+            parts.append(leaf if keep else vector[place : place + size].reshape(np.shape(leaf)))
+            place += size
+        return jax.tree.unflatten(structure, parts)
+
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in leaves]), build
+
+
+def pairs(stack):
+    """Pairs of directions: apart, near the mirror direction, grazing, and with no base from and to below."""
+    theta_i, phi_i = [0.3, 1.0, 0.6, 0.5, 1.3, 2.4, 2.2, 0.4], [0.0, 0.3, 0.1, 0.0, 0.2, 1.0, 0.3, 0.1]
+    theta_o, phi_o = [0.7, 0.4, 0.62, 2.2, 1.2, 2.6, 0.8, 2.75], [2.0, 3.3, 3.2, 1.0, 3.0, 4.0, 2.9, 3.24]
+    wi, wo = (
+        lj.direction(jnp.asarray(theta_i), jnp.asarray(phi_i)),
+        lj.direction(jnp.asarray(theta_o), jnp.asarray(phi_o)),
+    )
+    if stack.base is None:
+        return wi, wo
+    return tuple(w.at[:, 2].set(jnp.abs(w[:, 2])) for w in (wi, wo))
+
+
+def agrees(derivative, value, vector, point):
+    """Whether differences that have converged (to 2 %) at some step agree with the derivative, output by output.
+
+    Differences are one-sided and of second order at an end, central inside. Their error is what halving the step
+    changes, and the rounding of the values. Where slopes of two sides differ, the derivative lies between them, or
+    beyond by a quarter of what they differ by: it is made of many products whose factors have kinks of their own.
+    """
+    middle = np.asarray(value(vector))
+    found = np.zeros(np.shape(middle), bool)
+    steps = 10.0 ** (-np.arange(6.0, 9.0) if point.kinked else -np.arange(1.0, 9.0)) * 0.5 * point.length
+
+    def at(step):
+        return np.asarray(value(vector.at[point.place].add(step)))
+
+    def slope(step, side):
+        if side == 0:
+            return (at(step) - at(-step)) / (2 * step)
+        return side * (-3 * middle + 4 * at(side * step) - at(2 * side * step)) / (2 * step)
+
+    sides = point.sides if point.kinked or len(point.sides) == 1 else (0,)
+    scale = np.abs(middle).max() + np.abs(derivative).max()
+    for step in steps:
+        slopes, errors = [], []
+        for side in sides:
+            wide, narrow = slope(step, side), slope(0.5 * step, side)
+            slopes.append(narrow)
+            errors.append(np.abs(wide - narrow) + 16 * np.finfo(float).eps * np.abs(middle).max() / step)
+        apart = 0.25 * np.ptp(slopes, axis=0)
+        slack = 3 * np.max(errors, axis=0) + 1e-3 * np.max(np.abs(slopes), axis=0) + 1e-6 * scale
+        settled = np.max(errors, axis=0) < 0.02 * np.max(np.abs(slopes), axis=0) + 1e-6 * scale
+        low, high = np.min(slopes, axis=0) - apart - slack, np.max(slopes, axis=0) + apart + slack
+        found |= settled & (low <= derivative) & (derivative <= high)
+        if found.all():
+            break
+    return found

@@ -1,0 +1,96 @@
+"""Derivatives of every transport by every parameter: inside ranges, exactly at their ends, at 0, 1 and equal indices.
+
+Reverse mode equals forward mode, both equal differences of values, and single precision follows double precision.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from tests.layerjax.derivatives import ASKED_TO_BE_KNOWN, STACKS, agrees, pairs, points_of, vector_and_build
+
+SOLVER = lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6))
+TRANSPORTS = {
+    "SingleScattering": lj.SingleScattering(),
+    "SpongeCake": lj.SpongeCake(),
+    "WeidlichWilkie": lj.WeidlichWilkie(),
+    "ENDF": lj.ENDF(),
+    "AddingDoubling": SOLVER,
+    "AddingDoubling, multiple": lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6), microfacets="multiple"),
+    "Statistical": lj.Statistical(),
+    "Statistical, forward": lj.Statistical(symmetric=False),
+    "Statistical, single": lj.Statistical(microfacets="single"),
+}
+QUICK = {
+    ("SingleScattering", "haze over metal"),
+    ("SingleScattering", "flakes' transport"),
+    ("WeidlichWilkie", "dyed varnish"),
+    ("AddingDoubling", "haze over paint"),
+}
+"""Those whose derivatives compile fast."""
+
+
+def carried():
+    for name, transport in TRANSPORTS.items():
+        for kind, stack in STACKS.items():
+            try:
+                transport.check(stack)
+            except ValueError:
+                continue
+            slow = () if (name, kind) in QUICK else pytest.mark.slow
+            yield pytest.param(name, kind, marks=slow, id=f"{name}: {kind}")
+
+
+@pytest.mark.parametrize(("name", "kind"), list(carried()))
+def test_derivatives(name, kind):
+    stack, transport = STACKS[kind], TRANSPORTS[name]
+    fixed = ASKED_TO_BE_KNOWN.get(kind) or ("layers[1].ior" if name == "ENDF" and kind == "slab, vmf" else None)
+    start, build = vector_and_build(stack, fixed)
+    wi, wo = pairs(stack)
+    weight = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.0, len(wi)))
+    # the programs of single precision take as long to compile
+    dtypes = (jnp.float64,) if (name, kind) == ("AddingDoubling", "haze over paint") else (jnp.float64, jnp.float32)
+
+    def reflected(vector):
+        i, o = (w.astype(vector.dtype) for w in (wi, wo))
+        return lj.evaluate(build(vector), i, o, transport)[:, 0]
+
+    @jax.jit
+    def forward(vector, direction):
+        return jax.jvp(reflected, (vector,), (direction,))
+
+    def values(vector):
+        return forward(vector, jnp.zeros_like(vector))[0]
+
+    @jax.jit
+    def reverse(vector):
+        return jax.grad(lambda v: jnp.vdot(weight.astype(v.dtype), reflected(v)))(vector)
+
+    wrong = []
+    for point in points_of(stack, fixed):
+        vector = start.at[point.place].set(point.value)
+        direction = jnp.zeros_like(start).at[point.place].set(1.0)
+        slope, gradient = np.asarray(forward(vector, direction)[1]), np.asarray(reverse(vector))
+        where = f"{point.name} = {point.value:g}"
+        if not np.isfinite(slope).all() or not np.isfinite(gradient).all():
+            wrong.append(f"{where}: not finite")
+            continue
+        size = float(weight @ np.abs(slope))
+        if abs(gradient[point.place] - float(weight @ slope)) > 1e-6 * size + 1e-12:
+            wrong.append(f"{where}: reverse {gradient[point.place]:.6g}, forward {float(weight @ slope):.6g}")
+        if not point.unbounded:
+            good = agrees(slope, values, vector, point)
+            wrong += [f"{where}: pair {k} has {slope[k]:.4g}" for k in np.flatnonzero(~good)]
+        if jnp.float32 not in dtypes:
+            continue
+        single, small = vector.astype(jnp.float32), direction.astype(jnp.float32)
+        ahead, back = np.asarray(forward(single, small)[1]), np.asarray(reverse(single))
+        # rounding of values is divided by what a parameter is measured in
+        rounding = 64 * np.finfo(np.float32).eps * float(weight @ np.abs(values(vector))) / point.length
+        if not np.isfinite(ahead).all() or not np.isfinite(back).all():
+            wrong.append(f"{where}: not finite in single precision")
+        elif abs(back[point.place] - float(weight @ ahead)) > 1e-3 * size + rounding:
+            wrong.append(f"{where}: in single precision reverse {back[point.place]:.4g}, forward {weight @ ahead:.4g}")
+    assert not wrong, "\n".join(wrong)
