@@ -60,8 +60,11 @@ def signed_angle(data: "Measurements") -> np.ndarray:
 
 
 def in_plane(data: "Measurements") -> np.ndarray:
-    """(N,) bool: the viewer lies in the plane of incidence, to `SAME_ANGLE`."""
-    off_plane = np.abs(np.sin(np.radians(relative_azimuth(data)))) * np.sin(np.radians(data.theta_o))
+    """(N,) bool: the viewer lies in the plane of incidence, or the light in that of the viewer, to `SAME_ANGLE`."""
+    light, viewer = np.sin(np.radians(data.theta_i)), np.sin(np.radians(data.theta_o))
+    # near the normal the azimuth of the light hardly matters; on it, it counts as `relative_azimuth` says
+    arm = np.where(light < np.sin(np.radians(AT_NORMAL)), viewer, np.minimum(light, viewer))
+    off_plane = np.abs(np.sin(np.radians(relative_azimuth(data)))) * arm
     return off_plane < np.sin(np.radians(SAME_ANGLE))
 
 

@@ -180,6 +180,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
         picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
     values = np.asarray(fit.problem.call(_along, vectors, np.concatenate(wi), np.concatenate(wo)))
+    values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
     band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
     ends = np.cumsum([len(angle) for angle in angles])
     return [

@@ -210,7 +210,7 @@ def _surface(x: np.ndarray, y: np.ndarray) -> Triangulation | None:
     corners = Triangulation(x, y)
     sides = points[corners.triangles] - points[np.roll(corners.triangles, 1, axis=1)]
     longest = np.linalg.norm(sides, axis=-1).max(axis=-1)
-    if np.median(longest) > COARSE:
+    if np.quantile(longest, 0.75) > COARSE:
         return None
     # a triangle with a side much longer than is usual spans what was not measured, such as the retro cone
     corners.set_mask(longest > 2.5 * np.quantile(longest, 0.75))

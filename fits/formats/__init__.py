@@ -26,7 +26,7 @@ def read(
     quantity: str | None = None,
     *,
     geometry: Geometry | None = None,
-    lookup: str = "linear",
+    lookup: str = "centre",
 ) -> Measurements:
     """Read a measurement file: CSV, MERL binary, Zemax BSDF or FRED text.
 
@@ -41,7 +41,7 @@ def read(
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     kind = sniff(path) if format is None else format
-    if kind != "merl" and (geometry is not None or lookup != "linear"):
+    if kind != "merl" and (geometry is not None or lookup != "centre"):
         raise ValueError(f"{path}: geometry and lookup apply to MERL files only, this is a {kind} file")
     if kind == "csv":
         return csv.read(path, checked)

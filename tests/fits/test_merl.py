@@ -1,12 +1,19 @@
 """MERL tables: a synthetic file, written from a formula in the half and difference angles, is looked up again."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import layerjax as lj
+from fits.diagnostics import in_plane, incidences, relative_azimuth
 from fits.formats import read
+from fits.formats.merl import half_difference
 from fits.geometry import Geometry, direction, slices
+from fits.measurements import Measurements
+from fits.optimise import fit
+from fits.parameters import Free
 
 SHAPE = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500
@@ -65,8 +72,119 @@ def _angles(geometry):
     return np.array([_half_difference(wi, wo) for wi, wo in zip(geometry.wi, geometry.wo, strict=True)]).T
 
 
+def _bins(data: Measurements) -> np.ndarray:
+    """Table indices (N, 3), not rounded, by way of this file's own half and difference angles."""
+    theta_h, theta_d, phi_d = _angles(data)
+    return np.stack([np.sqrt(theta_h * 2 / np.pi) * 90, np.degrees(theta_d), np.degrees(phi_d)], axis=-1)
+
+
+def _pairs(bins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions at the centres of bins (N, 3): a direction at (theta_d, phi_d) and the normal, turned by theta_h."""
+    theta_h, theta_d, phi_d = ((bins + 0.5) / SHAPE * [1, 90, 180]).T
+    wi = direction(theta_d, phi_d)
+    cosine, sine = np.cos(theta_h**2 * np.pi / 2), np.sin(theta_h**2 * np.pi / 2)
+    wi, wo = (
+        np.stack([cosine * x + sine * z, y, cosine * z - sine * x], axis=-1) for x, y, z in (wi.T, (wi * [-1, -1, 1]).T)
+    )
+    return wi, wo
+
+
+def test_centre_lookup_reads_bins_as_they_are_at_their_centres(path, geometry, table):
+    for data in (read(path), read(path, geometry=geometry)):
+        found = half_difference(data.wi, data.wo)
+        index = np.floor(_bins(data)).astype(int)
+        centres = ((index + 0.5) / SHAPE) ** [2, 1, 1] * [np.pi / 2, np.pi / 2, np.pi]
+        np.testing.assert_allclose(np.stack(found, axis=-1), centres, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.values, table[:, *index.T].T, rtol=1e-14)
+        assert len(np.unique(index, axis=0)) == len(data)
+        assert data.mask.all()
+        assert f"readings at the centres of {len(data)} bins" in data.source.notes[1]
+
+
+def test_centres_are_near_what_was_asked_for(path, geometry):
+    spread = Geometry(geometry.wi[:50], geometry.wo[:50])
+    data = read(path, geometry=spread)
+    assert len(data) == 50
+    asked = Measurements(spread.wi, spread.wo, data.values, None, data.mask, data.channels)
+    off = abs(data.theta_i - asked.theta_i)
+    assert off.max() < 0.75
+    assert np.mean(off < 0.21) > 0.9  # near retro-reflection there are bins for few incidences
+    np.testing.assert_allclose(data.phi_i, asked.phi_i, atol=1e-8)
+    # directions that were exchanged or mirrored would be tens of degrees away
+    assert np.degrees(np.linalg.norm(data.wo - asked.wo, axis=-1)).max() < 6
+
+
+def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, table):
+    index = np.array([[3, 40, 20], [20, 30, 100], [45, 10, 179], [0, 60, 0]])
+    wi, wo = _pairs(index)
+    for light, viewer in ((wi, wo), (wo, wi)):
+        data = read(path, geometry=Geometry(light, viewer))
+        np.testing.assert_allclose([data.wi, data.wo], [light, viewer], atol=1e-12)
+        np.testing.assert_allclose(data.values, table[:, *index.T].T, rtol=1e-14)
+    both = read(path, geometry=Geometry(np.concatenate([wi, wo]), np.concatenate([wo, wi])))
+    np.testing.assert_allclose([both.wi, both.wo], [wi, wo], atol=1e-12)
+    assert any("left out: 4 of the 8 pairs asked for" in note for note in both.source.notes)
+
+
+def test_centres_along_the_default_slices_remain_slices(path):
+    data = read(path)
+    assert 380 < len(data) < 420
+    groups = incidences(data)
+    np.testing.assert_allclose([group.theta for group in groups], [10.5, 30.5, 50.5, 70.5], atol=0.1)
+    np.testing.assert_allclose(data.phi_i, 180, atol=1e-8)
+    for group in groups:
+        assert np.count_nonzero(in_plane(data)[group.rows]) >= 25
+        theta_i, theta_o = data.theta_i[group.rows], data.theta_o[group.rows]
+        peak = in_plane(data)[group.rows] & (abs(relative_azimuth(data)[group.rows]) < 1)
+        assert abs(theta_o - theta_i)[peak].min() < 0.01  # the mirror direction
+
+
+def test_light_along_the_normal_and_pairs_at_the_horizon(path):
+    upright = read(path, geometry=slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0)))
+    assert upright.theta_i.max() < 0.75
+    np.testing.assert_allclose(upright.phi_i, 180, atol=1e-8)
+    np.testing.assert_allclose(upright.theta_o, [40, 0, 40], atol=5)
+    # half a degree of phi_d puts one of the two below the horizon in every bin near this pair
+    low = direction([89.996, 30], 180), direction([89.996, 30], [4.78, 0])
+    assert len(read(path, geometry=Geometry(*low))) == 1
+    with pytest.raises(ValueError, match="geometry holds only pairs too near the horizon"):
+        read(path, geometry=Geometry(low[0][:1], low[1][:1]))
+
+
+def _flakes(thickness, albedo):
+    medium = lj.Medium(thickness=thickness, albedo=0.9, phase=lj.SGGX("surface", 0.02))
+    return lj.Stack([medium], base=lj.Lambertian(albedo=albedo))
+
+
+@pytest.fixture(scope="module")
+def flakes_path(tmp_path_factory):
+    """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
+    wi, wo = _pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
+    near = np.zeros(len(wi), bool)
+    for theta in (10.5, 30.5, 50.5, 70.5):
+        near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
+    near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
+    values = np.full(len(wi), -1.0)
+    values[near] = lj.evaluate(_flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
+    return _write(
+        tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
+    )
+
+
+def test_an_exact_table_gives_back_its_stack(flakes_path):
+    data = read(flakes_path)
+    assert data.mask.all()
+    data = replace(data, sigma=0.01 * data.values)
+    start = _flakes(Free(1.5, 0.05, 5.0), Free(0.3, 0.0, 1.0))
+    found = fit(start, data, transport=lj.SingleScattering(), starts=2)
+    assert found.converged
+    assert found.values["layers[0].thickness"] == pytest.approx(0.8, abs=1e-7)
+    assert found.values["base.albedo"] == pytest.approx(0.5, abs=1e-7)
+
+
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
-    data = read(path, geometry=geometry)
+    data = read(path, geometry=geometry, lookup="linear")
+    np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
     expected = _bsdf(*_angles(geometry)).T
     # linear interpolation is off by at most an eighth of the second difference along each axis
     bound = sum(abs(np.diff(table, 2, axis=axis)).max(axis=(1, 2, 3)) for axis in (1, 2, 3)) / 8
@@ -92,23 +210,26 @@ def test_nearest_lookup_takes_the_bin_of_the_database_code(path, geometry, table
 def test_mirror_normal_and_retro_directions_are_finite(path):
     wi = direction([30, 0, 30, 80, 0], 180)
     wo = direction([30, 0, -30, 80, 85], 0)
-    data = read(path, geometry=Geometry(wi, wo))
+    data = read(path, geometry=Geometry(wi, wo), lookup="linear")
     assert data.mask.all()
     expected = _bsdf(*np.array([_half_difference(*pair) for pair in zip(wi, wo, strict=True)]).T).T
     np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
 
 
 def test_default_slices(path):
-    data = read(path)
+    data = read(path, lookup="linear")
     assert len(data) == 4 * (35 + 34 + 34)
     assert sorted(set(data.theta_i)) == [10, 30, 50, 70]
     assert len({(*np.round(wi, 6), *np.round(wo, 6)) for wi, wo in zip(data.wi, data.wo, strict=True)}) == len(data)
 
 
-def test_bins_without_measurement_are_masked(tmp_path, table):
+@pytest.mark.parametrize("lookup", ["centre", "linear", "nearest"])
+def test_bins_without_measurement_are_masked(tmp_path, table, lookup):
     holed = table.copy()
     holed[1, :, 40:] = -SCALE[1]  # what the database writes where it has nothing, in one channel
-    data = read(_write(tmp_path / "holed.binary", holed), geometry=slices(incidence=[60], outgoing=[-55, 60]))
+    data = read(
+        _write(tmp_path / "holed.binary", holed), geometry=slices(incidence=[60], outgoing=[-55, 60]), lookup=lookup
+    )
     np.testing.assert_array_equal(data.mask, [True, False])  # theta_d of 2.5 and of 60 degrees
     np.testing.assert_array_equal(data.values[1], 0)
     assert "masked: 1 sample that need a bin without a measurement" in data.source.notes
@@ -139,7 +260,7 @@ def test_bad_files(tmp_path, path):
 
 
 def test_bad_arguments(path):
-    with pytest.raises(ValueError, match="lookup is 'cubic', must be one of linear, nearest"):
+    with pytest.raises(ValueError, match="lookup is 'cubic', must be one of centre, linear, nearest"):
         read(path, lookup="cubic")
     with pytest.raises(ValueError, match="at or below the horizon"):
         read(path, geometry=slices(outgoing=[100]))
