@@ -11,12 +11,13 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import gammaln
 
+from fits._values import shown
 from fits.parameters import Free
 
 Tails = Literal["gaussian", "student"]
@@ -24,15 +25,18 @@ Objective = Literal["likelihood", "cosine_l2", "log1p_cos", "cube_root"]
 DEFAULT_RELATIVE = 0.05
 DEFAULT_FLOOR = 1e-4
 CUBE_ROOT_OFFSET = 1e-6
+LEVELS = (1e-100, 1e100)  # of a floor, or a scale: their squares neither vanish nor overflow in float64
+DEGREES_OF_FREEDOM = (0.01, 1e6)  # above, a Student-t is a Gaussian, and the terms of its constant cancel
 
 
 @dataclass(frozen=True)
 class Noise:
     """How a datum scatters about the model: variance = sigma^2 + (relative f)^2 + floor^2, with f the model's value.
 
-    relative: unitless, >= 0, or `Free`. floor: 1/sr, >= 0, or `Free` with low > 0.
+    relative: unitless, in [0, 1e100], or `Free`. floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
     use_sigma: take the measurement's own sigma where it has one.
-    tails: "gaussian", or "student" with `degrees_of_freedom` > 0, whose scale (not standard deviation) is then sigma.
+    tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
+    then sigma.
     Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
@@ -45,22 +49,23 @@ class Noise:
     degrees_of_freedom: float = 4.0
 
     def __post_init__(self) -> None:
-        for field in ("relative", "floor"):
+        for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
             level = getattr(self, field)
-            if level is None:
-                continue
             if isinstance(level, Free):
                 if level.shape != ():
                     raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
-                low = level.arrays()[1]
-                if low < 0 or (field == "floor" and low == 0):
-                    raise ValueError(f"Noise.{field}.low is {low}; it must be {'>= 0' if low < 0 else 'above 0'}")
-            elif not (isinstance(level, int | float) and math.isfinite(level) and level >= 0):
-                raise ValueError(f"Noise.{field} is {level!r}; it must be a finite number >= 0, Free or None")
+                for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
+                    _check_range(f"{field}.{end}", float(value), least, LEVELS[1])
+            elif level is not None and level != 0:
+                _check_range(field, level, least, LEVELS[1])
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
-        if not (math.isfinite(self.degrees_of_freedom) and self.degrees_of_freedom > 0):
-            raise ValueError(f"Noise.degrees_of_freedom is {self.degrees_of_freedom}; it must be finite and above 0")
+        _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
+
+
+def _check_range(field: str, value: Any, low: float, high: float) -> None:
+    if not (isinstance(value, int | float) and low <= value <= high):
+        raise ValueError(f"Noise.{field} is {shown(value)}; it must be a number in [{low:g}, {high:g}]")
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:

@@ -18,66 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy import stats
 
-
-@dataclass(frozen=True)
-class Uniform:
-    """Constant density within the bounds."""
-
-    logarithmic: ClassVar[bool] = False
-
-    def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation in the coordinate where the prior is Gaussian; 0: flat there."""
-        return 0.0, 0.0
-
-
-@dataclass(frozen=True)
-class LogUniform:
-    """Density proportional to 1 / value within the bounds, which must be positive."""
-
-    logarithmic: ClassVar[bool] = True
-
-    def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation of the logarithm; 0: flat there."""
-        return 0.0, 0.0
-
-
-@dataclass(frozen=True)
-class Normal:
-    """Gaussian with `mean` and standard deviation `sd` > 0, cut off at the bounds and normalised within them."""
-
-    mean: float
-    sd: float
-    logarithmic: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        _require_finite("Normal.mean", self.mean)
-        _require_positive("Normal.sd", self.sd)
-
-    def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation."""
-        return float(self.mean), 1.0 / float(self.sd)
-
-
-@dataclass(frozen=True)
-class LogNormal:
-    """The logarithm is Gaussian about log(`median`) with standard deviation `sd`; cut off at the positive bounds."""
-
-    median: float
-    sd: float
-    logarithmic: ClassVar[bool] = True
-
-    def __post_init__(self) -> None:
-        _require_positive("LogNormal.median", self.median)
-        _require_positive("LogNormal.sd", self.sd)
-
-    def gaussian(self) -> tuple[float, float]:
-        """Centre and inverse standard deviation of the logarithm."""
-        return math.log(self.median), 1.0 / float(self.sd)
-
-
-Prior = Uniform | LogUniform | Normal | LogNormal
+from fits._values import shown
+from fits.priors import LogNormal as LogNormal
+from fits.priors import LogUniform as LogUniform
+from fits.priors import Normal as Normal
+from fits.priors import Prior as Prior
+from fits.priors import Uniform as Uniform
+from fits.priors import log_normaliser, require_computable
 
 
 @dataclass(frozen=True)
@@ -86,13 +34,15 @@ class Free:
 
     `start`, `low`, `high` are numbers or one per channel (then a prior holds for each channel alike); the unit is that
     of the number it stands for. Requires low < high, start in [low, high], and low > 0 for `LogNormal` and
-    `LogUniform`. Each place is a parameter of its own, even where the same object stands twice.
+    `LogUniform`. A `Normal` must have its mean within 37 standard deviations of the bounds, and a standard deviation
+    above 1e-15 of the distance from the mean to either bound, so that its density can be computed (`LogNormal`: the
+    same of the logarithms). Each place is a parameter of its own, even where the same object stands twice.
     """
 
     start: float | tuple[float, ...]
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
-    prior: Prior = Uniform()
+    prior: Prior
 
     __layerjax_placeholder__: ClassVar[bool] = True
 
@@ -105,16 +55,19 @@ class Free:
     ):
         prior = Uniform() if prior is None else prior
         if not isinstance(prior, Prior):
-            raise ValueError(f"Free.prior is {prior!r}; it must be Uniform, LogUniform, Normal, LogNormal or None")
+            raise ValueError(f"Free.prior is {shown(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None")
         for field, value in (("start", start), ("low", low), ("high", high), ("prior", prior)):
             object.__setattr__(self, field, value if field == "prior" else _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
         if np.any(lower >= upper):
-            raise ValueError(f"Free.low is {self.low} and Free.high is {self.high}; low must be below high")
+            raise ValueError(
+                f"Free.low is {shown(self.low)} and Free.high is {shown(self.high)}; low must be below high"
+            )
         if np.any((first < lower) | (first > upper)):
-            raise ValueError(f"Free.start is {self.start}; it must lie in [{self.low}, {self.high}]")
-        if prior.logarithmic and np.any(lower <= 0):
-            raise ValueError(f"Free.low is {self.low}; it must be above 0 for the prior {prior}")
+            raise ValueError(
+                f"Free.start is {shown(self.start)}; it must lie in [{shown(self.low)}, {shown(self.high)}]"
+            )
+        require_computable(prior, lower, upper)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -127,7 +80,8 @@ class Free:
             start, low, high = np.broadcast_arrays(*(np.asarray(x, float) for x in (self.start, self.low, self.high)))
         except ValueError:
             raise ValueError(
-                f"Free: start {self.start}, low {self.low} and high {self.high} have different numbers of channels"
+                f"Free: start {shown(self.start)}, low {shown(self.low)} and high {shown(self.high)} have different "
+                "numbers of channels"
             ) from None
         return start, low, high
 
@@ -150,7 +104,7 @@ class Box(eqx.Module):
         high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
         priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
-        logs = [_log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)]
+        logs = [log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)]
         return cls(
             low=jnp.asarray(low),
             high=jnp.asarray(high),
@@ -259,34 +213,13 @@ def is_free(leaf: Any) -> bool:
     return isinstance(leaf, Free)
 
 
-def _log_normaliser(prior: Prior, low: float, high: float) -> float:
-    centre, inverse_sd = prior.gaussian()
-    a, b = (math.log(low), math.log(high)) if prior.logarithmic else (low, high)
-    if inverse_sd == 0:
-        return math.log(b - a)
-    a, b = (a - centre) * inverse_sd, (b - centre) * inverse_sd
-    if a > 0:  # both ends in the upper tail: mirror, so that the difference keeps its digits
-        a, b = -b, -a
-    log_mass = stats.norm.logcdf(b) + math.log(-math.expm1(stats.norm.logcdf(a) - stats.norm.logcdf(b)))
-    return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
-
-
 def _plain(field: str, value: Any) -> float | tuple[float, ...]:
     try:
         array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{field} is {value!r}; it must be a number or one number per channel") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{field} is {shown(value)}; it must be a number or one number per channel") from None
     if array.ndim > 1 or array.size == 0:
         raise ValueError(f"{field} has shape {array.shape}; it must be a number or one number per channel")
-    _require_finite(field, array)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{field} is {shown(array.tolist())}; it must be finite")
     return float(array) if array.ndim == 0 else tuple(array.tolist())
-
-
-def _require_finite(field: str, value: Any) -> None:
-    if not np.all(np.isfinite(value)):
-        raise ValueError(f"{field} is {value}; it must be finite")
-
-
-def _require_positive(field: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{field} is {value}; it must be finite and above 0")

@@ -21,11 +21,8 @@ Keys are the parameters of the classes of the same name; the `kind` of an SGGX i
 ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.
 """
 
-import difflib
 import inspect
-import math
-import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -36,7 +33,21 @@ import tomli_w
 
 import layerjax as lj
 from fits._files import write_text
-from fits.likelihood import Noise, Objective
+from fits._values import (
+    ANY,
+    Range,
+    check_keys,
+    choice,
+    numbers,
+    one_number,
+    read_tables,
+    require_table,
+    shown,
+    truth,
+    whole_number,
+    whole_numbers,
+)
+from fits.likelihood import LEVELS, Noise, Objective
 from fits.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
 from layerjax import gallery
 
@@ -51,7 +62,6 @@ _TRANSPORTS: _Kinds = {
 }
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
 _FREE_KEYS = ("start", "low", "high", "prior")
-_ANY = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,24 +80,16 @@ class ProblemFile:
 def read_problem(path: str | Path) -> ProblemFile:
     """Read a stack, and what else the file says about fitting it. ValueError, on one line, for bad input."""
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        text = path.read_bytes().decode("utf-8")
-        tables = tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: not valid TOML: {error}") from None
+    text, tables = read_tables(path)
     try:
         known = ("about", "transport", "objective", "gallery", "layers", "base", "noise", "scale")
-        _check_keys("the file", tables, known)
+        check_keys("the file", tables, known)
         return ProblemFile(
             stack=_stack({key: tables[key] for key in ("gallery", "layers", "base") if key in tables}),
             transport=_transport(tables.get("transport", "auto")),
             noise=_noise(tables.get("noise", {})),
             scale=_scale(tables["scale"]) if "scale" in tables else None,
-            objective=cast(Objective, _choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
+            objective=cast(Objective, choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
             about=_about(tables.get("about", {})),
             text=text,
         )
@@ -126,7 +128,7 @@ def write_problem(
 
 def stack_from_dict(tables: Mapping[str, Any]) -> lj.Stack:
     """A stack, with `Free` parameters where a number is given as a table, from the `layers` and `base` of a file."""
-    _check_keys("the stack", tables, ("layers", "base"))
+    check_keys("the stack", tables, ("layers", "base"))
     layers = tables.get("layers", [])
     if not isinstance(layers, list):
         raise ValueError("layers is not a list of tables, must be written as [[layers]]")
@@ -144,7 +146,7 @@ def _stack(tables: Mapping[str, Any]) -> lj.Stack:
         return stack_from_dict(tables)
     if len(tables) > 1:
         raise ValueError("gallery names a whole stack, must stand without layers and base")
-    return gallery.stack(_choice("gallery", tables["gallery"], gallery.names()))
+    return gallery.stack(choice("gallery", tables["gallery"], gallery.names()))
 
 
 def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
@@ -159,15 +161,16 @@ def stack_to_dict(stack: lj.Stack) -> dict[str, Any]:
 
 def _build(where: str, table: Any, kinds: _Kinds) -> Any:
     """The object that a table with a `kind` describes."""
-    table = _require_table(where, table)
+    table = require_table(where, table)
     if "kind" not in table:
         raise ValueError(f"{where} has no kind, must be one of {', '.join(kinds)}")
-    kind = kinds[_choice(f"{where}.kind", table["kind"], kinds)]
+    kind = kinds[choice(f"{where}.kind", table["kind"], kinds)]
     known = {_key(name): (name, parameter) for name, parameter in inspect.signature(kind).parameters.items()}
-    _check_keys(where, table, ("kind", *known))
+    check_keys(where, table, ("kind", *known))
     hints = get_type_hints(kind)
     given = {}
-    normals = f", {table['distribution']}" if table.get("distribution", "ggx") != "ggx" else ""
+    distribution = table.get("distribution", "ggx")
+    normals = f", {distribution}" if isinstance(distribution, str) and distribution != "ggx" else ""
     for key, (name, parameter) in known.items():
         if key in table:
             ranged = f"{kind.__name__}.{name}{normals if name == 'alpha' else ''}"
@@ -183,72 +186,63 @@ def _build(where: str, table: Any, kinds: _Kinds) -> Any:
 def _value(where: str, value: Any, hint: Any, name: str) -> Any:
     """One parameter, read as what its type hint says."""
     if get_origin(hint) is Literal:
-        return _choice(where, value, get_args(hint))
+        return choice(where, value, get_args(hint))
     alternatives = [kind for kind in get_args(hint) if kind is not NoneType]
     if isinstance(hint, UnionType) and len(alternatives) == 1:  # an option that may be left out
         (hint,) = alternatives
     if hint is bool:
-        if not isinstance(value, bool):
-            raise ValueError(f"{where} is {value!r}, must be true or false")
-        return value
+        return truth(where, value)
     if hint is int:
-        if type(value) is not int:
-            raise ValueError(f"{where} is {value!r}, must be a whole number")
-        return value
+        return whole_number(where, value)
     if hint is float:
-        number = _numbers(where, value, _ANY)
-        if isinstance(number, tuple):
-            raise ValueError(f"{where} is {value!r}, must be one number")
-        return number
+        return one_number(where, value)
     if get_origin(hint) is tuple:
-        count = len(get_args(hint))
-        if not isinstance(value, list) or len(value) != count or any(type(number) is not int for number in value):
-            raise ValueError(f"{where} is {value!r}, must be a list of {count} whole numbers")
-        return tuple(value)
+        return whole_numbers(where, value, len(get_args(hint)))
     if name.endswith(".phase"):
         return _build(where, value, _PHASES)
-    return _number_or_free(where, value, lj.RANGES.get(name, _ANY))
+    return _number_or_free(where, value, lj.RANGES.get(name, ANY))
 
 
-def _number_or_free(where: str, value: Any, allowed: tuple[float, float]) -> float | tuple[float, ...] | Free:
-    return _free(where, value, allowed) if isinstance(value, dict) else _numbers(where, value, allowed)
+def _number_or_free(where: str, value: Any, allowed: Range) -> float | tuple[float, ...] | Free:
+    return _free(where, value, allowed) if isinstance(value, dict) else numbers(where, value, allowed)
 
 
-def _free(where: str, table: Any, allowed: tuple[float, float] = _ANY) -> Free:
-    table = _require_table(where, table)
-    _check_keys(where, table, _FREE_KEYS)
+def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
+    table = require_table(where, table)
+    check_keys(where, table, _FREE_KEYS)
     for key in ("start", "low", "high"):
         if key not in table:
             raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
-    bounds = {key: _numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
+    bounds = {key: numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
+    prior = cast(Prior, _build(f"{where}.prior", table["prior"], _PRIORS)) if "prior" in table else None
     try:
-        return Free(**bounds, prior=_prior(f"{where}.prior", table["prior"]) if "prior" in table else None)
+        return Free(**bounds, prior=prior)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 
 
-def _prior(where: str, table: Any) -> Prior:
-    return cast(Prior, _build(where, table, _PRIORS))
-
-
 def _noise(table: Any) -> Noise:
-    table = _require_table("noise", table)
+    table = require_table("noise", table)
     hints = get_type_hints(Noise)
-    _check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
-    return Noise(**{key: _value(f"noise.{key}", value, hints[key], f"Noise.{key}") for key, value in table.items()})
+    check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
+    given = {key: _value(f"noise.{key}", value, hints[key], f"Noise.{key}") for key, value in table.items()}
+    try:
+        return Noise(**given)
+    except ValueError as error:
+        raise ValueError(str(error).replace("Noise.", "noise.")) from None
 
 
 def _about(table: Any) -> dict[str, str]:
-    for key, text in _require_table("about", table).items():
+    for key, text in require_table("about", table).items():
         if not isinstance(text, str):
-            raise ValueError(f"about.{key} is {text!r}, must be a text")
+            raise ValueError(f"about[{shown(key)}] is {shown(text)}, must be a text")
     return dict(table)
 
 
 def _scale(table: Any) -> Free:
-    scale = _free("scale", table)
-    if scale.shape != () or cast(float, scale.low) <= 0:
-        raise ValueError(f"scale.low is {scale.low}, must be one number above 0")
+    scale = _free("scale", table, LEVELS)
+    if scale.shape != ():
+        raise ValueError(f"scale has {scale.shape[0]} channels, must be one number for all")
     return scale
 
 
@@ -256,49 +250,8 @@ def _transport(value: Any) -> lj.Transport | Literal["auto"]:
     if value == "auto":
         return "auto"
     if isinstance(value, str):
-        value = {"kind": _choice("transport", value, ("auto", *_TRANSPORTS))}
+        value = {"kind": choice("transport", value, ("auto", *_TRANSPORTS))}
     return cast(lj.Transport, _build("transport", value, _TRANSPORTS))
-
-
-def _numbers(where: str, value: Any, allowed: tuple[float, float]) -> float | tuple[float, ...]:
-    """One finite number, or a list of them, within the closed range `allowed`."""
-    low, high = allowed
-    wanted = "a finite number" if allowed == _ANY else f"a number in [{low:g}, {high:g}]"
-    numbers = value if isinstance(value, list) else [value]
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, int | float):
-            raise ValueError(f"{where} is {number!r}, must be {wanted}")
-        if not math.isfinite(number) or not low <= number <= high:
-            raise ValueError(f"{where} is {number:g}, must be {wanted}")
-    if not numbers:
-        raise ValueError(f"{where} is an empty list, must be {wanted} or one a channel")
-    return tuple(float(number) for number in numbers) if isinstance(value, list) else float(value)
-
-
-def _choice(where: str, value: Any, allowed: Iterable[str]) -> str:
-    allowed = tuple(allowed)
-    if value not in allowed:
-        raise ValueError(f"{where} is {value!r}{_suggestion(value, allowed)}, must be one of {', '.join(allowed)}")
-    return cast(str, value)
-
-
-def _check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    for key in table:
-        if key not in allowed:
-            raise ValueError(
-                f"{where} has an unknown key {key!r}{_suggestion(key, allowed)}; allowed: {', '.join(allowed)}"
-            )
-
-
-def _suggestion(value: Any, allowed: Iterable[str]) -> str:
-    close = difflib.get_close_matches(str(value), allowed, n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""
-
-
-def _require_table(where: str, table: Any) -> dict[str, Any]:
-    if not isinstance(table, dict):
-        raise ValueError(f"{where} is {table!r}, must be a table")
-    return table
 
 
 def _module_to_dict(module: Any) -> dict[str, Any]:

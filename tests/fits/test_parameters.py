@@ -30,6 +30,17 @@ PRIORS = {
         (([0.1, 0.2], [0.0, 0.0, 0.0], 1.0), "different numbers of channels"),
         ((0.5, 0.0, 1.0, LogNormal(1.0, 0.1)), "Free.low is 0.0; it must be above 0 for the prior"),
         ((0.5, 0.0, 1.0, "flat"), "Free.prior is 'flat'"),
+        ((10**400, 0.0, 1.0), "Free.start is 1000.*; it must be a number"),
+        ((1.0, -1e308, 1e308), "float64 must hold their difference"),
+        (
+            (1e-310, 1e-310, 1.0, LogUniform()),
+            "Free.low is 1e-310; it must be above 0 for the prior .*, at least 2.2e-308",
+        ),
+        ((1e300, 1e300, np.nextafter(1e300, 2e300), LogUniform()), "float64 must hold their difference"),
+        ((0.5, [0.0, 0.4], 1.0, Normal(-0.3, 0.01)), r"must lie within 37 standard deviations of \[\[0.0, 0.4\], "),
+        ((0.5, 0.0, 1.0, Normal(1.38, 0.01)), "must lie within 37 standard deviations"),
+        ((1.0, 0.5, 2.0, LogNormal(0.5 * np.exp(-0.38), 0.01)), "must lie within 37 standard deviations"),
+        ((0.5, 0.0, 1.0, Normal(0.5, 1e-16)), "its sd must be above 1e-15"),
     ],
 )
 def test_free_refuses(arguments: tuple, message: str) -> None:
@@ -58,6 +69,18 @@ def test_lognormal_density_is_scipys_renormalised_within_the_bounds() -> None:
     expected = reference.logpdf(values) - np.log(reference.cdf(1.3) - reference.cdf(0.8))
     ours = [float(Box.of([free]).log_prior(jnp.array([value]))) for value in values]
     np.testing.assert_allclose(ours, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("mean", [-0.36, 0.0, 0.7, 1.36])
+@pytest.mark.parametrize("sd", [0.01, 1.0, 0.9e6, 1.1e6, 1e20, 1e300])
+def test_priors_near_the_limits_are_computed(mean: float, sd: float) -> None:
+    box = Box.of([Free(0.5, 0.0, 1.0, Normal(mean, sd))])
+    total, _ = integrate.quad(
+        lambda x: float(np.exp(box.log_prior(jnp.array([x])))), 0, 1, points=[0.01, 0.69, 0.71, 0.99]
+    )
+    assert total == pytest.approx(1.0, abs=1e-9)
+    if sd > 1e7:
+        assert float(box.log_prior(jnp.array([0.3]))) == pytest.approx(0.0, abs=1e-6)  # flat
 
 
 @pytest.mark.parametrize("name", PRIORS)
