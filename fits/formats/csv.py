@@ -7,6 +7,8 @@ phi_i, phi_o                 azimuths in degrees, [-360, 360]; phi_o = phi_i + 1
                              Both may be missing: then theta_o is signed, in [-180, 180], positive on the mirror side.
 brdf | brdf_cos | reflectance_factor
                              f in 1/sr | f |cos theta_o| | pi f. For several channels one column each: brdf_red, ...
+bsdf | bsdf_cos | brf, reflectance
+                             other names for the same; a note says what they were taken for
 <that column>_std | _sigma   its standard deviation (optional); an empty cell means unknown
 used                         1 or 0 (optional): whether the sample takes part in fits
 
@@ -29,6 +31,18 @@ from fits.measurements import QUANTITIES, Measurements, Quantity, Source, channe
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
 _NOT_NEGATIVE = (0.0, float("inf"))
 _SUFFIXES = ("_std", "_sigma")
+_QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
+    **{quantity: quantity for quantity in QUANTITIES},
+    "bsdf": "brdf",
+    "bsdf_cos": "brdf_cos",
+    "brf": "reflectance_factor",
+    "reflectance": "reflectance_factor",
+}
+_MEANING: dict[Quantity, str] = {
+    "brdf": "the BRDF in 1/sr",
+    "brdf_cos": "the BRDF times the cosine of theta_o",
+    "reflectance_factor": "the reflectance factor pi times the BRDF",
+}
 _FIRST_LINE = "# layerjax measurements"
 
 
@@ -50,7 +64,8 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
         raise ValueError(f"{path}: the file holds only comments, must have a header line")
     header, body = rows[0], rows[1:]
     table = _Table(header, body)
-    chosen, channels = _value_columns(header, table.names, quantity)
+    kind, channels = _value_columns(header, table.names, quantity)
+    chosen = _QUANTITY_OF[kind]
 
     written_here = lines[0].text == _FIRST_LINE
 
@@ -63,6 +78,8 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
         phi_i, phi_o = np.full(len(body), geometry.LIGHT_AZIMUTH), np.zeros(len(body))
         theta_o = table.column("theta_o", _SIGNED)
         notes = ["no azimuth columns: theta_o is signed, in the plane of incidence, positive on the mirror side"]
+    if kind != chosen:
+        notes.append(f"{_named(list(channels.values()))} taken for {_MEANING[chosen]}")
     wi, wo = geometry.direction(theta_i, phi_i), geometry.direction(theta_o, phi_o)
 
     values = to_bsdf(np.stack([table.column(name) for name in channels.values()], axis=-1), wo, chosen)
@@ -166,28 +183,39 @@ def _delimiter(header: str) -> str:
     return max(",;\t", key=header.count)
 
 
-def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[Quantity, dict[str, str]]:
-    """The quantity to read and its columns, as channel name -> column name."""
-    found: dict[Quantity, dict[str, str]] = {}
-    longest_first = sorted(QUANTITIES, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
+def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
+    """What the names of the value columns begin with, one of `_QUANTITY_OF`, and they, as channel name -> column."""
+    found: dict[str, dict[str, str]] = {}
+    longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
     for name in names:
         match = next((known for known in longest_first if name == known or name.startswith(f"{known}_")), None)
         if match is not None and not name.endswith(_SUFFIXES):
             channel = name.removeprefix(match).removeprefix("_") or channel_names(1)[0]
             found.setdefault(match, {})[channel] = name
-    if wanted is not None and wanted not in found:
-        raise header.error(f"no column {wanted!r}, the file has {', '.join(names)}")
     if not found:
-        raise header.error(f"no value column: must be one of {', '.join(QUANTITIES)}; the file has {', '.join(names)}")
-    if wanted is None and len(found) > 1:
-        raise header.error(f"{len(found)} quantities ({', '.join(found)}): choose one with quantity")
-    chosen = next(iter(found)) if wanted is None else wanted
-    columns = found[chosen]
-    if chosen in columns.values() and len(columns) > 1:
+        allowed = ", ".join(_QUANTITY_OF)
+        raise header.error(f"no value column: must be one of {allowed}; the file has {', '.join(names)}")
+    quantities = dict.fromkeys(_QUANTITY_OF[kind] for kind in found)
+    if wanted is not None and wanted not in quantities:
+        raise header.error(f"no column {wanted!r}, the file has {', '.join(names)}")
+    if wanted is None and len(quantities) > 1:
+        raise header.error(f"{len(quantities)} quantities ({', '.join(quantities)}): choose one with quantity")
+    chosen = next(iter(quantities)) if wanted is None else wanted
+    kinds = [kind for kind in found if _QUANTITY_OF[kind] == chosen]
+    if len(kinds) > 1:
+        raise header.error(f"columns {', '.join(kinds)}: names of one quantity, must be only one of them")
+    columns = found[kinds[0]]
+    if kinds[0] in columns.values() and len(columns) > 1:
         raise header.error(
             f"columns {', '.join(columns.values())}: one without a channel name cannot stand beside others"
         )
-    return chosen, columns
+    return kinds[0], columns
+
+
+def _named(columns: list[str]) -> str:
+    if len(columns) == 1:
+        return f"column {columns[0]}"
+    return f"columns {', '.join(columns if len(columns) < 5 else [columns[0], '...', columns[-1]])}"
 
 
 def _spread_column(names: list[str], column: str) -> str | None:

@@ -49,6 +49,43 @@ def test_quantities_are_converted_once_and_recorded(tmp_path, quantity, factor):
     assert again.source.quantity == quantity  # what came in, although the new file holds BRDF
 
 
+@pytest.mark.parametrize(
+    ("column", "quantity", "factor", "meaning"),
+    [
+        ("bsdf", "brdf", 1.0, "the BRDF in 1/sr"),
+        ("bsdf_cos", "brdf_cos", 1 / np.cos(np.radians(60)), "the BRDF times the cosine of theta_o"),
+        ("brf", "reflectance_factor", 1 / np.pi, "the reflectance factor pi times the BRDF"),
+        ("reflectance", "reflectance_factor", 1 / np.pi, "the reflectance factor pi times the BRDF"),
+    ],
+)
+def test_other_names_of_quantities_are_noted(tmp_path, column, quantity, factor, meaning):
+    path = _file(tmp_path, f"theta_i,phi_i,theta_o,phi_o,{column},{column}_sigma\n10,180,60,0,0.3,0.02\n")
+    data = read(path)
+    np.testing.assert_allclose([data.values[0, 0], data.sigma[0, 0]], np.array([0.3, 0.02]) * factor, rtol=1e-14)
+    assert data.source.quantity == quantity
+    assert data.source.notes == (f"column {column} taken for {meaning}",)
+    np.testing.assert_array_equal(read(path, quantity=quantity).values, data.values)
+
+    names = [f"{column}_{wavelength}" for wavelength in (450, 550, 650)]
+    heads = ",".join([*names, *(f"{name}_std" for name in names)])
+    path = _file(tmp_path, f"theta_i,phi_i,theta_o,phi_o,{heads}\n10,180,60,0,1,2,3,0.1,0.2,0.3\n")
+    data = read(path)
+    assert data.channels == ("450", "550", "650")
+    np.testing.assert_allclose(data.values[0], factor * np.array([1, 2, 3]), rtol=1e-14)
+    np.testing.assert_allclose(data.sigma[0], factor * np.array([0.1, 0.2, 0.3]), rtol=1e-14)
+    assert data.source.notes == (f"columns {', '.join(names)} taken for {meaning}",)
+
+
+def test_names_of_one_quantity_do_not_stand_side_by_side(tmp_path):
+    path = _file(tmp_path, "theta_i,theta_o,brf_red,reflectance_blue\n10,20,1,2\n")
+    with pytest.raises(ValueError, match="columns brf, reflectance: names of one quantity, must be only one of them"):
+        read(path)
+    path = _file(tmp_path, "theta_i,theta_o,bsdf,brf\n10,20,1,2\n")
+    with pytest.raises(ValueError, match=r"2 quantities \(brdf, reflectance_factor\): choose one with quantity"):
+        read(path)
+    assert read(path, quantity="reflectance_factor").source.notes[-1] == "columns not used: bsdf"
+
+
 def test_channels_and_choice_among_quantities(tmp_path):
     head = "theta_i,phi_i,theta_o,phi_o,brdf_red,brdf_650nm,brdf_red_sigma,reflectance_factor_red"
     path = _file(tmp_path, f"{head}\n10,180,20,0,1,2,0.1,3\n20,180,20,0,1,4,,3\n")
@@ -112,7 +149,10 @@ GOOD = "10,180,20,0,0.5\n"
             "line 1: no column 'theta_o', the file has theta_i, phi_i, phi_o, brdf",
         ),
         ("theta_i,phi_i,theta_o,brdf\n1,2,3,4\n", "line 1: no column 'phi_o'"),
-        ("theta_i,phi_i,theta_o,phi_o,value\n1,2,3,4,5\n", "line 1: no value column: must be one of brdf, brdf_cos"),
+        (
+            "theta_i,phi_i,theta_o,phi_o,value\n1,2,3,4,5\n",
+            "no value column: must be one of brdf, brdf_cos, reflectance_factor, bsdf, bsdf_cos, brf, reflectance;",
+        ),
         (HEADER + ",brdf\n10,180,20,0,1,1\n", "line 1, column 'brdf': this column appears twice"),
         (
             HEADER + ",brdf_red\n10,180,20,0,1,1\n",
