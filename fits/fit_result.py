@@ -1,6 +1,7 @@
 """The outcome of a fit: values, how far to trust them, and what else would explain the data."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +12,14 @@ from fits.identifiability import Combination
 from fits.problem import Model, Problem
 
 Floats = NDArray[np.float64]
+
+ENDED = {
+    "this minimum": "reached this minimum",
+    "other minima": "ended at other minima",
+    "out of steps": "ran out of steps",
+    "failed": "failed",
+}
+"""What is said of the starts that ended in each way (see `Fit.ended`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +42,9 @@ class Fit:
     condition_number: of the information about the parameters, each scaled to unit length.
     unresolved: the combinations of parameters that the data alone do not separate, worst first.
     minima: best first. alternatives: those among them, other than the best, that explain the data equally well.
+    without_influence: parameters that the data say nothing about.
+    settings: starts, seed and solver. ended: how many starts ended where ("this minimum", "other minima", "out of
+    steps", "failed").
     """
 
     problem: Problem
@@ -48,6 +60,9 @@ class Fit:
     unresolved: tuple[Combination, ...]
     minima: tuple[Minimum, ...]
     alternatives: tuple[Minimum, ...]
+    without_influence: tuple[str, ...] = ()
+    settings: Mapping[str, int | str] = field(default_factory=dict)
+    ended: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def values(self) -> dict[str, float]:

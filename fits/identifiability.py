@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 UNRESOLVED_BEYOND = 0.1  # boxes: a direction with a larger standard error is not resolved
 OPEN_BEYOND = 1.0  # boxes: nor is this one held within its bounds
 UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
+LARGEST_ERROR = 1e9  # boxes: stands for all larger ones, so that squares of it can be formed
 CERTAIN_MEMBER = 0.05  # weight from which a parameter belongs to a direction
 MEMBER, OWED = 0.01, 0.25  # weight from which it does so if it owes the direction this share of its variance
 
@@ -75,7 +76,13 @@ def unresolved_combinations(root: Floats, names: tuple[str, ...], width: Floats)
 
 def floored(values: Floats) -> Floats:
     """Singular values, those lost in rounding as the smallest that are not: their inverses are large, never wrong."""
-    return np.maximum(values, np.finfo(float).eps * len(values) * max(values[0], np.finfo(float).tiny))
+    return np.maximum(values, np.maximum(np.finfo(float).eps * len(values) * values[0], 1.0 / LARGEST_ERROR))
+
+
+def without_influence(root: Floats, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Parameters that the data say nothing about, whatever is known of the others: their columns of A are all but 0."""
+    lengths = np.linalg.norm(root, axis=0)
+    return tuple(name for name, length in zip(names, lengths, strict=True) if length * UNKNOWN_BEYOND < 1.0)
 
 
 def square(root: Floats) -> Floats:

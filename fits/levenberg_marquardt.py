@@ -23,6 +23,7 @@ FIRST_GROWTH = 4.0
 SMALLEST_DAMPING = 128.0  # units of rounding: keeps a singular matrix positive definite
 LARGEST_DAMPING = 1e12
 SMALLEST_RATIO = 1e-4
+SHORTEST = 1e-7  # column of the Jacobian, of the longest one: shorter ones are damped like this
 PASSES = 3
 
 
@@ -148,16 +149,22 @@ def _projected_step(
 ) -> tuple[Array, Array, Array]:
     """The next trial in the box, the decrease that the quadratic model promises there, and the most it could promise.
 
-    The last belongs to the undamped step of all parameters that are not held, as if there were no box: it bounds what
-    is left to gain.
+    The last belongs to the undamped step of all parameters that are not held, as if there were no box, but no more than
+    the slope gives on the way to the faces of the box: it bounds what is left to gain.
     """
     length = jnp.sqrt(jnp.diagonal(normal))
+    # a parameter of hardly any influence would take a step as wide as the box for next to no gain, however damped
+    short = length < SHORTEST * jnp.max(length)
+    length = jnp.where(short, SHORTEST * jnp.max(length), length)
     scale = jnp.where(length > 0, 1.0 / jnp.where(length > 0, length, 1.0), 1.0)
     matrix = normal * scale[:, None] * scale[None, :]
     slope = gradient * scale
     held = ((y <= 0) & (gradient >= 0)) | ((y >= 1) & (gradient <= 0))
     none = jnp.zeros_like(y)
-    promise = -0.5 * jnp.vdot(jnp.where(held, 0.0, slope), _damped_solve(matrix, slope, none, held, least))
+    weak = held | short
+    promise = -0.5 * jnp.vdot(jnp.where(weak, 0.0, slope), _damped_solve(matrix, slope, none, weak, least))
+    slack = jnp.where(held, 0.0, jnp.abs(gradient) * jnp.where(gradient > 0, y, 1.0 - y))
+    promise = jnp.minimum(promise + jnp.sum(jnp.where(short, slack, 0.0)), jnp.sum(slack))
     stopped, inside = held, none
     for _ in range(PASSES):  # what leaves the box stops at its face; the others are solved for again with that known
         step = _damped_solve(matrix, slope, inside / scale, stopped, damping) * scale

@@ -118,6 +118,7 @@ def page(
         _section(
             "What the data cannot tell",
             _sentences(verdicts.determines(fit)),
+            tables.html_table(tables.unresolved_table(fit)) if fit.unresolved else "",
             _image(images, "correlation", "Correlation of the fitted parameters."),
         ),
         _section("Minima", _sentences(verdicts.minima(fit)), tables.html_table(tables.minima_table(fit))),
@@ -184,6 +185,7 @@ def _fitted(fit: "Fit") -> str:
         ("noise", verdicts.noise_in_words(problem)),
         ("objective", problem.objective),
         ("common scale", verdicts.scale_in_words(problem)),
+        ("starts", verdicts.starts_in_words(fit)),
         ("transport", problem.transport if isinstance(problem.transport, str) else type(problem.transport).__name__),
         *(("note", note) for note in data.source.notes),
         *((("attribution", data.source.attribution),) if data.source.attribution else ()),

@@ -12,41 +12,85 @@ from fits.diagnostics import ResidualStructure, in_plane, incidences
 from fits.verdicts import identifiability
 
 if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as Boxed
+
     from fits.compare import Comparison, Row
     from fits.fit_result import Fit
     from fits.measurements import Measurements
     from fits.posterior import Posterior
 
 MOST_MINIMA = 8
+LONGEST_WORD = 30  # letters of a text that is never wrapped
 
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads, and rows of as many words; `note` stands below."""
+    """A title, column heads, and rows of as many words; `note` stands below.
+
+    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
+    keys: int = 1
 
 
 def print_table(table: Table, stream: TextIO) -> None:
-    """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none."""
-    from rich import box
-    from rich.console import Console, JustifyMethod
-    from rich.table import Table as Boxed
+    """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none.
+
+    One that does not fit becomes several below each other, so that every column is shown.
+    """
+    from rich.console import Console
 
     console = Console(file=stream, width=None if stream.isatty() else 120, highlight=False, markup=False)
-    boxed = Boxed(title=table.title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-    for index, head in enumerate(table.columns):
-        last = index == len(table.columns) - 1
-        justify: JustifyMethod = "right" if _numeric(table, index) else "left"
-        boxed.add_column(head, justify=justify, no_wrap=not last, min_width=12 if last else None)
-    for row in table.rows:
-        boxed.add_row(*row)
-    console.print(boxed)
+    parts = _parts(table, console)
+    for number, part in enumerate(parts, start=1):
+        title = table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"
+        console.print(_boxed(table, part, title, squeezed=_least_width(table, part, console) > console.width))
     if table.note:
         console.print(table.note)
+
+
+def _parts(table: Table, console: "Console") -> list[list[int]]:
+    """The columns of the tables that this one is printed as: its keys, and as many of the others as fit."""
+    keys = list(range(table.keys))
+    parts = [keys]
+    for column in range(table.keys, len(table.columns)):
+        if parts[-1] != keys and _least_width(table, [*parts[-1], column], console) > console.width:
+            parts.append(keys)
+        parts[-1] = [*parts[-1], column]
+    return parts
+
+
+def _least_width(table: Table, columns: list[int], console: "Console") -> int:
+    return console.measure(_boxed(table, columns), options=console.options.update(width=10_000)).minimum
+
+
+def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = False) -> "Boxed":
+    """These columns in a box. Texts may be wrapped, numbers only where the box is to be `squeezed`."""
+    from rich import box
+    from rich.cells import cell_len
+    from rich.table import Table as Boxed
+
+    boxed = Boxed(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index in columns:
+        words = [table.columns[index], *(row[index] for row in table.rows)]
+        longest = max(map(cell_len, words))
+        number = _numeric(table, index)
+        wraps = not number and (index == len(table.columns) - 1 or longest > LONGEST_WORD)
+        boxed.add_column(
+            table.columns[index],
+            justify="right" if number else "left",
+            no_wrap=not (wraps or squeezed),
+            overflow="fold",
+            min_width=None if squeezed else min(longest, 12) if wraps else longest,
+        )
+    for row in table.rows:
+        boxed.add_row(*(row[index] for index in columns))
+    return boxed
 
 
 def html_table(table: Table) -> str:
@@ -98,6 +142,23 @@ def minima_table(fit: "Fit") -> Table:
     return Table("Minima that the starts reached", ("", *heads), tuple(rows), note)
 
 
+def unresolved_table(fit: "Fit") -> Table:
+    """Combinations of parameters that the data do not resolve: how badly, and what they would know of each alone."""
+    rows = []
+    for combination in fit.unresolved:
+        weights, alone = combination.weights, combination.alone
+        size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
+        mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
+        known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
+        rows.append((size, "OPEN" if combination.open else "LOOSE", mixture, known))
+    note = (
+        "In widths of the bounds, from the data alone; along what is OPEN only bounds and priors decide. The last "
+        "column is the standard error that the data would give each parameter if all others were known."
+    )
+    columns = ("error", "", "along", "each alone")
+    return Table("Combinations that the data do not resolve", columns, tuple(rows), note if rows else "")
+
+
 def posterior_table(posterior: "Posterior") -> Table:
     """Median, 68 % interval, mean, autocorrelation time and effective sample size of each parameter."""
     summary = posterior.summary()
@@ -118,7 +179,7 @@ def posterior_table(posterior: "Posterior") -> Table:
 def incidence_table(structure: ResidualStructure) -> Table:
     """Residuals of each incidence in units of sigma."""
     rows = tuple(
-        (f"{group.theta:g}°", str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
+        (degrees(group.theta), str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
         for group in structure.by_incidence
     )
     note = "In units of the assumed sigma: a model that explains the data has mean 0 and rms 1 at every incidence."
@@ -164,11 +225,11 @@ def data_table(data: "Measurements") -> Table:
             np.count_nonzero(data.mask[incidence.rows]),
             np.count_nonzero(flat[incidence.rows]),
         )
-        angles = (f"{incidence.theta:g}°", f"{incidence.phi:g}°", f"{theta.min():g}° to {theta.max():g}°")
+        angles = (degrees(incidence.theta), degrees(incidence.phi), f"{degrees(theta.min())} to {degrees(theta.max())}")
         rows.append((*angles, *map(str, counts), *ranges))
-    heads = tuple(f"BRDF {channel}, 1/sr" for channel in data.channels)
+    heads = tuple(f"BRDF {channel}" for channel in data.channels)
     columns = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
-    return Table("Angles", columns, tuple(_shortened(rows, 40)))
+    return Table("Angles, and BRDF in 1/sr", columns, tuple(_shortened(rows, 40)), keys=2)
 
 
 def comparison_table(comparison: "Comparison") -> Table:
@@ -197,6 +258,11 @@ def comparison_table(comparison: "Comparison") -> Table:
     order = {"loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}[comparison.sorted_by]
     note = " ".join(f"{line[0].upper()}{line[1:]}." for line in (f"sorted by {order}, best first", *comparison.notes))
     return Table("Comparison", tuple(head for head, _ in columns), rows, note)
+
+
+def degrees(angle: float) -> str:
+    """An angle in degrees as a word, to 0.01 at most: ``"89.85°"``, ``"30°"``."""
+    return f"{round(float(angle), 2) + 0.0:g}°"  # the sum makes 0 of -0
 
 
 def with_error(value: float, error: float) -> tuple[str, str]:

@@ -12,10 +12,18 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.identifiability import UNKNOWN_BEYOND, Combination, floored, square, unresolved_combinations
+from fits.identifiability import (
+    UNKNOWN_BEYOND,
+    Combination,
+    floored,
+    square,
+    unresolved_combinations,
+    without_influence,
+)
 from fits.problem import Model, Problem
 
 ON_BOUND = 1e-6  # of the box
+LEAST_PULL = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
 
 Floats = NDArray[np.float64]
 
@@ -24,10 +32,12 @@ Floats = NDArray[np.float64]
 class Uncertainty:
     """Errors at an optimum with P parameters, in physical units.
 
-    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it. Errors, covariance and
+    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (one without influence
+    lies where it happens to). Errors, covariance and
     condition number are conditional on these values; their own errors are NaN and their rows of the covariance 0.
     standard_errors: (P,), infinite where nothing holds a parameter.
     unresolved: the combinations that the data do not resolve, of all parameters, also those at a bound.
+    without_influence: names of those that the data say nothing about at all.
     """
 
     at_bound: NDArray[np.bool_]
@@ -35,6 +45,7 @@ class Uncertainty:
     covariance: Floats
     condition_number: float
     unresolved: tuple[Combination, ...]
+    without_influence: tuple[str, ...]
 
 
 def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
@@ -46,12 +57,16 @@ def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
     count = len(vector)
     if not all(np.all(np.isfinite(part)) for part in (data_root, prior_root, gradient)):
         nowhere = np.zeros(count, bool)
-        return Uncertainty(nowhere, np.full(count, np.inf), np.zeros((count, count)), float("inf"), ())
-    at_bound = ((unit <= ON_BOUND) & (gradient > 0)) | ((unit >= 1 - ON_BOUND) & (gradient < 0))
+        return Uncertainty(nowhere, np.full(count, np.inf), np.zeros((count, count)), float("inf"), (), ())
+    scatter = 1.0  # what a difference in cost is measured in
+    if problem.objective != "likelihood":
+        scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
+    data_root, pull = data_root / np.sqrt(scatter), LEAST_PULL * scatter
+    idle = without_influence(data_root, problem.names)
+    at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
+    at_bound &= ~np.isin(problem.names, idle)
     free = np.flatnonzero(~at_bound)
     width = np.asarray(problem.model.box.slope(jnp.asarray(vector)), float)
-    if problem.objective != "likelihood":
-        data_root = data_root / np.sqrt(max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny))
     unresolved = unresolved_combinations(data_root, problem.names, width)
     data_root, prior_root = data_root[:, free], prior_root[:, free]
     errors, covariance = np.full(count, np.nan), np.zeros((count, count))
@@ -60,7 +75,16 @@ def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unresolved)
+    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unresolved, idle)
+
+
+def local_information(problem: Problem, vector: Floats) -> tuple[Floats, Floats]:
+    """Rows of A, of the data and the prior, (rows, P), at any `vector` (P,): A'A is the information in boxes^-2.
+
+    And the gradient of the negative log-posterior there, (P,), in boxes^-1.
+    """
+    data_root, prior_root, gradient, _ = (np.asarray(x, float) for x in problem.call(_triangles, vector))
+    return np.vstack([data_root, prior_root]), gradient
 
 
 def condition_number(root: Floats) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fits.diagnostics import ResidualStructure
+from fits.fit_result import ENDED
 from fits.identifiability import UNRESOLVED_BEYOND, Combination
 
 if TYPE_CHECKING:
@@ -29,7 +30,9 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         width = float(fit.problem.high[index] - fit.problem.low[index])
         error = fit.standard_errors[name]
         partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
-        if name in fit.at_bound:
+        if name in fit.without_influence:
+            words[name] = "NO INFLUENCE on the data"
+        elif name in fit.at_bound:
             words[name] = "AT BOUND"
         elif name in worst:
             others = [other for other in worst[name].weights if other != name]
@@ -92,6 +95,8 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         )
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
+    if fit.without_influence:
+        sentences.append(f"Without influence on the data: {', '.join(fit.without_influence)}.")
     for combination in fit.unresolved[:1]:
         sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
     if fit.alternatives:
@@ -102,10 +107,14 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
 
 
 def outcome(fit: "Fit") -> list[str]:
-    """A few lines for the terminal: how good, how sure, and how it ended."""
+    """A few lines for the terminal: how good, how sure, how it ended, and what the data leave open."""
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     sure = f"best minimum reached by {fit.minima[0].count} starts, alternatives as good: {len(fit.alternatives)}"
-    return [f"{good}; {sure}", f"Status: {fit.status}", *map(_unresolved, fit.unresolved)]
+    lines = [f"{good}; {sure}", f"Status: {fit.status}"]
+    if fit.unresolved:
+        first, more = fit.unresolved[0], len(fit.unresolved) - 1
+        lines.append(f"{_not_separated(first)}{f' ({more} more)' if more else ''}: see the table in the report.")
+    return lines
 
 
 def noise_in_words(problem: "Problem") -> str:
@@ -142,21 +151,6 @@ def listed(names: Sequence[str]) -> str:
 def _not_separated(combination: Combination) -> str:
     names = list(combination.weights)
     return f"The data do not {'separate' if len(names) > 1 else 'determine'} {listed(names)}"
-
-
-def _unresolved(combination: Combination) -> str:
-    """What is not resolved, how badly, and how well the rest of it is."""
-    weights, alone = combination.weights, combination.alone
-    size = f"{combination.error:.2g} of the bounds" if math.isfinite(combination.error) else "infinite"
-    held = "only bounds and priors decide there" if combination.open else "the bounds and priors hold it as well"
-    if len(weights) == 1:
-        return f"{_not_separated(combination)}: from them alone its standard error is {size}; {held}."
-    mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
-    known = ", ".join(f"{name} to {error:.2g}" for name, error in alone.items())
-    return (
-        f"{_not_separated(combination)}, only other mixtures: along {mixture} (in widths of the bounds) the "
-        f"standard error from the data alone is {size}, and {held}. Were the others known, the data would give {known}."
-    )
 
 
 def _excess(fit: "Fit") -> float:
@@ -196,8 +190,16 @@ def _structure(structure: ResidualStructure) -> list[str]:
 def determines(fit: "Fit") -> list[str]:
     """What the data leave open: condition number, combinations they do not separate, parameters at a bound."""
     sentences = [f"The condition number of the scaled problem is {fit.condition_number:.3g}."]
-    sentences += map(_unresolved, fit.unresolved)
-    if not fit.unresolved:
+    if fit.without_influence:
+        sentences.append(
+            f"Without influence on the data: {', '.join(fit.without_influence)}. Any value explains them as well."
+        )
+    if fit.unresolved:
+        sentences.append(
+            f"The data alone know {len(fit.unresolved)} of {len(fit.vector)} combinations of parameters to no better "
+            f"than {UNRESOLVED_BEYOND:.0%} of their bounds: only bounds and priors hold them."
+        )
+    else:
         sentences.append(
             f"The data alone know every combination of parameters to better than {UNRESOLVED_BEYOND:.0%} of its bounds."
         )
@@ -209,12 +211,19 @@ def determines(fit: "Fit") -> list[str]:
     return sentences
 
 
+def starts_in_words(fit: "Fit") -> str:
+    """How many starts there were, and where they ended, in one line."""
+    if not fit.ended:
+        return "not recorded"
+    run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
+    where = ", ".join(f"{fit.ended[key]} {word}" for key, word in ENDED.items() if fit.ended[key])
+    return f"{sum(fit.ended.values())} ({run}): {where}"
+
+
 def minima(fit: "Fit") -> list[str]:
     """How many starts agree on the minimum, and whether another stack explains the data as well."""
-    best, total = fit.minima[0], sum(minimum.count for minimum in fit.minima)
-    sentences = [
-        f"{best.count} of {total} starts that converged reached the best minimum; {len(fit.minima)} minima were found."
-    ]
+    best, total = fit.minima[0], sum(fit.ended.values()) or sum(minimum.count for minimum in fit.minima)
+    sentences = [f"{best.count} of {total} starts reached the best minimum; {len(fit.minima)} minima were found."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
     if fit.alternatives:

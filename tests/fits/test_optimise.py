@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
+from fits import verdicts
 from fits.compiled import _run
 from fits.geometry import slices
 from fits.identifiability import Combination
@@ -177,7 +178,27 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     assert result.condition_number == np.inf
     assert np.isfinite(result.standard_errors["['a']"])
     assert result.unresolved == (Combination(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
+    assert result.without_influence == ("['c']",)
+    assert result.at_bound == ()
     assert "the data leave 1 direction(s) unresolved" in result.status
+    assert verdicts.identifiability(result)["['c']"] == "NO INFLUENCE on the data"
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-300, 1e-170, 1e-30])
+def test_errors_do_not_overflow_where_hardly_anything_is_known(strength: float) -> None:
+    """An influence of any size: a warning would be an error here."""
+
+    def faint(stack, wi, wo):
+        return line(stack, wi, wo) + strength * (stack["c"] + stack["d"]) * wo[:, :1]
+
+    free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0)}
+    result = fit(free, noisy_line(1.0, 0.5), transport=faint, starts=2)
+    assert result.without_influence == ("['c']", "['d']")
+    assert result.standard_errors["['c']"] == np.inf
+    assert result.standard_errors["['a']"] == pytest.approx(
+        fit(LINE, noisy_line(1.0, 0.5), transport=line, starts=1).standard_errors["['a']"], rel=1e-6
+    )
+    assert np.isfinite(result.covariance).all()
 
 
 def test_two_stacks_that_explain_the_data_equally_well_are_both_reported() -> None:
@@ -289,7 +310,7 @@ def test_a_medium_over_a_base_is_recovered() -> None:
     assert np.all(np.abs(result.vector - expected) < 4 * result.errors)
     assert result.predicted.shape == data.values.shape
     assert float(result.stack.base.albedo) == result.values["base.albedo"]
-    assert [call[:3] for call in calls] == [("fit", 8, 9), ("fit", 9, 9)]
+    assert [call[:3] for call in calls] == [("fit", done, 9) for done in range(1, 10)]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+import layerjax as lj
 from fits import model_pictures, parameter_pictures, pictures, tables, verdicts
 from fits.diagnostics import (
     autocorrelation,
@@ -21,7 +22,10 @@ from fits.diagnostics import (
 from fits.fit_result import Fit
 from fits.geometry import direction, slices
 from fits.identifiability import Combination
+from fits.likelihood import Noise
 from fits.measurements import Measurements, Source
+from fits.optimise import fit
+from fits.parameters import Free
 from fits.report import report
 
 
@@ -146,12 +150,14 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     together = Combination(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
     undecided = Altered(coat_fit, unresolved=(together,), at_bound=(second,))
     words = " ".join(verdicts.determines(undecided))
-    assert f"The data do not separate {first} and {second}" in words
-    assert f"along +0.8 {first}, -0.6 {second}" in words
-    assert "is 0.3 of the bounds" in words
-    assert f"would give {first} to 0.01, {second} to 0.02" in words
+    assert "The data alone know 1 of 2 combinations of parameters to no better than" in words
     assert f"At a bound: {second}" in words
-    assert f"The data do not separate {first} and {second}" in " ".join(verdicts.outcome(undecided))
+    (row,) = tables.unresolved_table(undecided).rows
+    assert row == ("0.3", "LOOSE", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
+    (line,) = (line for line in verdicts.outcome(undecided) if line.startswith("The data"))
+    assert line == f"The data do not separate {first} and {second}: see the table in the report."
+    several = Altered(coat_fit, unresolved=(together, together, together))
+    assert "(2 more): see the table" in verdicts.outcome(several)[-1]  # still one line
     short, fine = verdicts.in_short(undecided, residual_structure(coat_fit.problem.data, standardised(coat_fit)))
     assert f"The data do not separate {first} and {second}." in short
     assert not fine
@@ -160,7 +166,8 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     apart = Altered(coat_fit, correlation=np.eye(2))
     assert verdicts.identifiability(apart)[first] == "yes"
     unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
-    assert f"The data do not determine {first}: from them alone" in " ".join(verdicts.determines(unseen))
+    assert f"The data do not determine {first}:" in " ".join(verdicts.outcome(unseen))
+    assert tables.unresolved_table(unseen).rows[0][:2] == ("infinite", "OPEN")
     assert verdicts.identifiability(unseen)[first] == "OPEN: hardly seen"
 
 
@@ -194,6 +201,17 @@ def test_the_report_replaces_an_earlier_one_only_by_force(coat_fit: Fit, tmp_pat
     with pytest.raises(ValueError, match="exists"):
         report(coat_fit, path=path, force=False)
     assert path.read_text() == "mine"
+
+
+def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
+    values = np.repeat(coat_data.values, 3, axis=1)
+    data = replace(coat_data, values=values, sigma=None, channels=("red", "green", "blue"))
+    stack = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(Free(0.5, 0.0, 1.0)))
+    grey = fit(stack, data, noise=Noise(relative=0.03), starts=1)
+    figure = model_pictures.curves_picture({"grey": grey})
+    assert isinstance(figure, Figure)
+    curves = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 100]
+    assert len(curves) == 3
 
 
 def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
