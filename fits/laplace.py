@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.special import expit, gammaln
 
 from fits.bounded import cost_and_gradient
 from fits.fit_result import Fit
@@ -64,17 +65,15 @@ class Approximation:
         nowhere = np.zeros(count, bool)
         return cls(positions.mean(axis=0), directions * spread, nowhere, nowhere, np.ones(count))
 
-    def mismatch(self, positions: Floats, log_posteriors: Floats) -> float:
-        """Variance of the log-ratio of posterior to approximation over samples: 0 if they agree."""
-        return float(np.var(log_posteriors - self.log_density(positions)))
+    def mean_log_density(self, positions: Floats) -> float:
+        """Over samples of the posterior: the higher, the closer the approximation is to it."""
+        return float(np.mean(self.log_density(positions)))
 
     def draw(self, generator: np.random.RandomState, count: int, shrink: float = 1.0) -> Floats:
         """(count, P) independent draws, `shrink` times closer to the optimum."""
         drawn = np.empty((count, len(self.centre)))
         free = ~self.held
-        normal = generator.standard_normal((count, int(free.sum())))
-        tail = np.sqrt(DEGREES_OF_FREEDOM / generator.chisquare(DEGREES_OF_FREEDOM, (count, 1)))
-        drawn[:, free] = self.centre[free] + shrink * tail * normal @ self.root.T
+        drawn[:, free] = self.centre[free] + shrink * student_draws(generator, count, int(free.sum())) @ self.root.T
         uniform = generator.random_sample((count, int(self.held.sum())))
         reach = self.reach[self.held]
         distance = -reach * np.log1p(uniform * np.expm1(-1.0 / reach))
@@ -84,17 +83,14 @@ class Approximation:
         return drawn
 
     def log_density(self, positions: Floats) -> Floats:
-        """Log-density of the draws at unconstrained `positions` (count, P), up to a constant."""
+        """Log-density of the draws at unconstrained `positions` (count, P)."""
         free = ~self.held
-        total = np.zeros(len(positions))
-        if free.any():
-            whitened = np.linalg.solve(self.root, (positions[:, free] - self.centre[free]).T).T
-            dimension = int(free.sum())
-            total -= 0.5 * (DEGREES_OF_FREEDOM + dimension) * np.log1p(np.sum(whitened**2, axis=1) / DEGREES_OF_FREEDOM)
+        total = student(self.centre[free], self.root, positions[:, free])
         log_odds = np.where(self.lower[self.held], positions[:, self.held], -positions[:, self.held])
-        distance = 1.0 / (1.0 + np.exp(-log_odds))
         logistic = stats.logistic.logpdf(log_odds)  # d distance / d log-odds
-        return total + np.sum(logistic - distance / self.reach[self.held], axis=1)
+        reach = self.reach[self.held]
+        exponential = -expit(log_odds) / reach - np.log(-reach * np.expm1(-1.0 / reach))
+        return total + np.sum(logistic + exponential, axis=1)
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
         """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
@@ -103,16 +99,36 @@ class Approximation:
 
 
 def first_positions(
-    approximation: Approximation, finite: Callable[[Floats], bool], walkers: int, generator: np.random.RandomState
+    draw: Callable[[np.random.RandomState, int, float], Floats],
+    finite: Callable[[Floats], bool],
+    walkers: int,
+    generator: np.random.RandomState,
 ) -> Floats:
-    """Draws about the optimum, (walkers, P), all of finite posterior; closer to it if that is needed.
+    """Draws of an approximation, (walkers, P), all of finite posterior; closer to the optimum if that is needed.
 
     Raises ValueError if even a narrow cloud holds points of posterior zero.
     """
     for shrink in 0.5 ** np.arange(12):
-        positions = approximation.draw(generator, walkers, float(shrink))
+        positions = draw(generator, walkers, float(shrink))
         if finite(positions):
             return positions
     raise ValueError(
         "sampling: points next to the optimum have posterior zero; the model gives values that are not finite"
     )
+
+
+def student(centre: Floats, root: Floats, positions: Floats) -> Floats:
+    """Log-density at positions (count, F) of a Student-t about centre (F,); its covariance is root by its transpose."""
+    dimension = len(centre)
+    if not dimension:
+        return np.zeros(len(positions))
+    whitened = np.linalg.solve(root, (positions - centre).T)
+    freedom = 0.5 * (DEGREES_OF_FREEDOM + dimension)
+    peak = gammaln(freedom) - gammaln(0.5 * DEGREES_OF_FREEDOM) - 0.5 * dimension * np.log(DEGREES_OF_FREEDOM * np.pi)
+    return peak - np.linalg.slogdet(root)[1] - freedom * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
+
+
+def student_draws(generator: np.random.RandomState, count: int, dimension: int) -> Floats:
+    """Draws (count, dimension) from the same about 0, of unit width."""
+    normal = generator.standard_normal((count, dimension))
+    return normal * np.sqrt(DEGREES_OF_FREEDOM / generator.chisquare(DEGREES_OF_FREEDOM, (count, 1)))

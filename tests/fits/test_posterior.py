@@ -109,7 +109,6 @@ def test_the_approximation_is_learned_where_the_fits_own_is_poor(result: Fit, of
     positions = law.rvs(1600, random_state=generator) if offset else own.draw(generator, 1600)
     chain = MemoryChain(16, 2)
     chain.chain, chain.iteration = positions.reshape(100, 16, 2), 100
-    chain.log_prob = (law.logpdf(positions) if offset else own.log_density(positions)).reshape(100, 16)
     chosen = _adapted(chain, own)
     assert (chosen is own) == (offset == 0.0)
     if offset:
