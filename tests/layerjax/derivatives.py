@@ -167,7 +167,7 @@ def agrees(derivative, value, vector, point):
             errors.append(np.abs(wide - narrow) + 16 * np.finfo(float).eps * np.abs(middle).max() / step)
         apart = 0.25 * np.ptp(slopes, axis=0)
         slack = 3 * np.max(errors, axis=0) + 1e-3 * np.max(np.abs(slopes), axis=0) + 1e-6 * scale
-        settled = np.max(errors, axis=0) < 0.02 * np.max(np.abs(slopes), axis=0) + 1e-6 * scale
+        settled = np.max(errors, axis=0) <= 0.02 * np.max(np.abs(slopes), axis=0) + 1e-6 * scale
         low, high = np.min(slopes, axis=0) - apart - slack, np.max(slopes, axis=0) + apart + slack
         found |= settled & (low <= derivative) & (derivative <= high)
         if found.all():
