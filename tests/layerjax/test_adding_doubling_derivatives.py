@@ -45,14 +45,15 @@ def extreme_stack(kind, generator):
     return Stack([flakes((1.0, 0.0, 0.0)), haze(), flakes((0.3, 0.2, 0.9))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "dtype"),
     [
         ("faces", "float32"),
-        pytest.param("metal", "float64", marks=pytest.mark.slow),
-        pytest.param("tilted", "float32", marks=pytest.mark.slow),
-        pytest.param("media", "float32", marks=pytest.mark.slow),
-        pytest.param("media", "float64", marks=pytest.mark.slow),
+        ("metal", "float64"),
+        ("tilted", "float32"),
+        ("media", "float32"),
+        ("media", "float64"),
     ],
 )
 def test_finite_over_the_box(kind, dtype):
