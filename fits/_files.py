@@ -1,8 +1,19 @@
-"""Writing files whole or not at all."""
+"""Writing files whole or not at all, by one process at a time, and so that damage to them is seen."""
 
+import json
+import math
 import os
 import tempfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from io import RawIOBase
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CHECKSUM = "checksum"
 
 
 def write_text(path: str | Path, text: str, force: bool = False) -> None:
@@ -10,22 +21,125 @@ def write_text(path: str | Path, text: str, force: bool = False) -> None:
     write_bytes(path, text.encode(), force)
 
 
-def write_bytes(path: str | Path, content: bytes, force: bool = False) -> None:
-    """Write a file by way of a temporary one beside it; an existing file is a ValueError unless `force`."""
+def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: bool = False) -> None:
+    """Write a file by way of a temporary one beside it; an existing file is a ValueError unless `force`.
+
+    durable: its content has reached the disk before it takes the place of what was there. An OSError names the file.
+    """
     path = Path(path)
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     if not path.parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    with named(path):
+        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
+                if durable:
+                    file.flush()
+                    os.fsync(file.fileno())
+            os.chmod(temporary, permissions(0o666))  # mkstemp makes files that only their owner can read
+            os.replace(temporary, path)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+
+
+def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write several files of a folder, in the place of what is there: where one cannot be written, none is."""
+    with named(folder), tempfile.TemporaryDirectory(prefix=".", suffix=".new", dir=folder) as new:
+        for name, content in contents.items():
+            write_bytes(Path(new) / name, content)
+        for name in contents:
+            os.replace(Path(new) / name, folder / name)
+
+
+def write_json(path: Path, content: Mapping[str, Any], force: bool = False) -> None:
+    """Write a JSON file that holds a checksum of itself; numbers that are not finite become "nan", "inf", "-inf"."""
+    plain = _plain(content)
+    write_text(path, json.dumps(plain | {CHECKSUM: _checksum(plain)}, indent=1) + "\n", force)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What `write_json` wrote, or anyone else. ValueError for what is no JSON object, or not as it was written."""
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-        os.chmod(temporary, permissions(0o666))  # mkstemp makes files that only their owner can read
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not valid JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: holds a {type(content).__name__}, must be an object")
+    checksum = content.pop(CHECKSUM, None)  # layerjax 0.1.0 wrote none
+    if checksum is not None and checksum != _checksum(content):
+        raise ValueError(f"{path}: damaged or changed since it was written, its checksum is not that of its content")
+    return content
+
+
+def text_checksum(path: Path) -> str:
+    """Of a text file, whatever its line ends: version control and editors may change those."""
+    text = path.read_bytes().replace(b"\r\n", b"\n")
+    return f"{zlib.crc32(text):08x}"
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(content).encode()):08x}"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if hasattr(value, "tolist"):
+        return _plain(np.asarray(value).tolist())
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Errors of the operating system in the block, such as a full disk, name this file."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
+
+
+def write_whole(file: RawIOBase, content: bytes, path: Path) -> None:
+    """Write to an unbuffered file; an OSError names it, also where there was room for a part of the content only."""
+    rest = memoryview(content)
+    with named(path):
+        while rest:  # what is left over from a part that was taken fails with its reason
+            rest = rest[file.write(rest) :]
+
+
+@contextmanager
+def locked(path: Path, what: str) -> Iterator[None]:
+    """Hold a lock file for the block, for what it guards; it ends with the process, however that ends.
+
+    Raises ValueError, with the number of the process that holds it, if another one does.
+    """
+    import filelock
+
+    lock = filelock.FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except filelock.Timeout:
+        raise ValueError(f"{what} is in use by another process ({_holder(path)}): one at a time may write it") from None
+    try:
+        with suppress(OSError):  # on a full disk the lock holds without a name in it
+            path.write_text(f"{os.getpid()}\n")
+        yield
+    finally:
+        with suppress(OSError):  # Windows keeps what is open
+            path.unlink()  # while it is held: whoever opened it before sees that it is gone
+        lock.release()
+
+
+def _holder(path: Path) -> str:
+    try:
+        return path.read_text().strip() or "unknown"
+    except OSError:
+        return "unknown"
 
 
 def permissions(mode: int) -> int:

@@ -1,7 +1,8 @@
 """The `layerjax` command: what may be asked for, and how it ends.
 
 Exit codes: 0 done; 1 done, but not to be relied on (a chain that is too short, a fit that did not converge); 2 bad
-input or bad usage, named on stderr, with nothing written; 130 interrupted.
+input, bad usage or a full disk, named on stderr, with nothing written but what the same command goes on with; 130
+interrupted.
 """
 
 import argparse
@@ -22,18 +23,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     from fits import commands  # everything that is slow to import waits until the words make sense
 
     try:
-        return int(getattr(commands, arguments.command)(arguments))
+        code = int(getattr(commands, arguments.command)(arguments))
+        sys.stdout.flush()  # here, where a full disk or a reader that has gone can still be told
+        return code
     except KeyboardInterrupt as interrupt:
         print(f"layerjax: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone, as in `layerjax info FILE | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _end_output()
         return 0
     except (ValueError, OSError) as error:
+        _end_output()
         if arguments.traceback:
             raise
         print(f"layerjax: error: {_one_line(error)}", file=sys.stderr)
         return 2
+
+
+def _end_output() -> None:
+    """What cannot be written to stdout goes nowhere: Python would try again as it ends, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -102,6 +114,8 @@ def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument(
         "--compare", nargs="+", default=(), metavar="DIR2", help="results for the same data to compare with"
     )
+    parser.add_argument("--out", metavar="HTML", help="write the report to this file, and leave DIR as it is")
+    _add_force(parser, "overwrite the file of --out")
 
 
 def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fits._files import write_bytes, write_text
+from fits._files import write_bytes, write_text, write_together
 from fits.formats import read
 from fits.measurements import Measurements
 from fits.progress import show_progress
@@ -39,8 +39,9 @@ def fit(arguments: Namespace) -> int:
     objective = arguments.objective or given.objective
     if arguments.sample and objective != "likelihood":
         raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
-    settings = {"starts": arguments.starts, "seed": arguments.seed, "solver": arguments.solver}
-    with show_progress() as progress, _hint(f"{directory} was not written"):
+    done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
+    kept = f"{directory} was not written; the same command again goes on with the starts that are done"
+    with results.reserved(directory, arguments.force), show_progress() as progress, _hint(kept):
         result = run_fit(
             given.stack,
             data,
@@ -48,14 +49,18 @@ def fit(arguments: Namespace) -> int:
             noise=given.noise,
             scale=given.scale,
             objective=objective,
+            starts=arguments.starts,
+            seed=arguments.seed,
+            solver=arguments.solver,
             progress=progress,
-            **settings,
+            checkpoint=done,
         )
         progress("pictures and report", 0, 1)
         with results.replacing(directory, arguments.force) as folder:
             text = given.text if objective == given.objective else None
-            results.write_fit(result, folder, text, settings)
+            results.write_fit(result, folder, text)
             write_report(folder, directory.resolve().name, result)
+        done.unlink(missing_ok=True)
         progress("pictures and report", 1, 1)
     for table in (tables.parameter_table(result), *([tables.minima_table(result)] if len(result.minima) > 1 else [])):
         tables.print_table(table, sys.stdout)
@@ -80,8 +85,6 @@ def _sample(directory: Path, arguments: Namespace) -> int:
     if not result.is_posterior:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
     walkers, seed = _chain_settings(directory / results.CHAIN, arguments)
-    if arguments.force:
-        (directory / results.SUMMARY).unlink(missing_ok=True)
     again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
     with show_progress() as progress, _hint(again):
         posterior = run_sampler(
@@ -97,6 +100,8 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         progress("pictures and report", 0, 1)
         if verdicts.reportable(posterior):
             results.save_posterior(posterior, directory)
+        else:
+            (directory / results.SUMMARY).unlink(missing_ok=True)
         write_report(directory, directory.resolve().name, result, posterior)
         progress("pictures and report", 1, 1)
     if verdicts.reportable(posterior):
@@ -126,15 +131,23 @@ def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, if asked for beside others."""
     _use_jax()
     from fits import results
+    from fits.report import report as write_page
 
+    _refuse_existing(arguments.out, arguments.force)
     directory = Path(arguments.directory)
+    name, out = directory.resolve().name, arguments.out or directory / results.REPORT
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
+    if arguments.out is None and not os.access(directory, os.W_OK):
+        raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
     others = _candidates([Path(other) for other in arguments.compare], own=directory)
     with show_progress() as progress:
         progress("pictures and report", 0, 1)
-        write_report(directory, directory.resolve().name, result, posterior, others)
+        if arguments.out is None:
+            write_report(directory, name, result, posterior, others)
+        else:
+            write_page(result, posterior, out, others=others, name=name, force=arguments.force)
         progress("pictures and report", 1, 1)
-    print(f"Report: {directory / results.REPORT}")
+    print(f"Report: {out}")
     return DONE
 
 
@@ -145,7 +158,6 @@ def compare(arguments: Namespace) -> int:
     _refuse_existing(arguments.out, arguments.force)
     _use_jax()
     from fits import tables
-    from fits._files import write_text
     from fits.compare import compare as run_compare
 
     candidates = _candidates([Path(directory) for directory in arguments.directories])
@@ -253,9 +265,9 @@ def write_report(
     from fits.report import draw, page
 
     images = draw(result, posterior, others, name)
-    for picture, content in images.items():
-        write_bytes(folder / f"{picture}.png", content, force=True)
-    write_text(folder / results.REPORT, page(result, posterior, images, others, name), force=True)
+    text = page(result, posterior, images, others, name)
+    pictures = {f"{picture}.png": content for picture, content in images.items()}
+    write_together(folder, {**pictures, results.REPORT: text.encode()})
 
 
 def _use_jax() -> None:
@@ -264,8 +276,9 @@ def _use_jax() -> None:
 
     import jax
 
-    # arviz announces its next version on import
+    # arviz announces its next version on import; compiled programs that cannot be kept are compiled again
     warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
     jax.config.update("jax_enable_x64", True)
     if jax.config.values["jax_compilation_cache_dir"] is None:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"

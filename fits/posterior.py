@@ -18,9 +18,10 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from fits.chain import FileChain, MemoryChain
+from fits.chain import FileChain, MemoryChain, stored_chain
 from fits.fit_result import Fit
 from fits.laplace import Approximation, first_positions
+from fits.mixture import Mixture
 from fits.problem import Model, Problem
 from fits.progress import Progress
 
@@ -35,6 +36,7 @@ REPORTED_DRAWS = 2048
 INDEPENDENT = 0.5
 
 Floats = NDArray[np.float64]
+Proposals = Approximation | Mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +158,17 @@ def sample(
         walkers: even, at least twice the number of parameters plus 2.
         seed: of starts and moves; the same seed gives the same chain.
         path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
-            again goes on from its last whole step and ends as it would have. None keeps it in memory.
+            again goes on from its last whole step and ends as it would have. One process at a time writes it, any
+            number may read it. None keeps it in memory.
         max_steps: hard limit; a chain that reaches it is not `converged`.
         resume: False replaces what `path` holds.
         allow_short: let the result report estimates though the chain has not converged.
         progress: called with ("sample", steps, None, note).
 
     Raises:
-        ValueError: the fit's objective is no likelihood; too few walkers; `path` holds a chain of something else; no
-            start with a finite posterior near the optimum.
+        ValueError: the fit's objective is no likelihood; too few walkers; `path` holds a chain of something else, or is
+            in use by another process; no start with a finite posterior near the optimum.
+        OSError: the disk is full, say. What was sampled is kept.
     """
     problem = fit.problem
     if not fit.is_posterior:
@@ -179,12 +183,13 @@ def sample(
     identity = _identity(problem, walkers, seed)
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
-        initial = Approximation.of(fit)
+        initial = Mixture.of(fit) or Approximation.of(fit)
         while not _finished(chain, max_steps):
             state = chain.get_last_sample() if chain.iteration else _first_state(problem, initial, walkers, seed)
             sampler = _sampler(problem, walkers, chain, initial)
             target = min(_next_check(chain.iteration), max_steps)
-            sampler.run_mcmc(state, target - chain.iteration, skip_initial_state_check=bool(chain.iteration))
+            # walkers are drawn from a density of full rank: emcee need not look whether they are
+            sampler.run_mcmc(state, target - chain.iteration, skip_initial_state_check=True)
             chain.checkpoint()
             if progress is not None:
                 progress("sample", chain.iteration, None, _note(chain))
@@ -194,22 +199,25 @@ def sample(
     return _posterior(fit, chain, allow_short)
 
 
+class NoSteps(ValueError):
+    """A chain that has not begun."""
+
+
 def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
     """The posterior kept in a file by `sample`, as far as it got. ValueError if the file is not a chain of this fit."""
-    from fits.chain import read_chain
-
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no chain")
-    stored = read_chain(path)
-    walkers, seed = int(stored["identity"]["walkers"]), int(stored["identity"]["seed"])
-    chain = FileChain(path, walkers, len(fit.problem.names), _identity(fit.problem, walkers, seed))
-    chain.close()
+
+    def expected(stored: dict[str, Any]) -> dict[str, Any]:
+        return _identity(fit.problem, int(stored["walkers"]), int(stored["seed"]))
+
+    chain = stored_chain(path, expected)
     if not chain.iteration:
-        raise ValueError(f"{path}: the chain has no steps yet")
+        raise NoSteps(f"{path}: the chain has no steps yet")
     return _posterior(fit, chain, allow_short)
 
 
-def _sampler(problem: Problem, walkers: int, chain: MemoryChain, initial: Approximation) -> emcee.EnsembleSampler:
+def _sampler(problem: Problem, walkers: int, chain: MemoryChain, initial: Proposals) -> emcee.EnsembleSampler:
     def log_posteriors(positions: Floats) -> Floats:
         return np.asarray(problem.call(_log_posteriors, positions), float)
 
@@ -220,7 +228,7 @@ def _sampler(problem: Problem, walkers: int, chain: MemoryChain, initial: Approx
     )
 
 
-def _adapted(chain: MemoryChain, initial: Approximation) -> Approximation:
+def _adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
     """The fit's approximation, or one learned from the second half of the chain up to its last check if that is closer.
 
     As checks grow apart, so the adaptation fades; and it depends on whole checks only, so that a resumed chain is the
@@ -229,18 +237,20 @@ def _adapted(chain: MemoryChain, initial: Approximation) -> Approximation:
     _, check = _last_checks(chain.iteration)
     if not check:
         return initial
-    positions, log_posteriors = chain.chain[check // 2 : check], chain.log_prob[check // 2 : check].ravel()
+    positions = chain.chain[check // 2 : check]
     positions = positions.reshape(-1, positions.shape[-1])
-    candidates = (initial, Approximation.learned(positions))
-    return min(candidates, key=lambda candidate: candidate.mismatch(positions, log_posteriors))
+    candidates: list[Proposals] = [initial, Approximation.learned(positions)]
+    if isinstance(initial, Mixture):
+        candidates.append(initial.refined(positions))
+    return max(candidates, key=lambda candidate: candidate.mean_log_density(positions))
 
 
-def _first_state(problem: Problem, approximation: Approximation, walkers: int, seed: int) -> emcee.State:
+def _first_state(problem: Problem, approximation: Proposals, walkers: int, seed: int) -> emcee.State:
     def finite(positions: Floats) -> bool:
         return bool(np.all(np.isfinite(problem.call(_log_posteriors, positions))))
 
     generator = np.random.RandomState(seed)
-    positions = first_positions(approximation, finite, walkers, generator)
+    positions = first_positions(approximation.draw, finite, walkers, generator)
     return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 

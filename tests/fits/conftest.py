@@ -6,6 +6,7 @@ import pytest
 
 import layerjax as lj
 from fits.fit_result import Fit
+from fits.formats.csv import write_csv
 from fits.geometry import slices
 from fits.measurements import Measurements
 from fits.optimise import fit
@@ -41,6 +42,15 @@ def coat_data() -> Measurements:
     data = simulate(truth, slices(incidence=(10, 50), azimuth=(0, 60)), noise=0.03, seed=1)
     keep = [True] * (len(data) - 10) + [False] * 10
     return data.where(keep, "the last ten readings are left out")
+
+
+@pytest.fixture
+def work(tmp_path: Path, coat_data: Measurements, coat_toml: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A current directory that holds data.csv and coat.toml."""
+    write_csv(coat_data, tmp_path / "data.csv")
+    (tmp_path / "coat.toml").write_text(coat_toml.read_text())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,6 @@ import pytest
 from fits.cli import main
 from fits.fit_result import Fit
 from fits.formats import read
-from fits.formats.csv import write_csv
 from fits.measurements import Measurements
 from fits.problem import Problem
 from fits.results import load_fit, load_posterior, save_fit
@@ -23,15 +22,6 @@ TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6  # of the stack behind coat_data
 ROOT = Path(__file__).parents[2]
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf\n"
 ROWS = "10,180,20,0,0.1\n10,180,30,0,0.1\n10,180,40,0,0.1\n"
-
-
-@pytest.fixture
-def work(tmp_path: Path, coat_data: Measurements, coat_toml: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A current directory that holds data.csv and coat.toml."""
-    write_csv(coat_data, tmp_path / "data.csv")
-    (tmp_path / "coat.toml").write_text(coat_toml.read_text())
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -284,7 +274,7 @@ def test_help_imports_no_jax() -> None:
     assert "simulate" in done.stdout
 
 
-def test_an_interrupted_fit_exits_with_130_and_leaves_nothing(work: Path, coat_fit: Fit) -> None:
+def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Path, coat_fit: Fit) -> None:
     before = contents(work)
     command = [sys.executable, "-m", "fits.cli", "fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(work.parent / "cache")}
@@ -299,5 +289,9 @@ def test_an_interrupted_fit_exits_with_130_and_leaves_nothing(work: Path, coat_f
     _, error = process.communicate(timeout=60)
     assert first.startswith("layerjax: fit ")
     assert process.returncode == 130
-    assert error.splitlines()[-1] == "layerjax: interrupted: result was not written"
-    assert contents(work) == before
+    assert error.splitlines()[-1] == (
+        "layerjax: interrupted: result was not written; the same command again goes on with the starts that are done"
+    )
+    after = contents(work)
+    assert len(after.pop(str(work / ".result.starts")).splitlines()) > 1  # what it is of, and at least one start
+    assert after == before

@@ -155,8 +155,9 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
         ("fit.json", "[]", "must be an object"),
         ("fit.json", '{"layerjax_result": 99}', "version 99"),
         ("fit.json", '{"layerjax_result": 2}', "damaged"),
-        ("data.csv", "", "empty"),
-        ("problem.toml", "layers = 3", "layers"),
+        ("data.csv", None, "data.csv"),
+        ("data.csv", "", "data.csv: damaged or changed"),
+        ("problem.toml", "layers = 3", "problem.toml: damaged or changed"),
     ],
 )
 def test_a_damaged_result_is_named(coat_fit: Fit, tmp_path: Path, name: str, content: str | None, words: str) -> None:
