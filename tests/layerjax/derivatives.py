@@ -159,7 +159,9 @@ def agrees(derivative, value, vector, point):
         return side * (-3 * middle + 4 * at(side * step) - at(2 * side * step)) / (2 * step)
 
     sides = point.sides if point.kinked or len(point.sides) == 1 else (0,)
-    scale = np.abs(middle).max() + np.abs(derivative).max()
+    # where values and slopes are 0, such as at an index of 1, what they are away from there
+    away = np.max([np.abs(at(side * 1e-2 * point.length)) for side in point.sides], axis=0)
+    scale = np.abs(middle).max() + np.abs(derivative).max() + away
     for step in steps:
         slopes, errors = [], []
         for side in sides:

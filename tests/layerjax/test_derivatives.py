@@ -32,9 +32,18 @@ QUICK = {
 """Those whose derivatives compile fast."""
 
 
+SOME = {
+    "AddingDoubling, multiple": ("varnish", "coated metal", "plate", "hazy coat on metal"),
+    "Statistical, forward": ("varnish on rough paint", "coated metal", "hazy varnish", "plate"),
+    "Statistical, single": ("varnish", "coated metal", "two coats on paint"),
+}
+"""Structures of transports that are others but for one option."""
+
+
 def carried():
     for name, transport in TRANSPORTS.items():
-        for kind, stack in STACKS.items():
+        for kind in SOME.get(name, STACKS):
+            stack = STACKS[kind]
             try:
                 transport.check(stack)
             except ValueError:
