@@ -148,7 +148,7 @@ def agrees(derivative, value, vector, point):
     """
     middle = np.asarray(value(vector))
     found = np.zeros(np.shape(middle), bool)
-    steps = 10.0 ** (-np.arange(4.0, 9.0) if point.kinked else -np.arange(1.0, 9.0)) * 0.5 * point.length
+    steps = 10.0 ** (-np.arange(3.0, 9.0) if point.kinked else -np.arange(1.0, 9.0)) * 0.5 * point.length
 
     def at(step):
         return np.asarray(value(vector.at[point.place].add(step)))
