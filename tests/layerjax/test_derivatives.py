@@ -26,6 +26,9 @@ TRANSPORTS = {
 TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 """Where ends of integrals coincide, and which of them moves depends on rounding: modes agree less well."""
 
+JITTERY = {("Statistical", "two coats on paint")}
+"""Values that jitter by 3e-4 at equal indices, where caps of facets coincide: no difference converges there."""
+
 QUICK = {
     ("SingleScattering", "haze over metal"),
     ("SingleScattering", "flakes' transport"),
@@ -93,7 +96,7 @@ def test_derivatives(name, kind):
         same = 1e-3 if (kind, point.name, point.value) in TIED else 1e-6
         if abs(gradient[point.place] - float(weight @ slope)) > same * size + 1e-12:
             wrong.append(f"{where}: reverse {gradient[point.place]:.6g}, forward {float(weight @ slope):.6g}")
-        if not point.unbounded:
+        if not point.unbounded and not (point.kinked and (name, kind) in JITTERY):
             good = agrees(slope, values, vector, point)
             wrong += [f"{where}: pair {k} has {slope[k]:.4g}" for k in np.flatnonzero(~good)]
         if jnp.float32 not in dtypes:
