@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.special import expit, gammaln
+from scipy.special import expit, gammaln, logit
 
 from fits.bounded import cost_and_gradient
 from fits.fit_result import Fit
@@ -54,7 +54,7 @@ class Approximation:
         values, directions = np.linalg.eigh((fit.covariance / np.outer(stretch, stretch))[free])
         spread = np.clip(np.sqrt(np.maximum(values, 0.0)), NARROWEST, WIDEST)
         reach = np.clip(1.0 / np.maximum(slope, INSIDE), INSIDE, WIDEST_REACH)
-        return cls(np.log(unit) - np.log1p(-unit), directions * spread, held, unit < 0.5, reach)
+        return cls(logit(unit), directions * spread, held, unit < 0.5, reach)
 
     @classmethod
     def learned(cls, positions: Floats) -> "Approximation":
@@ -78,7 +78,7 @@ class Approximation:
         reach = self.reach[self.held]
         distance = -reach * np.log1p(uniform * np.expm1(-1.0 / reach))
         distance = np.clip(shrink * distance, INSIDE, 1.0 - INSIDE)
-        log_odds = np.log(distance) - np.log1p(-distance)
+        log_odds = logit(distance)
         drawn[:, self.held] = np.where(self.lower[self.held], log_odds, -log_odds)
         return drawn
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, logsumexp
+from scipy import stats
+from scipy.special import expit, logit, logsumexp
 
 from fits.bounded import cost_and_gradient
 from fits.fit_result import Fit
@@ -48,8 +49,9 @@ class Mixture:
         slope = np.abs(np.asarray(problem.call(cost_and_gradient, optimum)[1], float))
         held = np.isin(problem.names, fit.at_bound)
         # what is hardly pressed against its bound, and open with others, lies along the ridge
-        part = np.sum(open_directions(problem, optimum, np.ones_like(held)) ** 2, axis=0)
-        held &= (part < LEAST_PART) | (slope > LOOSE)
+        if held.any():
+            part = np.sum(open_directions(problem, optimum, np.ones_like(held)) ** 2, axis=0)
+            held &= (part < LEAST_PART) | (slope > LOOSE)
         points, bounds = ridge(problem, optimum, ~held)
         if len(points) == 1:
             return None
@@ -85,9 +87,8 @@ class Mixture:
             own = OWN_SAMPLES + dimension
             covariance = (scatter + own * prior) / (count + own)[:, None, None]
             covariance *= np.where(self.held[:, None] | self.held, np.eye(dimension), 1.0)
-            now = Mixture(
-                centre, np.linalg.cholesky(covariance), np.log((count + 1.0) / (count + 1.0).sum()), self.held
-            )
+            log_weight = np.log((count + 1.0) / (count + 1.0).sum())
+            now = Mixture(centre, np.linalg.cholesky(covariance), log_weight, self.held)
         centres, roots = np.concatenate([now.centre, self.centre]), np.concatenate([now.root, self.root])
         weights = np.concatenate([np.log1p(-KEPT) + now.log_weight, np.log(KEPT) + self.log_weight])
         return Mixture(centres, roots, weights, self.held)
@@ -99,7 +100,7 @@ class Mixture:
     def log_density(self, positions: Floats) -> Floats:
         """Log-density at unconstrained `positions` (count, P)."""
         units = expit(positions)
-        stretch = np.sum(np.log(units) + np.log1p(-units), axis=1)  # d box / d log-odds
+        stretch = np.sum(stats.logistic.logpdf(positions), axis=1)  # d box / d log-odds
         return logsumexp(self._log_parts(units), axis=0) + np.log(2.0) * np.sum(self.held) + stretch
 
     def draw(self, generator: np.random.RandomState, count: int, shrink: float = 1.0) -> Floats:
@@ -108,14 +109,14 @@ class Mixture:
         while len(drawn) < count:
             more = self._draw(generator, count, shrink)
             drawn = np.concatenate([drawn, more[_inside(more)]])
-        return _log_odds(drawn[:count])
+        return logit(drawn[:count])
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
         """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
         drawn = self._draw(generator, len(positions), 1.0)
         inside = _inside(drawn)
         proposed = positions.copy()
-        proposed[inside] = _log_odds(drawn[inside])
+        proposed[inside] = logit(drawn[inside])
         ratio = self.log_density(positions) - self.log_density(proposed)
         return proposed, np.where(inside, ratio, -np.inf)
 
@@ -134,7 +135,3 @@ class Mixture:
 
 def _inside(units: Floats) -> NDArray[np.bool_]:
     return np.all((units > 0.0) & (units < 1.0), axis=1)
-
-
-def _log_odds(units: Floats) -> Floats:
-    return np.log(units) - np.log1p(-units)

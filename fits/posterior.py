@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
+from scipy.special import logit
 from scipy.stats import qmc
 
 from fits.chain import FileChain, MemoryChain, stored_chain
@@ -320,7 +321,7 @@ def _identity(problem: Problem, walkers: int, seed: int) -> dict[str, Any]:
     """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points."""
     points = qmc.Sobol(len(problem.names), scramble=False).random_base2(2)
     unit = 0.01 + 0.98 * points
-    posteriors = problem.call(_log_posteriors, np.log(unit) - np.log1p(-unit))
+    posteriors = problem.call(_log_posteriors, logit(unit))
     return {
         "names": "\n".join(problem.names),
         "bounds": np.stack([problem.low, problem.high]),

@@ -6,6 +6,7 @@ Points are compared in log-odds of the box, which run on linearly next to a boun
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 
 from fits.bounded import cost_and_gradient
 from fits.identifiability import square
@@ -105,14 +106,13 @@ def _stretch(unit: Floats) -> Floats:
 
 def _place(unit: Floats) -> Floats:
     inner = np.clip(unit, NEXT_TO_BOUND, 1.0 - NEXT_TO_BOUND)
-    return np.log(inner) - np.log1p(-inner) + (unit - inner) / (inner * (1.0 - inner))
+    return logit(inner) + (unit - inner) / (inner * (1.0 - inner))
 
 
 def _unit(place: Floats) -> Floats:
-    edge = np.log(NEXT_TO_BOUND) - np.log1p(-NEXT_TO_BOUND)
+    edge = logit(NEXT_TO_BOUND)
     inner = np.clip(place, edge, -edge)
-    unit = 1.0 / (1.0 + np.exp(-inner))
-    return np.clip(unit + (place - inner) * NEXT_TO_BOUND * (1.0 - NEXT_TO_BOUND), 0.0, 1.0)
+    return np.clip(expit(inner) + (place - inner) * NEXT_TO_BOUND * (1.0 - NEXT_TO_BOUND), 0.0, 1.0)
 
 
 def height(problem: Problem, unit: Floats) -> float:

@@ -14,14 +14,20 @@ Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): se
 shuffling an inner axis of three.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._numerics import safe_sqrt
+from layerjax._parameters import floating
 
 Vector = tuple[Array, Array, Array]
 Factor = Array | float
+
+UNIT_SLACK = 2e-3
+"""What the squared length of a direction may differ from 1: directions come rounded from files."""
 
 
 def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
@@ -29,14 +35,14 @@ def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
 
     `theta` and `phi` broadcast; the result has shape ``broadcast(theta, phi) + (3,)``. theta > pi/2 points below.
     """
-    theta, phi = jnp.broadcast_arrays(real_array("theta", theta), real_array("phi", phi))
+    theta, phi = jnp.broadcast_arrays(floating("theta", theta), floating("phi", phi))
     sin_theta = jnp.sin(theta)
     return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:
     """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions of shape ``(..., 3)``, in radians."""
-    x, y, z = split(real_array("w", w))
+    x, y, z = split(floating("w", w))
     planar = x * x + y * y
     at_pole = planar == 0  # the azimuth is undefined there: give 0, with gradient 0
     azimuth = jnp.where(at_pole, 0.0, jnp.arctan2(jnp.where(at_pole, 0.0, y), jnp.where(at_pole, 1.0, x)))
@@ -95,7 +101,7 @@ def normalize(a: Vector) -> Vector:
     )
 
 
-def tangent(a: Vector) -> Vector:
+def horizontal(a: Vector) -> Vector:
     """The unit vector in the tangent plane (z = 0) below or above a, +x if a has no azimuth."""
     squared = a[0] * a[0] + a[1] * a[1]
     leans = squared > 0
@@ -157,14 +163,33 @@ def frame(n: Vector) -> tuple[Vector, Vector]:
     return tangent, bitangent
 
 
-def real_array(name: str, value: ArrayLike) -> Array:
-    """The value as an array of a floating type; a ValueError for one that is not made of real numbers."""
-    try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: {value!r:.60} is not an array of real numbers") from None
-    if jnp.issubdtype(array.dtype, jnp.floating):
-        return array
-    if not jnp.issubdtype(array.dtype, jnp.integer):
-        raise ValueError(f"{name}: numbers of type {array.dtype} given, real ones needed")
-    return array.astype(jnp.result_type(float))
+def read_directions(**named: ArrayLike) -> list[Array]:
+    """Directions as arrays of one floating type; a ValueError that says what they are if they are none.
+
+    Concrete ones must be of unit length (within 1e-3). Traced ones have no length yet: it is up to the caller.
+    """
+    with jax.ensure_compile_time_eval():  # what is known while a program is traced is looked at as well
+        arrays = [floating(name, value) for name, value in named.items()]
+        for name, array in zip(named, arrays, strict=True):
+            if array.ndim < 1 or array.shape[-1] != 3:
+                raise ValueError(f"{name}: shape {array.shape} given, (..., 3) needed")
+        for name, array in zip(named, arrays, strict=True):
+            if array.size and not isinstance(array, jax.core.Tracer):
+                _require_unit(name, array)
+        dtype = jnp.result_type(*arrays)
+        return [array.astype(dtype) for array in arrays]
+
+
+def _require_unit(name: str, array: Array) -> None:
+    if not float(_farthest_from_unit(array)) < UNIT_SLACK:
+        length = np.linalg.norm(np.asarray(array, float).reshape(-1, 3), axis=-1)
+        first = int(np.argmax(~(np.abs(length - 1.0) < 0.5 * UNIT_SLACK)))
+        where = f" ({name}.reshape(-1, 3)[{first}])" if array.ndim > 1 else ""
+        raise ValueError(f"{name}: a direction has length {length[first]:g}{where}, must be 1")
+
+
+@jax.jit
+def _farthest_from_unit(directions: Array) -> Array:
+    """Largest difference of a squared length from 1; NaN if there is one."""
+    flat = directions.reshape(-1, 3)
+    return jnp.max(jnp.abs((flat * flat) @ jnp.ones(3, flat.dtype) - 1.0))

@@ -13,13 +13,12 @@ from typing import Any, Literal, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels, pick
-from layerjax.directions import Vector, dot, real_array, select, split, tangent
+from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, read_directions, select, split
 from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
@@ -29,9 +28,6 @@ CHUNK_BYTES = 20_000
 
 BLOCK_CHUNKS = 4
 """Chunks that are transposed together."""
-
-UNIT_SLACK = 2e-3
-"""What the squared length of a direction may differ from 1: directions come rounded from files."""
 
 
 class Prepared(eqx.Module):
@@ -223,7 +219,7 @@ def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Ar
         drawn = transport.sample(state, wi, uniforms)
         # what leaves nowhere may be no unit vector: it becomes a direction in the tangent plane, where the BSDF is 0
         left = jnp.abs(dot(drawn, drawn) - 1.0) < UNIT_SLACK
-        wo = select(left, drawn, tangent(drawn))
+        wo = select(left, drawn, horizontal(drawn))
         density = jnp.where(left, transport.pdf(state, wi, wo), 0.0)
         if transport.random:
             return (*wo, density)
@@ -335,35 +331,3 @@ def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
     """Arrays of the tree in the floating type of the directions, which decide the precision of the computation."""
     cast = partial(jax.lax.convert_element_type, new_dtype=dtype)
     return jax.tree.map(lambda leaf: cast(leaf) if eqx.is_inexact_array(leaf) and leaf.dtype != dtype else leaf, tree)
-
-
-def read_directions(**named: ArrayLike) -> list[Array]:
-    """Directions as arrays of one floating type; a ValueError that says what they are if they are none.
-
-    Concrete ones must be of unit length (within 1e-3). Traced ones have no length yet: it is up to the caller.
-    """
-    with jax.ensure_compile_time_eval():  # what is known while a program is traced is looked at as well
-        arrays = [real_array(name, value) for name, value in named.items()]
-        for name, array in zip(named, arrays, strict=True):
-            if array.ndim < 1 or array.shape[-1] != 3:
-                raise ValueError(f"{name}: shape {array.shape} given, (..., 3) needed")
-        for name, array in zip(named, arrays, strict=True):
-            if array.size and not isinstance(array, jax.core.Tracer):
-                _require_unit(name, array)
-        dtype = jnp.result_type(*arrays)
-        return [array.astype(dtype) for array in arrays]
-
-
-def _require_unit(name: str, array: Array) -> None:
-    if not float(_farthest_from_unit(array)) < UNIT_SLACK:
-        length = np.linalg.norm(np.asarray(array, float).reshape(-1, 3), axis=-1)
-        first = int(np.argmax(~(np.abs(length - 1.0) < 0.5 * UNIT_SLACK)))
-        where = f" ({name}.reshape(-1, 3)[{first}])" if array.ndim > 1 else ""
-        raise ValueError(f"{name}: a direction has length {length[first]:g}{where}, must be 1")
-
-
-@jax.jit
-def _farthest_from_unit(directions: Array) -> Array:
-    """Largest difference of a squared length from 1; NaN if there is one."""
-    flat = directions.reshape(-1, 3)
-    return jnp.max(jnp.abs((flat * flat) @ jnp.ones(3, flat.dtype) - 1.0))

@@ -14,8 +14,8 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._numerics import horizon
-from layerjax.directions import split
-from layerjax.evaluate import in_precision, read_directions
+from layerjax.directions import read_directions, split
+from layerjax.evaluate import in_precision
 from layerjax.stack import Stack, channel_count, require_numbers, simplify
 from layerjax.transport._lanes import follow, quotas, standard_error, upright
 from layerjax.transport._walk import Microfacets, Walk
