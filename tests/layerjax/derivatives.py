@@ -51,8 +51,14 @@ STACKS = {
     "two coats on paint": Stack([FACE, Interface(1.2, 0.2)], Lambertian(0.5)),
 }
 
-ASKED_TO_BE_KNOWN = {"dyed varnish": "layers[1].albedo", "dyed coat on metal": "layers[1].albedo"}
-"""What is concrete: transports that carry no scattering medium must know that it scatters nothing."""
+ABSORBING = {"dyed varnish": "layers[1].albedo", "dyed coat on metal": "layers[1].albedo"}
+"""Transports that carry no scattering medium must know that it scatters nothing."""
+
+
+def asked_to_be_known(transport, kind):
+    """The parameter that is concrete, if there is one: `ENDF` must know that what surrounds a slab is the same."""
+    return "layers[1].ior" if (transport, kind) == ("ENDF", "slab, vmf") else ABSORBING.get(kind)
+
 
 UNBOUNDED = {
     ("VMFDiffuse.roughness", 0.0): "the value of the fits leaps there, and slopes diverge towards it",
