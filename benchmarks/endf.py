@@ -11,9 +11,9 @@ import numpy as np
 import layerjax as lj
 from benchmarks import endf_truth, environment
 from benchmarks.results import DIRECTORY, environment_lines, table, write
-from layerjax.transport import endf_warping as warping
-from layerjax.transport.endf_chains import Form
-from layerjax.vmf import concentration_of, sphere_density
+from layerjax.normals.vmf import concentration_of, sphere_density
+from layerjax.transport.endf import warping as warping
+from layerjax.transport.endf.chains import Form
 
 PATHS, QUICK_PATHS = 1_000_000, 100_000
 

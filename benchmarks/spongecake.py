@@ -1,6 +1,6 @@
 """SpongeCake's multiple scattering beside the truth: errors of held-out materials, energy, the paper's figures, fits.
 
-The held-out materials are those that `layerjax.precomputed.spongecake_data` draws for testing; their multiple
+The held-out materials are those that `layerjax.precompute.spongecake.data` draws for testing; their multiple
 scattering is solved once and kept in the folder given as `work`.
 """
 
@@ -23,12 +23,12 @@ from benchmarks import environment
 from benchmarks.results import DIRECTORY, write
 from benchmarks.spongecake_cost import ROUNDS, costs
 from benchmarks.spongecake_tables import Errors, Figure, Fitted, Furnace, Gain, markdown
-from layerjax.distributions import Kind
-from layerjax.precomputed import spongecake_data as materials
-from layerjax.precomputed import spongecake_training as training
-from layerjax.precomputed.learning import Schedule
-from layerjax.precomputed.spongecake import PLANS, SEED
-from layerjax.precomputed.spongecake_training import ENERGY, Parts
+from layerjax.normals.sggx import Kind
+from layerjax.precompute.learning import Schedule
+from layerjax.precompute.spongecake import data as materials
+from layerjax.precompute.spongecake import training as training
+from layerjax.precompute.spongecake.maker import PLANS, SEED
+from layerjax.precompute.spongecake.training import ENERGY, Parts
 
 KINDS: tuple[Kind, ...] = ("surface", "fiber")
 CAKE, FIRST = lj.SpongeCake(), lj.SingleScattering()

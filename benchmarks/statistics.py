@@ -17,7 +17,7 @@ import layerjax as lj
 from benchmarks import environment
 from benchmarks.results import DIRECTORY, environment_lines, table, write
 from layerjax.quadrature import gauss_legendre
-from layerjax.transport.statistics.lobes import Options, statistics
+from layerjax.transport.statistical.lobes import Options, statistics
 
 ANGLES = (0.0, 30.0, 60.0, 75.0)
 FORWARD, SYMMETRIC = lj.Statistical(symmetric=False), lj.Statistical()

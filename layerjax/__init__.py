@@ -11,8 +11,6 @@ from layerjax.evaluate import pdf as pdf
 from layerjax.evaluate import prepare as prepare
 from layerjax.evaluate import sample as sample
 from layerjax.evaluate import unscattered as unscattered
-from layerjax.goniophotometer import Goniogram as Goniogram
-from layerjax.goniophotometer import goniophotometer as goniophotometer
 from layerjax.phase import SGGX as SGGX
 from layerjax.phase import HenyeyGreenstein as HenyeyGreenstein
 from layerjax.stack import Interface as Interface
@@ -30,5 +28,7 @@ from layerjax.transport import SpongeCake as SpongeCake
 from layerjax.transport import Statistical as Statistical
 from layerjax.transport import Transport as Transport
 from layerjax.transport import WeidlichWilkie as WeidlichWilkie
+from layerjax.transport.random_walk.goniophotometer import Goniogram as Goniogram
+from layerjax.transport.random_walk.goniophotometer import goniophotometer as goniophotometer
 
 __version__ = "0.1.0"

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -116,3 +117,9 @@ def leaves_with_names(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every leaf of the tree with its name as a user would write it, such as ``layers[0].phase.alpha``."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_placeholder):
         yield prefix + jax.tree_util.keystr(path).lstrip("."), leaf
+
+
+def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
+    """Arrays of the tree in the floating type of the directions, which decide the precision of the computation."""
+    cast = partial(jax.lax.convert_element_type, new_dtype=dtype)
+    return jax.tree.map(lambda leaf: cast(leaf) if eqx.is_inexact_array(leaf) and leaf.dtype != dtype else leaf, tree)

@@ -17,6 +17,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._numerics import horizon, safe_div
+from layerjax._parameters import in_precision
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, read_directions, select, split
 from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
@@ -325,9 +326,3 @@ def _needed(key: Array | None, function: str) -> Array:
 def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
     prepared = stack if isinstance(stack, Prepared) else prepare(stack, transport)
     return in_precision(prepared, dtype)
-
-
-def in_precision(tree: Any, dtype: jnp.dtype) -> Any:
-    """Arrays of the tree in the floating type of the directions, which decide the precision of the computation."""
-    cast = partial(jax.lax.convert_element_type, new_dtype=dtype)
-    return jax.tree.map(lambda leaf: cast(leaf) if eqx.is_inexact_array(leaf) and leaf.dtype != dtype else leaf, tree)

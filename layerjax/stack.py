@@ -15,7 +15,7 @@ import numpy as np
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
-from layerjax.facets import Distribution, check_facets
+from layerjax.normals.facets import Distribution, check_facets
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Conductor, Surface
 

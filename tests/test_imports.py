@@ -1,6 +1,7 @@
 """Imports point downward, and importing the library loads nothing heavy."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -9,94 +10,34 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# lowest first; a module may import only from lines above its own
-LAYERS = [
+# lowest first; what lies in a package may import what lies in those above its own line, and beside it
+PACKAGES = [
     "layerjax._numerics",
     "layerjax._parameters",
     "layerjax.channels",
     "layerjax.directions",
     "layerjax.quadrature",
     "layerjax.fresnel",
-    "layerjax.distributions",
-    "layerjax.vmf",
-    "layerjax.vmf_flakes",
-    "layerjax.facets",
+    "layerjax.tables",
+    "layerjax.normals",
     "layerjax.phase",
-    "layerjax.surfaces._surface",
-    "layerjax.surfaces.lambertian",
-    "layerjax.surfaces.oren_nayar",
-    "layerjax.surfaces.vmf_coefficients",
-    "layerjax.precomputed",
-    "layerjax.surfaces.vmf_transport",
-    "layerjax.surfaces.vmf_diffuse",
-    "layerjax.surfaces.microfacet",
+    "layerjax.microsurface",
     "layerjax.surfaces",
     "layerjax.stack",
-    "layerjax.transport._transport",
-    "layerjax.transport.single_scattering",
-    "layerjax.transport._walk_rng",
-    "layerjax.transport._walk_scene",
-    "layerjax.transport._walk_surface",
-    "layerjax.transport._microsurface",
-    "layerjax.transport._walk_state",
-    "layerjax.transport._walk_flight",
-    "layerjax.transport._walk",
-    "layerjax.transport._lanes",
-    "layerjax.transport.random_walk",
-    "layerjax.transport.first_order",
-    "layerjax.transport.proposals",
-    "layerjax.transport.discrete",
-    "layerjax.transport.discrete.grid",
-    "layerjax.transport.discrete.inverse",
-    "layerjax.transport.discrete.operators",
-    "layerjax.transport.discrete.sampling",
-    "layerjax.transport.discrete.media",
-    "layerjax.transport.statistics",
-    "layerjax.transport.statistics.variance",
-    "layerjax.transport.statistics.visible",
-    "layerjax.transport.statistics.returns",
-    "layerjax.transport.statistics.energies",
-    "layerjax.transport.discrete.interfaces",
-    "layerjax.transport.discrete.solve",
-    "layerjax.transport.discrete.tables",
-    "layerjax.transport.adding_doubling",
-    "layerjax.transport.spongecake_mapping",
-    "layerjax.transport.spongecake_layers",
-    "layerjax.transport.spongecake_bend",
-    "layerjax.transport.spongecake_lobes",
-    "layerjax.transport.spongecake",
-    "layerjax.transport.endf_warping",
-    "layerjax.transport.endf_chains",
-    "layerjax.transport.endf_slab",
-    "layerjax.transport.endf_drawing",
-    "layerjax.transport.endf",
-    "layerjax.transport.weidlich_wilkie",
-    "layerjax.transport.statistics.adding",
-    "layerjax.transport.statistics.lobes",
-    "layerjax.transport.statistics.tables",
-    "layerjax.transport.statistics.diffuse",
-    "layerjax.precomputed.vmf_diffuse_solver",
-    "layerjax.precomputed.vmf_diffuse",
-    "layerjax.precomputed.shares",
-    "layerjax.precomputed.diffuse_interface",
-    "layerjax.transport.statistics.diffuse_base",
-    "layerjax.transport.statistics.diffuse_lobe",
-    "layerjax.transport.statistics.drawing",
-    "layerjax.transport.statistical",
-    "layerjax.transport",
-    "layerjax.transport.automatic",
-    "layerjax.evaluate",
-    "layerjax.goniophotometer",
-    "layerjax",
     "layerjax.gallery",
-    "layerjax.precomputed.microsurface",
-    "layerjax.precomputed.learning",
-    "layerjax.precomputed.spongecake_data",
-    "layerjax.precomputed.spongecake_training",
-    "layerjax.precomputed.spongecake_energy",
-    "layerjax.precomputed.spongecake_bending",
-    "layerjax.precomputed.spongecake",
-    "layerjax.precomputed.__main__",
+    "layerjax.transport.contract",
+    "layerjax.transport.single_scattering",
+    "layerjax.transport.first_order",
+    "layerjax.transport.weidlich_wilkie",
+    "layerjax.transport.spongecake",
+    "layerjax.transport.endf",
+    "layerjax.transport.adding_doubling",
+    "layerjax.transport.statistical",
+    "layerjax.transport.random_walk",
+    "layerjax.transport",
+    "layerjax.evaluate",
+    "layerjax",
+    "layerjax.precompute",
 ]
 
 
@@ -111,24 +52,39 @@ def imported(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-            yield from (name if name in LAYERS else node.module for name in names)
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                yield name if name in MODULES else node.module
 
 
 def sources(package):
     return sorted((ROOT / package).rglob("*.py"))
 
 
+MODULES = {module_name(path): path for package in ("layerjax", "fits", "benchmarks") for path in sources(package)}
+
+
+def package_of(module):
+    """The longest line of PACKAGES that the module is or lies in."""
+    return max((name for name in PACKAGES if f"{module}.".startswith(f"{name}.")), key=len)
+
+
 @pytest.mark.parametrize("path", sources("layerjax"), ids=module_name)
 def test_layerjax_imports_point_downward(path):
     name = module_name(path)
-    assert name in LAYERS, f"{name} has no place in LAYERS"
+    own = PACKAGES.index(package_of(name))
     for other in imported(path):
         root = other.split(".")[0]
-        trains = {"optax"} if name == "layerjax.precomputed.learning" else set()  # inside a function there
+        trains = {"optax"} if name == "layerjax.precompute.learning" else set()  # inside a function there
         assert root in {*sys.stdlib_module_names, "jax", "equinox", "numpy", "layerjax", *trains}
         if root == "layerjax":
-            assert LAYERS.index(other) < LAYERS.index(name), f"{name} imports {other}"
+            assert PACKAGES.index(package_of(other)) <= own, f"{name} imports {other}"
+
+
+@pytest.mark.parametrize("package", ["layerjax"])
+def test_no_two_modules_need_each_other(package):
+    graph = {name: set(imported(path)) & MODULES.keys() - {name} for name, path in MODULES.items()}
+    graphlib.TopologicalSorter({name: needs for name, needs in graph.items() if name.startswith(package)}).prepare()
 
 
 @pytest.mark.parametrize("path", sources("fits"), ids=module_name)

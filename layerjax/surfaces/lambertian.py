@@ -7,7 +7,7 @@ from layerjax._numerics import safe_sqrt
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector
-from layerjax.surfaces._surface import Surface
+from layerjax.surfaces.contract import Surface
 
 
 class Lambertian(Surface):

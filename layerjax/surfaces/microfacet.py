@@ -8,13 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax import facets, fresnel
+from layerjax import fresnel
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import count, per_channel, pick
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
-from layerjax.facets import Distribution, check_facets, facet_density
+from layerjax.normals import facets
+from layerjax.normals.facets import Distribution, check_facets, facet_density
 from layerjax.quadrature import Nodes
-from layerjax.surfaces._surface import Surface
+from layerjax.surfaces.contract import Surface
 
 
 class Conductor(Surface):

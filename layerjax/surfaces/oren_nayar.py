@@ -16,7 +16,7 @@ from layerjax._numerics import at_least, safe_sqrt
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import per_channel
 from layerjax.directions import Vector
-from layerjax.surfaces._surface import Surface
+from layerjax.surfaces.contract import Surface
 from layerjax.surfaces.lambertian import sample_cosine
 
 _FUJII = 0.5 - 2.0 / (3.0 * jnp.pi)

@@ -16,13 +16,18 @@ from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.facets import Distribution, facet_density, rule, sample
+from layerjax.normals.facets import (
+    Distribution,
+    facet_density,
+    rule,
+    sample,
+)
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
 from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
-from layerjax.transport._transport import Side
+from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 
 

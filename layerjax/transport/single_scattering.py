@@ -28,7 +28,7 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Surface
-from layerjax.transport._transport import Side, Transport
+from layerjax.transport.contract import Side, Transport
 
 BASE = -1
 """Stands for the base among the indices of layers."""

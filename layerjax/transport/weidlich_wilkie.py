@@ -21,10 +21,10 @@ from layerjax import fresnel
 from layerjax._numerics import horizon
 from layerjax.channels import Channels, count, mean, per_channel, pick
 from layerjax.directions import Factor, Vector, combine, half_vector, select
-from layerjax.distributions import ggx_density, sggx_area
+from layerjax.normals.sggx import ggx_density, sggx_area
 from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport._transport import Side, Transport, refuse_vmf
+from layerjax.transport.contract import Side, Transport, refuse_vmf
 from layerjax.transport.first_order import Face
 
 LEAST_SHARE = 0.02

@@ -7,7 +7,7 @@ import pytest
 
 import fits
 import layerjax as lj
-from layerjax.precomputed.vmf_diffuse_solver import all_orders, half_space
+from layerjax.precompute.vmf_diffuse.half_space import all_orders, half_space
 
 ALBEDO, ROUGHNESS, NOISE = (0.518, 0.331, 0.184), 0.5, 0.03
 INCIDENCE, VIEWS, MODES = (10, 35, 60, 75), np.arange(-80, 81, 10), 5

@@ -9,8 +9,9 @@ import pytest
 
 import layerjax as lj
 from layerjax._numerics import safe_sqrt
-from layerjax.precomputed import diffuse_interface, load
-from layerjax.transport.statistics.diffuse import (
+from layerjax.precompute import diffuse_interface
+from layerjax.tables import load
+from layerjax.transport.statistical.diffuse import (
     Coat,
     closed_form,
     coat_means,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax import distributions
 from layerjax.directions import normalize, split
+from layerjax.normals import sggx as distributions
 
 
 def sphere(nodes, axis=None):

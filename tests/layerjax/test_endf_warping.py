@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from benchmarks import endf_truth
-from layerjax import fresnel, vmf
+from layerjax import fresnel
 from layerjax.directions import direction, frame, join, normalize, reflect, refract, split
-from layerjax.transport import endf_warping as warping
-from layerjax.transport.endf_chains import Face, Mirror, chain_concentration, inner_concentration
-from layerjax.transport.endf_slab import inner_slab_concentration, slab_concentration
+from layerjax.normals import vmf
+from layerjax.transport.endf import warping as warping
+from layerjax.transport.endf.chains import (
+    Face,
+    Mirror,
+    chain_concentration,
+    inner_concentration,
+)
+from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration
 
 IOR = 1.5
 THETAS = (0.0, 0.5, 1.0, 1.3)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.statistics.energies import (
+from layerjax.microsurface.directional_albedo import (
     conductor_energy,
     interface_energies,
     lobe_energy,

@@ -9,10 +9,10 @@ import scipy.special
 import layerjax as lj
 from layerjax.directions import split
 from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
-from layerjax.transport._lanes import follow
-from layerjax.transport._walk import Walk
-from layerjax.transport._walk_rng import key_words
-from layerjax.transport._walk_scene import Scene
+from layerjax.transport.random_walk.lanes import follow
+from layerjax.transport.random_walk.random_numbers import key_words
+from layerjax.transport.random_walk.scene import Scene
+from layerjax.transport.random_walk.walk import Walk
 from tests.cases import flakes, haze, tilt3
 
 KEY = jax.random.key(11)

@@ -7,8 +7,8 @@ import pytest
 import scipy.stats
 
 import layerjax as lj
-from layerjax import distributions
 from layerjax.directions import join, split
+from layerjax.normals import sggx as distributions
 from tests.cases import haze, tilt3
 
 DRAWS = 200_000

@@ -8,7 +8,8 @@ import pytest
 
 import layerjax as lj
 from benchmarks.operations import count
-from layerjax.transport.spongecake_layers import pair_of
+from layerjax.tables import load
+from layerjax.transport.spongecake.layers import pair_of
 from tests.layerjax.test_box import POINTS, draw
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 
@@ -128,7 +129,7 @@ def test_nothing_is_added_where_nothing_scatters_twice():
 @pytest.mark.parametrize("name", STACKS)
 def test_error_is_what_the_tables_say(name):
     """Within the 95th percentile of the held-out materials of the record, and well below the first order alone."""
-    record = lj.precomputed.load("spongecake")[f"{len(STACKS[name].layers)}-error"]
+    record = load("spongecake")[f"{len(STACKS[name].layers)}-error"]
     random = np.random.default_rng(1)
     cosines = np.sqrt(random.uniform(0.01, 1.0, (2, 600))) * [[1.0], [1.0]]
     theta, phi = np.arccos(cosines * np.where(np.arange(600) % 2, 1, [[1], [-1]])), random.uniform(0, 6.3, (2, 600))

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.precomputed import load, spongecake
-from layerjax.precomputed import spongecake_bending as bending
-from layerjax.precomputed import spongecake_data as data
-from layerjax.precomputed import spongecake_training as training
-from layerjax.precomputed.learning import Schedule
-from layerjax.transport.spongecake import networks
-from layerjax.transport.spongecake_lobes import evaluate_second, second_lobe
-from layerjax.transport.spongecake_mapping import network, pack, unpack
+from layerjax.precompute.learning import Schedule
+from layerjax.precompute.spongecake import bending as bending
+from layerjax.precompute.spongecake import data as data
+from layerjax.precompute.spongecake import maker as spongecake
+from layerjax.precompute.spongecake import training as training
+from layerjax.tables import load
+from layerjax.transport.spongecake.lobes import evaluate_second, second_lobe
+from layerjax.transport.spongecake.mapping import network, pack, unpack
+from layerjax.transport.spongecake.transport import networks
 
 
 def drawn(media, shards=3, seed=1):

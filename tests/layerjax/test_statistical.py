@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.statistics.lobes import Options, lobe_roughness, statistics
+from layerjax.transport.statistical.lobes import Options, lobe_roughness, statistics
 from tests.layerjax.test_samplers import chi_square
 
 ANGLES = np.radians([0.0, 30.0, 60.0, 75.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.statistics.lobes import Options, statistics
+from layerjax.transport.statistical.lobes import Options, statistics
 
 INTERFACES, COUNT = 10, 24
 BASES = {

@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from benchmarks.statistics import cases, compare
-from layerjax.transport.statistics.lobes import Options, statistics
+from layerjax.transport.statistical.lobes import Options, statistics
 
 LIGHT = lj.direction(jnp.radians(jnp.array([0.0, 60.0])), 0.0)
 FORWARD = Options("multiple", "orders", angles=False, own_side=False)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from layerjax import vmf
+from layerjax.normals import vmf
 
 KAPPAS = np.array([1e-2, 0.3, 0.49, 0.51, 0.99, 1.01, 2.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e6, 1e8])
 X, W = np.polynomial.legendre.leggauss(60)

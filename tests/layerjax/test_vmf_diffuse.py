@@ -10,9 +10,9 @@ import pytest
 
 import layerjax as lj
 from layerjax.directions import split
-from layerjax.surfaces.vmf_coefficients import first_order, second_order, third_order
-from layerjax.surfaces.vmf_diffuse import scattering_orders
-from layerjax.vmf_flakes import areas, concentration
+from layerjax.surfaces.vmf_diffuse.coefficients import first_order, second_order, third_order
+from layerjax.surfaces.vmf_diffuse.flakes import areas, concentration
+from layerjax.surfaces.vmf_diffuse.surface import scattering_orders
 from tests.cases import haze
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 

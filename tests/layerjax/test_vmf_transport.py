@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from layerjax.precomputed import load, vmf_diffuse
-from layerjax.precomputed.vmf_diffuse_solver import all_orders, half_space, orders
-from layerjax.surfaces import vmf_transport
-from layerjax.surfaces.vmf_transport import transport_brdf
+from layerjax.precompute.vmf_diffuse import maker as vmf_diffuse
+from layerjax.precompute.vmf_diffuse.half_space import all_orders, half_space, orders
+from layerjax.surfaces.vmf_diffuse import all_orders as vmf_transport
+from layerjax.surfaces.vmf_diffuse.all_orders import transport_brdf
+from layerjax.tables import load
 
 brdf = jax.jit(transport_brdf)
 
@@ -283,7 +284,7 @@ def test_the_table_is_made_again_to_rounding():
 @pytest.mark.parametrize("roughness", [1e-3, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0])
 def test_error_over_the_hemispheres_beside_the_paper_s_fit(roughness):
     # the fit's error by an independent program: 1 to 8 %
-    from layerjax.surfaces.vmf_diffuse import VMFDiffuse
+    from layerjax.surfaces.vmf_diffuse.surface import VMFDiffuse
 
     space, modes = half_space(width(roughness), 32, 12), np.arange(12)
     u, phi = space.cosines, (np.arange(24) + 0.5) / 24 * np.pi

@@ -1,0 +1,195 @@
+"""Normals of the facets of a rough surface: GGX or von Mises-Fisher, behind one set of functions.
+
+Which of the two is known while tracing, so that neither pays for the other. Masking is separable Smith. GGX normals are
+drawn as they are seen. Seen vMF normals have no sampler in closed form: the polar angle is drawn as it is, the azimuth
+about the plane of incidence from a density linear between 0 and the rim beyond which facets look away. None is lost,
+and what is left to weigh (see `draw_weight`) is 1 where normals are narrow, with a standard deviation of 0.5 at grazing
+light and of 0.6 at kappa = 0.
+"""
+
+from typing import Any, Literal, get_args
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
+from layerjax._parameters import check_range, is_placeholder
+from layerjax.directions import Vector, dot
+from layerjax.normals import sggx as distributions
+from layerjax.normals import vmf
+from layerjax.quadrature import Nodes, flake_rule, gauss_legendre, panels
+
+Distribution = Literal["ggx", "vmf"]
+"""Normals of Walter et al. 2007, or von Mises-Fisher normals with kappa = 2 / alpha^2 (Guo et al. 2015)."""
+
+MOST_SLOPE = 0.999
+"""Slope of the density of azimuths, at most: at 1 the rim would have density 0."""
+
+LEAST_WEIGHT = 1e-9
+"""Of what is left to weigh, and of <wi, m> where it divides: well below its rounding."""
+
+TAIL = 4.6
+"""Quadratures end where kappa (1 - cos theta) is the square of this; 6e-10 of the normals lie beyond."""
+
+
+def check_facets(owner: str, distribution: Any, alpha: Any) -> None:
+    """Refuse a distribution that is none, and a width outside the range that belongs to it."""
+    if distribution not in get_args(Distribution):
+        allowed = ", ".join(map(repr, get_args(Distribution)))
+        raise ValueError(f"{owner}.distribution: {distribution!r} is not one of {allowed}")
+    if not is_placeholder(alpha):
+        check_range(f"{owner}.alpha" if distribution == "ggx" else f"{owner}.alpha, {distribution}", alpha)
+
+
+def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
+    """Density D(m) of normals above the horizon, 1/sr; the integral of D cos over the hemisphere is 1."""
+    if distribution == "ggx":
+        return distributions.ggx_density(m, alpha)
+    return vmf.facet_density(m, vmf.concentration(alpha))
+
+
+def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
+    """2 cos / G1(w): twice the projected area of the facets seen along w, which has this cosine >= 0 with the normal.
+
+    Densities of light that a facet scatters are quotients by it, so that no cosine is left to divide by.
+    """
+    if distribution == "ggx":
+        return cosine + distributions.sggx_area(w, "surface", alpha, None)
+    return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
+
+
+def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
+    """Smith masking G1(w) for w above the horizon."""
+    return 2.0 * w[2] / twice_seen(w[2], w, alpha, distribution)
+
+
+def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:
+    """A normal that is seen from wi (above the horizon), from two uniform numbers; see `facet_density`."""
+    if distribution == "ggx":
+        return distributions.ggx_sample(wi, alpha, u1, u2)
+    normal = vmf.facet_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
+    planar, x, y = _plane(wi)
+    sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
+    slope, rim = _azimuths(wi[2] * cosine, planar * sine)
+    signed = 2.0 * u2 - 1.0
+    part, total = jnp.abs(signed), 1.0 + slope
+    phi = rim * 2.0 * signed / (total + safe_sqrt(total * total - 4.0 * slope * part))
+    along, across = sine * jnp.cos(phi), sine * jnp.sin(phi)
+    return x * along - y * across, y * along + x * across, cosine
+
+
+def facet_density(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
+    """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
+    if distribution == "ggx":
+        return distributions.ggx_density(h, alpha) * distributions.ggx_masking(wi, alpha) / (4.0 * wi[2])
+    kappa = vmf.concentration(alpha)
+    drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.facet_density(h, kappa)
+    return drawn / (4.0 * at_least(dot(wi, h), LEAST_WEIGHT))
+
+
+def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
+    """Density of seen vMF normals, D <wi, m> G1(wi) / cos, over that of `sample`; of GGX normals it is 1.
+
+    It may be divided by: at the rim it stays above 0.
+    """
+    kappa = vmf.concentration(alpha)
+    seen = at_least(dot(wi, m), 0.0) * vmf.masking_over_cosine(wi[2], kappa)
+    return at_least(seen / (vmf.hemisphere_norm(kappa) * _share_drawn(wi, m, kappa)), LEAST_WEIGHT)
+
+
+def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> Nodes:
+    """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
+    if distribution == "ggx":
+        return flake_rule(wi, *distributions.radii("surface", alpha), None, nodes)[0]
+    return _mirror_rule(wi, vmf.concentration(alpha), nodes)
+
+
+def seen_normals(wi: Vector, alpha: Array, polar: int, azimuths: int) -> tuple[Vector, Array]:
+    """vMF normals that wi sees, wi in the plane of x and z: on one side of it (the other is its mirror image).
+
+    Args:
+        wi: shape (n, 1) a component, x <= 0.
+        polar, azimuths: number of polar angles, and of azimuths at each.
+
+    Returns:
+        Normals (n, polar * azimuths) a component, and weights that add up to the integral of D <wi, m> G1(wi) / cos.
+    """
+    kappa = vmf.concentration(alpha)
+    x, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(polar))
+    end = safe_sqrt(at_most(kappa, TAIL * TAIL))
+    t = end * x
+    drop = t * t / kappa
+    sine, cosine = safe_sqrt(drop * (2.0 - drop)), 1.0 - drop
+    share = 2.0 * t * jnp.exp(-t * t) * end * w / -jnp.expm1(-kappa)
+    planar = safe_sqrt(wi[0] * wi[0])
+    _, rim = _azimuths(wi[2] * cosine, planar * sine)
+    middle = (jnp.arange(azimuths, dtype=t.dtype) + 0.5) / azimuths
+    phi = rim[..., None] * middle
+    z = cosine[:, None] * jnp.ones_like(phi)
+    m = (-sine[:, None] * jnp.cos(phi), sine[:, None] * jnp.sin(phi), z)
+    weight = share[:, None] * rim[..., None] * jnp.ones_like(middle) / (jnp.pi * azimuths)
+    flat = tuple(part.reshape(phi.shape[0], -1) for part in (*m, weight))
+    normals = (flat[0], flat[1], flat[2])
+    level = vmf.upper_share(kappa) * vmf.masking_over_cosine(wi[2], kappa) / vmf.hemisphere_norm(kappa)
+    return normals, flat[3] * at_least(dot(wi, normals), 0.0) * level
+
+
+def _plane(wi: Vector) -> tuple[Array, Array, Array]:
+    """Sine of wi, and the unit vector along which it leans, the x axis where it does not."""
+    planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])
+    leans = planar > 0
+    inverse = 1.0 / jnp.where(leans, planar, 1.0)
+    return planar, jnp.where(leans, wi[0] * inverse, 1.0), jnp.where(leans, wi[1] * inverse, 0.0)
+
+
+def _azimuths(level: Array, swing: Array) -> tuple[Array, Array]:
+    """Of normals with <wi, m> = level + swing cos(phi): slope of the density of phi / rim, and the last phi seen."""
+    cut = swing > level
+    slope = at_most(safe_div(jnp.where(cut, 0.0, swing), jnp.where(cut, 1.0, level)), MOST_SLOPE)
+    return jnp.where(cut, MOST_SLOPE, slope), jnp.where(cut, _rim(level, swing, cut), jnp.pi)
+
+
+def _rim(level: Array, swing: Array, cut: Array) -> Array:
+    """The azimuth where level + swing cos(phi) is 0, if |level| < swing (`cut`)."""
+    wide, low = jnp.where(cut, swing, 1.0), jnp.where(cut, level, 0.5)
+    return jnp.arctan2(safe_sqrt((wide - low) * (wide + low)), -low)
+
+
+def _share_drawn(wi: Vector, m: Vector, kappa: Array) -> Array:
+    """Density of `sample` over that of all normals, M."""
+    planar, x, y = _plane(wi)
+    sine = safe_sqrt(m[0] * m[0] + m[1] * m[1])
+    slope, rim = _azimuths(wi[2] * m[2], planar * sine)
+    along, across = x * m[0] + y * m[1], x * m[1] - y * m[0]
+    upright = sine == 0
+    phi = jnp.abs(jnp.arctan2(jnp.where(upright, 0.0, across), jnp.where(upright, 1.0, along)))
+    return jnp.pi * (1.0 + slope * (1.0 - 2.0 * at_most(phi / rim, 1.0))) / (rim * vmf.upper_share(kappa))
+
+
+def _mirror_rule(wi: Vector, kappa: Array, nodes: int) -> Nodes:
+    """Normals in polar coordinates, each parallel cut where wi is mirrored to the horizon.
+
+    Up to pi/4 - theta_i / 2 no parallel is cut, beyond pi/4 + theta_i / 2 nothing is left of them.
+    """
+    planar, x, y = _plane(wi)
+    theta = jnp.arctan2(planar, wi[2])
+    drop = at_most(TAIL * TAIL / kappa, 1.0)
+    last = 2.0 * jnp.arctan2(safe_sqrt(0.5 * drop), safe_sqrt(1.0 - 0.5 * drop))
+    edges = [jnp.zeros_like(theta), *(at_most(0.25 * jnp.pi + 0.5 * side * theta, last) for side in (-1.0, 1.0))]
+    polar, w_polar = panels(jnp.stack(edges, axis=-1), nodes)
+    sine, cosine = jnp.sin(polar), jnp.cos(polar)
+    # wo.z = cos(theta_i) cos(2 polar) + sin(theta_i) sin(2 polar) cos(phi)
+    level, swing = wi[2][..., None] * jnp.cos(2.0 * polar), planar[..., None] * jnp.sin(2.0 * polar)
+    cut = swing > jnp.abs(level)
+    rim = jnp.where(cut, _rim(level, swing, cut), jnp.where(level > 0, jnp.pi, 0.0))
+    s, w = panels(jnp.asarray([0.0, 1.0], theta.dtype), nodes)
+    phi = rim[..., None] * jnp.concatenate([s, -s])
+    along, across = sine[..., None] * jnp.cos(phi), sine[..., None] * jnp.sin(phi)
+    x, y, z = (part[..., None, None] for part in (x, y, wi[2]))
+    m = (x * along - y * across, y * along + x * across, cosine[..., None] * jnp.ones_like(phi))
+    towards = (wi[0][..., None, None], wi[1][..., None, None], z)
+    facing = dot(towards, m)
+    wo = tuple(2.0 * facing * part - w_part for part, w_part in zip(m, towards, strict=True))
+    weight = 4.0 * facing * (sine * w_polar * rim)[..., None] * jnp.concatenate([w, w])
+    shape = (*weight.shape[:-2], -1)
+    return (wo[0].reshape(shape), wo[1].reshape(shape), wo[2].reshape(shape)), weight.reshape(shape)

@@ -1,0 +1,3 @@
+"""Makers of the tables that `layerjax.tables` ships: ``python -m layerjax.precompute NAME``. Nothing imports them."""
+
+NAMES = ("microsurface", "diffuse_interface", "spongecake", "vmf_diffuse")

@@ -1,0 +1,187 @@
+"""microsurface.npz: what rough GGX surfaces give back of light that meets more than one facet.
+
+Coefficients of the polynomials of `layerjax.microsurface.multiple_bounces`, fitted by least squares to walks on the
+microsurface (Heitz et al. 2016, "Multiple-scattering microfacet BSDFs with the Smith model") at low-discrepancy points
+of the parameters. A walk starts with a given first event and is weighted with its Fresnel share; what leaves at each
+facet is counted in full expectation, and where all of it is known by quadrature only its division is taken from walks.
+Heights are counted as -log C1 >= 0, in which the facets are a homogeneous medium
+(`layerjax.transport.random_walk.microsurface`).
+"""
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax import fresnel
+from layerjax.directions import Vector, dot, normalize, reflect, refract, scale, select
+from layerjax.microsurface.directional_albedo import first_event, first_mirror
+from layerjax.microsurface.multiple_bounces import conductor_basis, interface_bases
+from layerjax.normals.sggx import ggx_sample
+
+SEED = 2016
+FACETS = 200
+"""Facets that walks meet at most; between nearly equal indices light goes straight on through many."""
+ENOUGH = 2e-4
+"""Walks end when no more than this is left on any surface."""
+LANES = 1 << 17
+RIDGE = 0.1
+"""Prior precision of a coefficient, in units of the inverse error of a walk's answer."""
+
+First = Literal["reflected", "refracted", "mirror"]
+
+
+def make(coarse: bool = False, report: Callable[[str], Any] = print) -> dict[str, np.ndarray]:
+    """The table: coefficients for dielectrics with ior < 1 and > 1 ("below", "above"), and for conductors."""
+    table = {"seed": np.array(SEED)}
+    shrink = 32 if coarse else 1
+    begin = time.perf_counter()
+    plan: list[tuple[First, str, int, int]] = [
+        ("reflected", "below", 32768, 512),
+        ("refracted", "below", 32768, 512),
+        ("reflected", "above", 8192, 256),
+        ("refracted", "above", 8192, 256),
+    ]
+    for number, (first, side, points, paths) in enumerate(plan):
+        u = _spread(points // shrink, 3)
+        u = u[:, np.argsort(u[2])]  # walks of like length together
+        cosine, alpha = np.maximum(u[0] ** 1.5, 1e-3), np.maximum(u[1] ** 0.7, 0.01)
+        ior = np.sqrt(1.0 - (15.0 / 16.0) * u[2] ** 2)  # evenly in the cosine of the critical angle
+        arguments = [cosine, alpha, ior if side == "below" else 1.0 / ior, np.zeros_like(ior)]
+        coefficients, error = _fit(_dielectric, arguments, first, paths, number)
+        table[f"{first}_{side}"] = coefficients
+        report(f"{first}_{side}: rms residual {error:.1e}, {time.perf_counter() - begin:.0f} s")
+    u = _spread(16384 // shrink, 4)
+    metals = [np.exp(np.log(0.02) + np.log(500.0) * u[2]), 20.0 * u[3] ** 1.5]
+    arguments = [np.maximum(u[0] ** 1.3, 1e-3), np.maximum(u[1] ** 0.7, 0.01), *metals]
+    table["conductor"], error = _fit(_conductor, arguments, "mirror", 512, 4)
+    report(f"conductor: rms residual {error:.1e}, {time.perf_counter() - begin:.0f} s")
+    return table
+
+
+def _fit(
+    equations: Callable[..., tuple[Array, Array, Array]],
+    arguments: list[np.ndarray],
+    first: First,
+    paths: int,
+    number: int,
+) -> tuple[np.ndarray, float]:
+    """Coefficients, and the residual of the energies that they give."""
+    key = jax.random.fold_in(jax.random.key(SEED), number)
+    batch = LANES // paths
+    rows = []
+    for start in range(0, arguments[0].size, batch):
+        few = [jnp.asarray(argument[start : start + batch]) for argument in arguments]
+        near, far = _estimate(jax.random.fold_in(key, start), *few, first=first, paths=paths)
+        rows.append([np.asarray(part) for part in equations(*few, near, far, first)])
+    design, target, amount = (np.concatenate(part) for part in zip(*rows, strict=True))
+    weight = 1.0 / np.sqrt(0.3 * amount / paths + 1e-8)
+    prior = RIDGE * np.eye(design.shape[1])
+    left_side = np.concatenate([design * weight[:, None], prior])
+    right_side = np.concatenate([target * weight, np.zeros(len(prior))])
+    coefficients = np.linalg.lstsq(left_side, right_side)[0]
+    return coefficients, float(np.std(design @ coefficients - target))
+
+
+@functools.partial(jax.jit, static_argnames="first")
+def _dielectric(
+    cosine: Array, alpha: Array, ior: Array, k: Array, near: Array, far: Array, first: First
+) -> tuple[Array, Array, Array]:
+    _, kept, stuck = first_event(cosine, alpha, ior)
+    basis = interface_bases(cosine, alpha, ior)[first]
+    if first == "reflected":
+        away = near + far
+        return kept[:, None] * basis, kept * near / jnp.where(away > 0, away, 1.0), kept
+    return stuck[:, None] * basis, near, stuck
+
+
+@functools.partial(jax.jit, static_argnames="first")
+def _conductor(
+    cosine: Array, alpha: Array, ior: Array, k: Array, near: Array, far: Array, first: First
+) -> tuple[Array, Array, Array]:
+    _, kept = first_mirror(cosine, alpha, ior, k)
+    _, all_kept = first_mirror(cosine, alpha, 1e-9 * jnp.ones_like(ior), jnp.zeros_like(k))
+    basis, mean = conductor_basis(cosine, alpha, ior, k)
+    return kept[:, None] * basis, all_kept * near / jnp.where(far > 0, far, 1.0) - kept * mean, kept
+
+
+def _spread(count: int, dimensions: int) -> np.ndarray:
+    """Points spread evenly over the unit cube, (dimensions, count), by powers of a generalised golden ratio."""
+    ratio = 1.5
+    for _ in range(60):
+        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
+    return (0.5 + np.arange(1, count + 1) * ratio ** -np.arange(1.0, dimensions + 1)[:, None]) % 1.0
+
+
+@functools.partial(jax.jit, static_argnames=("first", "paths"))
+def _estimate(
+    key: Array, cosine: Array, alpha: Array, ior: Array, k: Array, *, first: First, paths: int
+) -> tuple[Array, Array]:
+    """Means over paths of what leaves after the first facet to the near and to the far side.
+
+    Instead of a far side conductors have what perfect mirrors would have sent to the near side.
+    """
+    shape = (cosine.shape[0], paths)
+    cosine, alpha, ior, k = (jnp.broadcast_to(x[:, None], shape).astype(jnp.float32) for x in (cosine, alpha, ior, k))
+    zero, up = jnp.zeros_like(cosine), jnp.zeros(shape, bool)
+    heights, walks = jax.random.split(key)
+    travel: Vector = (jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), zero, -cosine)
+    height = -jnp.log1p(-jax.random.uniform(heights, shape, jnp.float32)) * cosine / _area(travel, alpha)
+
+    def goes_on(state: tuple[Any, ...]) -> Array:
+        return (state[0] < FACETS) & (jnp.max(jnp.mean(state[3] * state[4], axis=1)) > ENOUGH)
+
+    def step(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        facet, travel, height, weight, level, ior, beyond, near, far = state
+        begins = facet == 0
+        u = jax.random.uniform(jax.random.fold_in(walks, facet), (4, *shape), jnp.float32)
+        wi = scale(-1.0, travel)
+        m = ggx_sample(wi, alpha, u[0], u[1])
+        c = jnp.clip(dot(wi, m), 0.0, 1.0)
+        wo = reflect(wi, m)
+        if first == "mirror":
+            level = level * fresnel.conductor(c, ior, k)
+        else:
+            refracted, exists = refract(wi, m, ior)
+            reflectance = fresnel.dielectric(c, ior)
+            # z counts away from the surface on the side that the ray is on; below, the heights are turned over
+            across: Vector = (refracted[0], refracted[1], -refracted[2])
+            crosses = exists & jnp.where(begins, first == "refracted", u[2] >= reflectance)
+            share = reflectance if first == "reflected" else jnp.where(exists, 1.0 - reflectance, 0.0)
+            level = jnp.where(begins, share, level)
+            wo = select(crosses, across, wo)
+            height = jnp.where(crosses, _overturned(height), height)
+            ior, beyond = jnp.where(crosses, 1.0 / ior, ior), beyond ^ crosses
+        area = _area(wo, alpha)
+        rises = wo[2] > 0
+        escape = jnp.where(rises, jnp.exp(-height * area / jnp.where(rises, wo[2], 1.0)), 0.0)
+        leaves = jnp.where(begins, 0.0, weight * escape)
+        near = near + jnp.where(beyond, 0.0, level * leaves)
+        far = far + (leaves if first == "mirror" else jnp.where(beyond, level * leaves, 0.0))
+        path = -jnp.log1p(-u[3] * (1.0 - escape))  # to the next facet, given that there is one
+        height = jnp.maximum(height - wo[2] * path / jnp.maximum(area, 1e-30), 1e-6)
+        return facet + 1, normalize(wo), height, weight * (1.0 - escape), level, ior, beyond, near, far
+
+    one = jnp.ones_like(zero)
+    start = (jnp.int32(0), travel, height, one, one, ior, up, zero, zero)
+    end = jax.lax.while_loop(goes_on, step, start)
+    near, far = (x.astype(float).mean(axis=1) for x in end[-2:])
+    return near, far
+
+
+def _area(w: Vector, alpha: Array) -> Array:
+    """Projected area of the facets that face a ray along w, (sigma - w_z) / 2."""
+    across = alpha * alpha * (w[0] * w[0] + w[1] * w[1])
+    sigma = jnp.sqrt(across + w[2] * w[2])
+    return 0.5 * jnp.where(w[2] > 0, across / (sigma + jnp.abs(w[2])), sigma - w[2])
+
+
+def _overturned(height: Array) -> Array:
+    """-log(1 - exp(-height))."""
+    small = height < 0.6931
+    return -jnp.where(small, jnp.log(-jnp.expm1(-height)), jnp.log1p(-jnp.exp(-height)))

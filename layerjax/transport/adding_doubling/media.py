@@ -1,0 +1,232 @@
+"""A homogeneous medium on the grid: its phase function at the nodes, a thin slab of it, and doubling from that.
+
+Symbols: K the kernel sigma p of a collision before albedo (Wang 2022, Eq. 4), tau the thickness, a = sigma / mu; the
+thin slab scatters once, in closed form in depth (Eqs. 12 and 16), K tau / (mu_i mu_o) exp(-m) exprel(y), and what is
+caught on its way out scatters once more and leaves: right to the order tau^2, and a lossless slab loses nothing.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._numerics import decay_between, exprel
+from layerjax.channels import per_channel
+from layerjax.directions import Vector, half_vector
+from layerjax.phase import HenyeyGreenstein, PhaseFunction
+from layerjax.stack import Medium, is_known
+from layerjax.transport.adding_doubling.grid import Region
+from layerjax.transport.adding_doubling.operators import (
+    Layer,
+    Operator,
+    Parts,
+    double,
+    matmul,
+    turned,
+)
+from layerjax.transport.adding_doubling.sampling import balance, modes_at_nodes, straight_on
+
+Pair = tuple[Array, Array]
+"""Reflection and transmission, light from above."""
+
+THIN = 0.7e-4
+"""Largest thickness of the slab that doubling starts from: a relative error of 1e-6.
+
+It is no power of two times a round number, so that derivatives by differences do not straddle a change of the number of
+steps.
+"""
+
+MOST_STEPS = 28
+"""Doublings that reach the thickest medium of the box, 1e4."""
+
+
+class Kernel(eqx.Module):
+    """Kernel K of a collision at the nodes, for light from above, in reflection and transmission: (modes, out, in).
+
+    `schlick`: the same times (1 - |wi . h|)^5, if the medium has a Fresnel term. `solid` is the weight of dmu dphi over
+    2 pi, `turn` takes azimuths by half a turn (modes: nothing).
+    """
+
+    plain: Pair
+    schlick: Pair | None
+    area: Array
+    """sigma for light going down at the nodes."""
+    cosine: Array
+    solid: Array
+    azimuths: int | None = eqx.field(static=True)
+
+    def turn(self, operator: Operator) -> Operator:
+        """An operator lit from above to the same lit from below: the medium is its own image under inversion."""
+        return turned(operator, self.azimuths)
+
+    def turn_row(self, values: Array) -> Array:
+        """Values for light going down at the nodes to those for light going up."""
+        if self.azimuths is None:
+            return values
+        split = values.reshape(*values.shape[:-1], -1, self.azimuths)
+        return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
+
+
+def kernel_modes(medium: Medium, region: Region, modes: int) -> Kernel:
+    """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel."""
+    found = modes_at_nodes(lambda wi, wo: _both_sides(medium, wi, wo), region, region, modes)
+    plain, schlick = (found[0], found[1]), (found[2], found[3]) if medium.f0 is not None else None
+    area = medium.phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
+    kernel = Kernel(plain, schlick, area, region.cosine, region.solid, None)
+    return _balanced(kernel, medium.phase)
+
+
+def kernel_ordinates(medium: Medium, region: Region, azimuths: int) -> Kernel:
+    """Kernel of any medium, between all directions of the nodes and equally spaced azimuths."""
+    phi = jnp.asarray(2.0 * np.pi * np.arange(azimuths) / azimuths, region.cosine.dtype)
+    cosine, sine = (jnp.repeat(array, azimuths) for array in (region.cosine, region.sine))
+    azimuth = jnp.tile(phi, region.cosine.shape[0])
+    travel = (sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine)
+    wi = (-travel[0][None], -travel[1][None], travel[2][None])
+    wo = (travel[0][:, None], travel[1][:, None], travel[2][:, None])
+    found = [value[None] for value in _both_sides(medium, wi, wo)]
+    plain, schlick = (found[0], found[1]), (found[2], found[3]) if medium.f0 is not None else None
+    area = medium.phase.cross_section((-travel[0], -travel[1], travel[2]))
+    solid = jnp.repeat(region.solid, azimuths) / azimuths
+    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths), medium.phase)
+
+
+def _both_sides(medium: Medium, wi: Vector, wo: Vector) -> list[Array]:
+    """Kernel in reflection and transmission, and if there is a Fresnel term both times (1 - |wi . h|)^5."""
+    plain, schlick = [], []
+    for side in (1.0, -1.0):
+        out = (wo[0], wo[1], side * wo[2])
+        h, cosine = half_vector(wi, out)
+        value = medium.phase.kernel(wi, out, h)
+        plain.append(value)
+        if medium.f0 is not None:
+            schlick.append(value * fresnel.schlick(cosine, 0.0))
+    return plain + schlick
+
+
+def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
+    """The kernel with a collision scattering exactly sigma.
+
+    Flakes are scaled. What is left goes straight on, as does all that Henyey-Greenstein's peak has too little or too
+    much of: there it changes nothing.
+    """
+    weight = 2.0 * jnp.pi * kernel.solid
+    reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
+    area = kernel.area * jnp.ones_like(weight)
+    if isinstance(phase, HenyeyGreenstein):
+        scale, missing = jnp.ones_like(weight), area - weight @ (reflect + transmit)
+    else:
+        scale, missing = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
+    forward = straight_on(missing, weight)
+    back, onward = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
+
+    def balanced(pair: Pair) -> Pair:
+        return pair[0] * back, pair[1] * onward + forward  # towards exact forward Schlick's term is 1
+
+    schlick = None if kernel.schlick is None else balanced(kernel.schlick)
+    return Kernel(balanced(kernel.plain), schlick, kernel.area, kernel.cosine, kernel.solid, kernel.azimuths)
+
+
+def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
+    """The medium as a layer, by so many doublings (see `doublings`)."""
+    thickness = _column(medium.thickness, kernel)
+    direct = _direct(kernel, thickness)
+    if is_known(medium.albedo, 0.0):
+        return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
+    strength = _strength(medium, kernel)
+
+    @jax.checkpoint
+    def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
+        parts = Parts(once[0], rest[0]), Parts(once[1], rest[1])
+        reflect, transmit = double(*parts, (passed, kernel.turn_row(passed)), kernel.turn)
+        assert reflect is not None
+        assert transmit is not None
+        return reflect, transmit
+
+    def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
+        slab = thickness * depth
+        arguments = rest, _once(kernel, strength, slab), _direct(kernel, slab)
+        if steps is not None:
+            return doubled(*arguments), None
+        return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
+
+    most = MOST_STEPS if steps is None else steps
+    depths = jnp.asarray(2.0 ** np.arange(-most, 0), thickness.dtype)
+    first = depths[0]
+    if steps is None:
+        # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
+        largest = jax.lax.stop_gradient(jnp.max(thickness))
+        first = depths[jnp.clip(most - jnp.ceil(jnp.log2(largest / THIN + 1e-30)), 0, most - 1).astype(jnp.int32)]
+    start = _twice(kernel, strength, thickness * first)
+    rest, _ = jax.lax.scan(step, start, depths)
+    once = _once(kernel, strength, thickness)
+    reflect, transmit = Parts(once[0], rest[0]), Parts(once[1], rest[1])
+
+    def turned_parts(parts: Parts) -> Parts:
+        return Parts(kernel.turn(parts.first), kernel.turn(parts.rest))
+
+    return Layer(reflect, turned_parts(reflect), transmit, turned_parts(transmit), direct, kernel.turn_row(direct))
+
+
+def doublings(thickness: Any) -> int | None:
+    """Steps from a slab no thicker than `THIN`; None, decided at run time, if the thickness is not known yet."""
+    if isinstance(thickness, jax.core.Tracer):
+        return None
+    largest = float(np.max(np.asarray(thickness)))
+    return max(1, int(np.ceil(np.log2(max(largest, THIN) / THIN))))
+
+
+def _direct(kernel: Kernel, thickness: Array) -> Array:
+    return jnp.exp(-thickness * (kernel.area / kernel.cosine))
+
+
+def _once(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
+    """Flux scattered exactly once by a slab: reflection and transmission."""
+    gain, depth = _depths(kernel, thickness)
+    into, down, up = depth[..., None, :], depth[..., :, None], kernel.turn_row(depth)[..., :, None]
+    reflect = gain * exprel(up + into)
+    transmit = gain * decay_between(down, into)
+    return strength[0] * reflect, strength[1] * transmit
+
+
+def _twice(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
+    """Flux that a thin slab scatters more than once: what is caught again on its way out scatters and then leaves."""
+    gain, depth = _depths(kernel, thickness)
+    started = gain * exprel(depth)[..., None, :]
+    up, down = (started * part - once for part, once in zip(strength, _once(kernel, strength, thickness), strict=True))
+    again = 2.0 * jnp.pi * kernel.solid[:, None] / kernel.area
+    back, onward = strength[0] * again, strength[1] * again
+    risen, turned_down = matmul(kernel.turn(onward), up), matmul(kernel.turn(back), up)  # for what travels upward
+    assert risen is not None
+    assert turned_down is not None
+    return risen + back @ down, turned_down + onward @ down
+
+
+def _depths(kernel: Kernel, thickness: Array) -> tuple[Array, Array]:
+    """Collisions per unit of what falls in and of K, and the optical depth of light going down."""
+    gain = 2.0 * jnp.pi * kernel.solid[:, None] * (thickness / kernel.cosine)[..., None, :]
+    return gain, thickness * (kernel.area / kernel.cosine)
+
+
+def _strength(medium: Medium, kernel: Kernel) -> tuple[Array, Array]:
+    """Kernel times albedo and Schlick's term, (channels or 1, modes, out, in)."""
+    reflect, transmit = (part[None] for part in kernel.plain)
+    if kernel.schlick is not None:
+        f0 = _column(medium.f0, kernel)[..., None]
+        reflect, transmit = (
+            f0 * part + (1.0 - f0) * fifth for part, fifth in zip((reflect, transmit), kernel.schlick, strict=True)
+        )
+    if is_known(medium.albedo, 1.0):
+        return reflect, transmit
+    albedo = _column(medium.albedo, kernel)[..., None]
+    return albedo * reflect, albedo * transmit
+
+
+def _column(value: Any, kernel: Kernel) -> Array:
+    """A parameter along the axis of channels, (channels or 1, 1, 1)."""
+    values = per_channel(jnp.asarray(value, kernel.area.dtype))
+    return jnp.stack(values)[:, None, None]

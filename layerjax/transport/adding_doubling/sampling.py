@@ -1,0 +1,67 @@
+"""Kernels known at points only: their Fourier modes at the nodes, and what they scatter put right.
+
+A lobe as narrow as the spacing of the nodes has the wrong energy when sampled at them. The energy is known otherwise (a
+collision scatters sigma, a face its albedo), so the kernel is scaled to it. A mirror sends nodes to nodes, and becomes
+just that in the limit of a narrow lobe.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import at_least, safe_div
+from layerjax.directions import Vector
+from layerjax.transport.adding_doubling.grid import Region
+
+LEAST_SAMPLES = 96
+"""Azimuths, over half a turn, at which a kernel is sampled at least."""
+
+BALANCING = 5
+"""Rounds of `balance`; what is left after them goes straight on."""
+
+
+def modes_at_nodes(
+    function: Callable[[Vector, Vector], Sequence[Array]], into: Region, out: Region, modes: int
+) -> list[Array]:
+    """Mean over azimuth of values(wi, wo) cos(m phi), (modes, out, in), for each array that the function returns.
+
+    phi is the azimuth between the directions of travel. wi and wo are given above the horizon.
+    """
+    samples = max(2 * modes, LEAST_SAMPLES)
+    phi = (np.arange(samples) + 0.5) * np.pi / samples
+    dtype = into.cosine.dtype
+    cosines = jnp.asarray(np.cos(np.outer(phi, np.arange(modes))) / samples, dtype)
+    mu_i, sin_i = into.cosine[None, :, None], into.sine[None, :, None]
+    mu_o, sin_o = out.cosine[:, None, None], out.sine[:, None, None]
+    wi: Vector = (-sin_i, jnp.zeros_like(mu_i), mu_i)
+    wo: Vector = (sin_o * jnp.asarray(np.cos(phi), dtype), sin_o * jnp.asarray(np.sin(phi), dtype), mu_o)
+    shape = (out.cosine.shape[0], into.cosine.shape[0], samples)
+    return [jnp.moveaxis(jnp.broadcast_to(value, shape) @ cosines, -1, 0) for value in function(wi, wo)]
+
+
+def balance(
+    kernels: Sequence[tuple[Array, Callable[[Array], Array]]], weight: Array, energy: Array
+) -> tuple[Array, Array]:
+    """Factors d, (nodes,), for which sum d_i K_ij d_j scatters `energy` when summed with `weight`; and what is missing.
+
+    Scaling both sides alike keeps a kernel reciprocal and its lobes where they are. With each kernel goes the function
+    that takes d to the factors of its outgoing directions.
+    """
+
+    def scattered(scale: Array) -> Array:
+        parts = [(weight * out(scale)) @ kernel for kernel, out in kernels]
+        return scale * sum(parts[1:], parts[0])
+
+    scale = jnp.ones_like(energy)
+    exists = (energy > 0) & (weight > 0)
+    for _ in range(BALANCING):
+        ratio = safe_div(energy, at_least(scattered(scale), 1e-3 * energy))
+        scale = jnp.where(exists, scale * jnp.sqrt(jnp.where(exists, ratio, 1.0)), 1.0)
+    return scale, jnp.where(exists, energy - scattered(scale), 0.0)
+
+
+def straight_on(missing: Array, weight: Array) -> Array:
+    """The kernel that sends this energy on at the same angles: a delta, the same in all modes."""
+    return jnp.diag(safe_div(missing, weight))

@@ -1,0 +1,126 @@
+"""A whole stack on the grid: its layers one by one, added from the bottom up.
+
+Layers that are symmetric about the normal are solved as Fourier modes. Where a medium has an axis of its own, what lies
+below it is turned into ordinates first, and so is every layer on top.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax.phase import SGGX
+from layerjax.stack import Interface, Medium, Stack
+from layerjax.surfaces import Conductor, Surface
+from layerjax.transport.adding_doubling.grid import Grid, make_grid
+from layerjax.transport.adding_doubling.interfaces import (
+    Microfacets,
+    Normals,
+    base_layer,
+    interface_layer,
+)
+from layerjax.transport.adding_doubling.media import (
+    doublings,
+    kernel_modes,
+    kernel_ordinates,
+    medium_layer,
+)
+from layerjax.transport.adding_doubling.operators import Layer, add
+
+
+class Plan(eqx.Module):
+    """What is decided before tracing. azimuths: ordinates in azimuth, or None for Fourier modes."""
+
+    nodes: int = eqx.field(static=True)
+    modes: int = eqx.field(static=True)
+    azimuths: int | None = eqx.field(static=True)
+    steps: tuple[int | None, ...] = eqx.field(static=True)
+    ranks: tuple[int, ...] | None = eqx.field(static=True)
+    microfacets: Microfacets = eqx.field(static=True)
+
+
+def make_plan(stack: Stack, nodes: int, modes: int, ordinates: tuple[int, int], microfacets: Microfacets) -> Plan:
+    """The plan for a simplified stack."""
+    steps = tuple(doublings(layer.thickness) for layer in stack.layers if isinstance(layer, Medium))
+    if any(is_tilted(layer) for layer in stack.layers):
+        nodes, azimuths = ordinates
+        return Plan(nodes, azimuths // 2 + 1, azimuths, steps, _ranks(stack), microfacets)
+    return Plan(nodes, modes, None, steps, _ranks(stack), microfacets)
+
+
+def is_tilted(layer: Any) -> bool:
+    """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
+    if not isinstance(layer, Medium) or not isinstance(layer.phase, SGGX) or layer.phase.axis is None:
+        return False
+    axis = layer.phase.axis
+    return isinstance(axis, jax.core.Tracer) or bool(np.any(np.asarray(axis)[:2] != 0.0))
+
+
+def solve(stack: Stack, plan: Plan) -> tuple[Grid, Layer]:
+    """The grid, and the whole stack as one layer."""
+    interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
+    grid = make_grid([1.0, *(layer.ior for layer in interfaces)], plan.ranks, plan.nodes, dtype)
+    solved: list[tuple[Layer, bool]] = []
+    region, steps = 0, list(plan.steps)
+    for layer in stack.layers:
+        here = grid.regions[region]
+        if isinstance(layer, Interface):
+            region += 1
+            leaves = stack.base is None and 1 < region == len(interfaces)
+            below, alpha = grid.regions[region], jnp.asarray(layer.alpha, dtype)
+            normals = Normals(alpha, layer.distribution)
+            found = interface_layer(grid, here, below, normals, plan.modes, plan.microfacets, enters=not leaves)
+            solved.append((found, False))
+        elif plan.azimuths is not None and is_tilted(layer):
+            kernel = kernel_ordinates(layer, here, plan.azimuths)
+            solved.append((medium_layer(layer, kernel, steps.pop(0)), True))
+        else:
+            solved.append((medium_layer(layer, kernel_modes(layer, here, plan.modes), steps.pop(0)), False))
+    if stack.base is not None:
+        here = grid.regions[region]
+        solved.append((base_layer(grid, here, _relative(stack.base, here.ior), plan.modes, plan.microfacets), False))
+    whole, is_expanded = solved[-1]
+    for found, tilted in reversed(solved[:-1]):
+        if tilted and not is_expanded:
+            whole, is_expanded = expanded(whole, plan.azimuths), True
+        whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
+    return grid, whole
+
+
+def expanded(layer: Layer, azimuths: int | None) -> Layer:
+    """Fourier modes to ordinates."""
+    assert azimuths is not None
+    count = azimuths
+    modes = np.arange(count // 2 + 1)
+    share = np.where((modes == 0) | (2 * modes == count), 1.0, 2.0) / count
+    between = np.cos(2.0 * np.pi * np.outer(modes, np.arange(count)) / count) * share[:, None]
+    apart = (np.arange(count)[:, None] - np.arange(count)) % count
+
+    def operator(flux: Array) -> Array:
+        circulant = jnp.einsum("cmij,md->cijd", flux, jnp.asarray(between, flux.dtype))[..., apart]
+        channels, nodes = flux.shape[0], flux.shape[-1]
+        return jnp.swapaxes(circulant, 2, 3).reshape(channels, 1, nodes * count, nodes * count)
+
+    return layer.map(operator, lambda direct: jnp.repeat(direct, count, axis=-1))
+
+
+def _relative(base: Surface, above: Array) -> Surface:
+    """A conductor's index counted from what surrounds the stack, as one counted from what lies on it."""
+    if not isinstance(base, Conductor):
+        return base
+    return eqx.tree_at(lambda surface: (surface.ior, surface.k), base, (base.ior / above, base.k / above))
+
+
+def _ranks(stack: Stack) -> tuple[int, ...] | None:
+    """Place of every region's index among the distinct ones, if they are known."""
+    indices: list[Any] = [1.0]
+    for layer in stack.layers:
+        if isinstance(layer, Interface):
+            if isinstance(layer.ior, jax.core.Tracer):
+                return None
+            indices.append(np.asarray(layer.ior, dtype=np.float64))
+    return tuple(int(rank) for rank in np.unique(np.array(indices, dtype=np.float64), return_inverse=True)[1])

@@ -1,0 +1,262 @@
+"""Where the several-event part of a solved stack is read off: tables over directions, cubic between their points.
+
+What is tabulated is f / ior_o^2 (mu_i + mu_o), a smooth function down to grazing light on both sides, made reciprocal.
+A table is finer than the grid: polynomials in the cosine and Fourier series in azimuth carry the values over. Modes are
+summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import at_least, horizon, safe_div
+from layerjax.channels import Channels
+from layerjax.directions import Vector, select
+from layerjax.transport.adding_doubling.grid import (
+    Grid,
+    Region,
+    cubic,
+    stencil,
+    table_matrix,
+)
+from layerjax.transport.adding_doubling.operators import Layer, Operator, turned
+from layerjax.transport.contract import Side
+
+AZIMUTH_DENSITY = 2
+"""Azimuths of a table for each ordinate of the grid."""
+
+MODE_DENSITY = 3
+"""Steps of a table from azimuth 0 to pi for each Fourier mode."""
+
+
+Points = tuple[Array, Array]
+"""Four offsets into a table along one of its axes, and their weights: (4, ...) each."""
+
+
+class Tables(eqx.Module):
+    """The rest of the BSDF, and the energies of all of it.
+
+    values: for each channel an array over (quadrant and direction out, direction in, azimuth), the azimuth left out
+    with ordinates and with one mode; quadrants: above to above, and with a stack that transmits below to below, and
+    above to below. `steps`: of the azimuth from 0 to pi, with one more point beyond either end.
+
+    near and far: energy scattered to the same side and the other, as a share of what meets an event: a row for light
+    from above and one for light from below, per channel, for each direction in.
+    """
+
+    grid: Grid
+    values: tuple[Array, ...] | None
+    near: Array
+    far: Array
+    opaque: bool = eqx.field(static=True)
+    azimuths: int | None = eqx.field(static=True)
+    steps: int | None = eqx.field(static=True)
+
+
+def make_tables(
+    grid: Grid, whole: Layer, azimuths: int | None, opaque: bool, caught: Callable[[Vector], Channels | None]
+) -> Tables:
+    """Tables of a solved stack. caught: share of light along a direction that meets an event at all (None: all)."""
+    top, bottom = grid.regions[0], grid.regions[-1]
+    count = 1 if azimuths is None else azimuths
+    modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
+    steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
+    lifts = {id(region): _lift(grid, region, modes, azimuths) for region in (top, bottom)}
+
+    def kernel(flux: Operator, out: Region) -> Operator:
+        if flux is None:
+            return None
+        weight = 2.0 * jnp.pi * jnp.repeat(out.weight, count) / count
+        return safe_div(flux, jnp.broadcast_to(weight[:, None], flux.shape))
+
+    def table(there: Operator, back: Operator, out: Region, into: Region) -> Array | None:
+        if there is None or back is None:
+            return None
+        back = turned(back, azimuths)
+        assert back is not None
+        mean = 0.5 * (there + jnp.swapaxes(back, -1, -2))
+        values = mean * (jnp.repeat(out.cosine, count)[:, None] + jnp.repeat(into.cosine, count))
+        fine = lifts[id(out)] @ values @ jnp.swapaxes(lifts[id(into)], -1, -2)
+        if steps is None:
+            return fine[:, 0]
+        return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
+
+    reflected = kernel(whole.reflect_top.rest, top)
+    quadrants = [table(reflected, reflected, top, top)]
+    if not opaque:
+        reflected = kernel(whole.reflect_bottom.rest, bottom)
+        down, up = kernel(whole.transmit_down.rest, bottom), kernel(whole.transmit_up.rest, top)
+        quadrants += [table(reflected, reflected, bottom, bottom), table(down, up, bottom, top)]
+    present = [quadrant for quadrant in quadrants if quadrant is not None]
+    values = None
+    if present:
+        like = jnp.zeros_like(present[0])
+        together = jnp.concatenate([like if quadrant is None else quadrant for quadrant in quadrants], axis=1)
+        values = tuple(together[c] for c in range(together.shape[0]))
+    rows = [(whole.reflect_top, whole.transmit_down, top), (whole.reflect_bottom, whole.transmit_up, bottom)]
+    near: list[Array] = []
+    far: list[Array] = []
+    for reflect, transmit, region in rows[: 1 if opaque else 2]:
+        lift = lifts[id(region)][0]
+        met = caught(_node_directions(region, azimuths, 1.0 if region is top and not near else -1.0))
+        share = jnp.ones((1, lift.shape[-1]), lift.dtype) if met is None else jnp.stack(met)
+        for energies, flux in ((near, reflect.total), (far, transmit.total)):
+            sums = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
+            energies.append(
+                safe_div(sums, jnp.broadcast_to(share, jnp.broadcast_shapes(sums.shape, share.shape))) @ lift.T
+            )
+    shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])
+    stacked = [jnp.stack([jnp.broadcast_to(row, shape) for row in rows]) for rows in (near, far)]
+    return Tables(grid, values, stacked[0], stacked[1], opaque, azimuths, steps)
+
+
+def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
+    """BSDF of the paths with more than one event, never below 0."""
+    zero = jnp.zeros_like(wi[2] * wo[2])
+    if tables.values is None or (tables.opaque and side == "transmission"):
+        return (zero,)
+    edge = horizon(wi[2].dtype)
+    top, bottom = tables.grid.regions[0].ior, tables.grid.regions[-1].ior
+    if tables.opaque or side == "reflection":
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        quadrant, scale = jnp.zeros((), jnp.int32), jnp.ones(())
+        out, into, ior_out, ior_into = wo, wi, top, top
+    else:
+        valid = (jnp.abs(wi[2]) > edge) & (jnp.abs(wo[2]) > edge)
+        if side == "transmission":
+            valid = valid & (wi[2] * wo[2] < 0)
+        upward = (wi[2] < 0) & (wo[2] > 0)  # the table holds above to below
+        out, into = select(upward, wi, wo), select(upward, wo, wi)
+        ior_out, ior_into = jnp.where(out[2] < 0, bottom, top), jnp.where(into[2] < 0, bottom, top)
+        scale = jnp.where(wo[2] < 0, bottom, top) ** 2
+        quadrant = jnp.where(out[2] > 0, 0, jnp.where(into[2] > 0, 2, 1))
+    out, into = _inside(out, valid), _inside(into, valid)
+    shape = tables.values[0].shape
+    start = quadrant * (shape[0] // (1 if tables.opaque else 3) * math.prod(shape[1:]))
+    axes = [
+        *_points(tables, out, ior_out, 0.0, math.prod(shape[1:])),
+        *_points(tables, into, ior_into, np.pi, math.prod(shape[2:])),  # a table's azimuths are those of travel
+    ]
+    if tables.steps is not None:
+        axes.append(_azimuth_points(into, out, tables.steps))
+    factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
+    found = _contracted(tables.values, start, axes)
+    return tuple(factor * at_least(value, 0.0) for value in found)
+
+
+def _contracted(values: Channels, start: Array, axes: Sequence[Points]) -> Channels:
+    """Sum of the entries at start and the offsets of all axes, times their weights; four along the last axis a step."""
+    flat = [value.reshape(-1) for value in values]
+    *outer, (offsets, weights) = axes
+
+    def step(sums: Channels, which: Array) -> tuple[Channels, None]:
+        place, weight = start, jnp.ones((), weights.dtype)
+        for (near, share), k in zip(outer, which, strict=True):
+            place, weight = place + near[k], weight * share[k]
+        added = []
+        for entries in flat:
+            read = [weights[k] * entries.at[place + offsets[k]].get(mode="promise_in_bounds") for k in range(4)]
+            added.append(weight * (read[0] + read[1] + read[2] + read[3]))
+        return tuple(total + more for total, more in zip(sums, added, strict=True)), None
+
+    shape = jnp.broadcast_shapes(start.shape, *(weights.shape[1:] for _, weights in axes))
+    zero = jnp.zeros(shape, weights.dtype)
+    every = np.asarray(list(itertools.product(range(4), repeat=len(outer))), np.int32)
+    return jax.lax.scan(step, (zero,) * len(flat), jnp.asarray(every))[0]
+
+
+def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
+    """Energy scattered to wi's side and to the other, all orders, from what the nodes scatter."""
+    above = wi[2] > 0
+    valid = jnp.abs(wi[2]) > horizon(wi[2].dtype)
+    if tables.opaque:
+        valid = valid & above
+    row = jnp.where(above | tables.opaque, 0, 1)
+    ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
+    axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
+    energies: list[Channels] = []
+    for table in (tables.near, tables.far):
+        found = _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
+        energies.append(tuple(jnp.where(valid, at_least(value, 0.0), 0.0) for value in found))
+    return energies[0], energies[1]
+
+
+def _node_directions(region: Region, azimuths: int | None, side: float) -> Vector:
+    """Directions towards the light that travels along the nodes."""
+    ordinates = np.zeros(1) if azimuths is None else 2.0 * np.pi * np.arange(azimuths) / azimuths
+    sine = region.sine[:, None]
+    x, y = -sine * jnp.asarray(np.cos(ordinates), sine.dtype), -sine * jnp.asarray(np.sin(ordinates), sine.dtype)
+    return x.ravel(), y.ravel(), jnp.repeat(side * region.cosine, ordinates.size)
+
+
+def _inside(w: Vector, valid: Array) -> Vector:
+    """w above, or a stand-in where it is not to be read."""
+    return (jnp.where(valid, w[0], 0.6), jnp.where(valid, w[1], 0.0), jnp.where(valid, jnp.abs(w[2]), 0.8))
+
+
+def _points(tables: Tables, w: Vector, ior: Array, turn: float, stride: int) -> list[Points]:
+    """Where a direction lies in a table whose directions are `stride` apart: in cosine, and with ordinates azimuth."""
+    first, polar = stencil(tables.grid, ior, w[2], w[0] * w[0] + w[1] * w[1])
+    if tables.azimuths is None:
+        return [(stride * _four(first), jnp.stack(polar))]
+    count = AZIMUTH_DENSITY * tables.azimuths
+    at_pole = (w[0] == 0) & (w[1] == 0)
+    phi = jnp.arctan2(jnp.where(at_pole, 0.0, w[1]), jnp.where(at_pole, 1.0, w[0])) + turn
+    place = phi * (count / (2.0 * np.pi))
+    corner = jax.lax.stop_gradient(jnp.floor(place))
+    around = _four(corner.astype(jnp.int32) - 1) % count
+    weights = jnp.stack(cubic(place - corner + 1.0))
+    return [(stride * count * _four(first), jnp.stack(polar)), (stride * around, weights)]
+
+
+def _azimuth_points(wi: Vector, wo: Vector, steps: int) -> Points:
+    """Where the azimuth between the directions of travel lies in a table."""
+    sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
+    at_pole = (sine == 0) & (cosine == 0)
+    place = (steps / np.pi) * jnp.arctan2(jnp.abs(jnp.where(at_pole, 0.0, sine)), jnp.where(at_pole, 1.0, cosine))
+    first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)), 0, steps - 1)
+    return _four(first.astype(jnp.int32)), jnp.stack(cubic(place - first + 1.0))
+
+
+def _four(first: Array) -> Array:
+    return jnp.stack([first + k for k in range(4)])
+
+
+def _waves(modes: int, steps: int) -> np.ndarray:
+    """Matrix from Fourier modes to the azimuths of a table, (modes, points)."""
+    phi = np.pi / steps * np.arange(-1, steps + 2)
+    return np.where(np.arange(modes) == 0, 1.0, 2.0)[:, None] * np.cos(np.outer(np.arange(modes), phi))
+
+
+def _lift(grid: Grid, region: Region, modes: int, azimuths: int | None) -> Array:
+    """Matrices from values at the nodes to the points of the table: (modes or 1, points, nodes)."""
+    x, matrix = table_matrix(grid.nodes)
+    panels = grid.edges.shape[0]
+    even = jnp.asarray(np.kron(np.eye(panels), matrix), grid.edges.dtype)
+    low, high = grid.bounds(grid.panels, region.ior**2)
+    squared = (high - jnp.asarray(x * x, high.dtype) * (high - low)) / region.ior**2
+    positive = squared > 0
+    sine = jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0).ravel()
+    # odd modes vanish at the pole like the sine: polynomials interpolate the quotient
+    odd = sine[:, None] * even / region.sine
+    if azimuths is None:
+        return jnp.stack([even, odd])[np.arange(modes) % 2]
+    # even ones but the mean vanish like its square, so that there is one value at the pole; with Fourier modes, whose
+    # lobes may be narrow, the quotient by the square costs more than it gives
+    turning = sine[:, None] * odd / region.sine
+    ordinates, points = np.arange(azimuths), np.arange(AZIMUTH_DENSITY * azimuths) / AZIMUTH_DENSITY
+    apart = 2.0 * np.pi * (points[:, None] - ordinates) / azimuths
+    orders = np.arange(azimuths // 2 + 1)
+    share = np.where((orders == 0) | (2 * orders == azimuths), 1.0, 2.0) / azimuths
+    waves = np.cos(apart[..., None] * orders) * share
+    parts = [
+        jnp.asarray(waves[..., chosen].sum(-1), even.dtype)
+        for chosen in (slice(1), slice(1, None, 2), slice(2, None, 2))
+    ]
+    return sum(map(jnp.kron, (even, odd, turning), parts), jnp.zeros((), even.dtype))[None]

@@ -1,0 +1,112 @@
+"""Light through a slab with two rough sides, and through one rough interface.
+
+A slab's two refractions are one lobe about the half vector of the light and the mirror image of where it goes (Guo et
+al. 2015, Sec. 4.3, which gives the concentration of the transmitted light alone, Eq. 23, and no value). In form
+"reciprocal" it is evaluated below the surface, as the chains of a coat are: of several forms that were compared with a
+Monte Carlo it has the smallest error in energy and shape. One interface is exact: Walter et al. 2007 with vMF normals.
+"""
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._numerics import at_least
+from layerjax.channels import Channels
+from layerjax.directions import Vector, half_vector
+from layerjax.normals import vmf
+from layerjax.surfaces.microfacet import refraction_lobe
+from layerjax.transport.endf.chains import (
+    Coat,
+    Face,
+    Mirror,
+    Options,
+    absorbed,
+    crossed,
+    crossing,
+    entered,
+    masked,
+    times,
+    visible,
+    width,
+)
+from layerjax.transport.endf.warping import (
+    LEAST_VARIANCE,
+    extended,
+    joint,
+    reflection_gains,
+    refracted_cosine,
+    refraction_gains,
+)
+from layerjax.transport.first_order import mirror
+
+
+def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> list[Channels]:
+    """BTDF of every lobe: light that goes straight, and after one round trip or more.
+
+    wi is above the horizon, and so is `under`, the mirror image of where the light goes.
+    """
+    if coat.top is None:
+        return []
+    if coat.base is None:
+        return [(_refraction(coat.top, options.masking, wi, under),)]
+    through = _by_mean_directions if options.form == "paper" else _below_the_surface
+    return through(coat, coat.top, coat.base, options, wi, under)
+
+
+def _by_mean_directions(
+    coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, under: Vector
+) -> list[Channels]:
+    """All terms at the mean direction, straight on from wi."""
+    h, _ = half_vector(wi, under, same_side=True)
+    inner, enters = entered(wi, top.ior)
+    level = fresnel.dielectric(wi[2], top.ior)
+    sides = visible(wi, top.kappa, options.masking) * visible(under, base.kappa, options.masking)
+    within = masked(inner, top.kappa, options.masking) * masked(inner, base.kappa, options.masking)
+    energy: Channels = (jnp.where(enters, 0.25 * (1.0 - level) ** 2 * sides * within, 0.0),)
+    energy = times(energy, absorbed(coat, inner, inner, 0.5))
+    step = times((level * level,), absorbed(coat, inner, (-inner[0], -inner[1], inner[2])))
+    lobes: list[Channels] = []
+    for j in range(options.bounces + 1):
+        energy = times(energy, step) if j else energy
+        lobes.append(times(energy, (vmf.facet_density(h, slab_concentration(j, wi[2], top, base)),)))
+    return lobes
+
+
+def _below_the_surface(
+    coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, under: Vector
+) -> list[Channels]:
+    """About the half vector of both directions inside the slab."""
+    inner_i, inner_o, through, inside = crossed(top, wi, under)
+    h, cosine = half_vector(inner_i, inner_o, same_side=True)
+    through = through * masked(wi, top.kappa, options.masking) * masked(under, base.kappa, options.masking)
+    through = through * visible(inner_i, top.kappa, options.masking) * visible(inner_o, base.kappa, options.masking)
+    energy: Channels = times((0.25 * through,), absorbed(coat, inner_i, mirror(inner_o), 0.5))
+    step = times((inside * inside,), absorbed(coat, inner_i, mirror(inner_o)))
+    lobes: list[Channels] = []
+    for j in range(options.bounces + 1):
+        energy = times(energy, step) if j else energy
+        lobes.append(times(energy, (vmf.facet_density(h, inner_slab_concentration(j, cosine, top, base)),)))
+    return lobes
+
+
+def slab_concentration(j: int, cosine: Array, top: Face, base: Mirror) -> Array:
+    """kappa of the extended normals after j reflections at each side, by the cosine outside (Guo 2015, Eqs. 23, 24)."""
+    inside, _ = refracted_cosine(cosine, top.ior)
+    entry, exit = refraction_gains(cosine, top.ior), refraction_gains(inside, 1.0 / top.ior)
+    bounce = reflection_gains(inside).facets * exit.beam
+    lobes = [(top.kappa, entry.facets * exit.beam), (base.kappa, exit.facets)]
+    lobes += j * [(top.kappa, bounce), (base.kappa, bounce)]
+    return extended(joint(*lobes), reflection_gains(cosine))
+
+
+def inner_slab_concentration(j: int, cosine: Array, top: Face, base: Mirror) -> Array:
+    """The same about the half vector inside, by its cosine with the light: variances add there."""
+    spread = crossing(cosine, top.ior)
+    inverse = (j + 0.25 * spread * spread) * (1.0 / top.kappa + 1.0 / base.kappa)
+    return 1.0 / at_least(inverse, LEAST_VARIANCE)
+
+
+def _refraction(top: Face, masking: vmf.Masking | None, wi: Vector, under: Vector) -> Array:
+    """BTDF of one rough interface (Walter et al. 2007, Eq. 21, with its eta_o^2); a delta, given as 0, at eta = 1."""
+    lobe, transmitted = refraction_lobe(wi, mirror(under), top.ior, width(top.kappa), "vmf")
+    return lobe * transmitted * visible(wi, top.kappa, masking) * visible(under, top.kappa, masking)

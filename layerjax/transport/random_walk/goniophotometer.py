@@ -1,0 +1,170 @@
+"""A virtual goniophotometer: where the light goes that falls on a stack, by an analog random walk.
+
+Unlike values of the BSDF, energies need no direction to aim at: paths are followed until they leave and counted where
+they do. What is counted is exact on average, bin by bin and order by order.
+"""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+
+from layerjax._numerics import horizon
+from layerjax._parameters import in_precision
+from layerjax.directions import read_directions, split
+from layerjax.stack import Stack, channel_count, require_numbers, simplify
+from layerjax.transport.random_walk.lanes import (
+    follow,
+    quotas,
+    standard_error,
+    upright,
+)
+from layerjax.transport.random_walk.random_numbers import key_words
+from layerjax.transport.random_walk.scene import Scene
+from layerjax.transport.random_walk.state import Step
+from layerjax.transport.random_walk.walk import Microfacets, Walk
+
+
+class Goniogram(eqx.Module):
+    """Shares of the incident power, with standard errors; the channel axis is last.
+
+    ============================= ================================= ==================================================
+    field                         shape                             meaning
+    ============================= ================================= ==================================================
+    energy, energy_error          (..., 2, polar, azimuth, C)       scattered into each bin, on wi's side and on the
+                                                                    other
+    orders, orders_error          (..., 2, orders, C)               by order 1, 2, ... of scattering; the last holds
+                                                                    all higher orders too
+    albedo, albedo_error          (..., 2, C)                       scattered to wi's side and to the other
+    unscattered, unscattered_error (..., C)                         passed without an event
+    cosines                       (polar + 1,)                      edges of the bins in cos(theta) >= 0, from 0 to 1
+    azimuths                      (azimuth + 1,)                    edges of the bins in phi, from 0 to 2 pi
+    ============================= ================================= ==================================================
+
+    What is missing from 1 was absorbed, or lost to masking. A bin's mean of f |cos| is its energy over its solid angle.
+    """
+
+    energy: Array
+    energy_error: Array
+    orders: Array
+    orders_error: Array
+    albedo: Array
+    albedo_error: Array
+    unscattered: Array
+    unscattered_error: Array
+    cosines: Array
+    azimuths: Array
+
+
+def goniophotometer(
+    stack: Stack,
+    wi: ArrayLike,
+    *,
+    key: Array,
+    paths: int = 1 << 17,
+    polar: int = 10,
+    azimuth: int = 24,
+    orders: int = 8,
+    microfacets: Microfacets = "single",
+    lanes: int = 4096,
+) -> Goniogram:
+    """Energies that leave a stack, lit along wi.
+
+    Args:
+        stack: the layered material.
+        wi: unit directions towards the light, shape ``(..., 3)``; below-horizon light falls on the stack from below (on
+            an opaque base: nothing comes back).
+        key: a JAX random key; the same key gives the same result.
+        paths: number of paths for each wi, >= 2.
+        polar, azimuth: number of bins, equal in |cos(theta)| and in phi.
+        orders: number of orders told apart.
+        microfacets: see `RandomWalk`.
+        lanes: number of paths that are under way at a time.
+
+    Raises:
+        ValueError: a count is too small, or the stack holds a placeholder.
+    """
+    require_numbers(stack)
+    for name, value, least in (
+        ("paths", paths, 2),
+        ("polar", polar, 1),
+        ("azimuth", azimuth, 1),
+        ("orders", orders, 1),
+    ):
+        if value < least:
+            raise ValueError(f"goniophotometer: {name} = {value!r} is less than {least}")
+    if microfacets not in ("single", "multiple"):
+        raise ValueError(f"goniophotometer: microfacets = {microfacets!r} is not one of 'single', 'multiple'")
+    (wi,) = read_directions(wi=wi)
+    slim = in_precision(simplify(stack), wi.dtype)
+    counts = (paths, polar, azimuth, orders, min(lanes, paths))
+    return _measure(slim, wi, channel_count(stack), key, counts, microfacets)
+
+
+@eqx.filter_jit
+def _measure(
+    stack: Stack,
+    wi: Array,
+    channels: int,
+    key: Array,
+    counts: tuple[int, int, int, int, int],
+    microfacets: Microfacets,
+) -> Goniogram:
+    paths, polar, azimuth, orders, lanes = counts
+    dtype, batch = wi.dtype, wi.shape[:-1]
+    scene = Scene(stack, channels, dtype)
+    words = key_words(key)
+    bins = 2 * polar * azimuth
+    owed = quotas(paths, lanes)
+
+    def record(result: Any, step: Step, owes: Array) -> Any:
+        by_direction, by_order = result
+        counted = step.escapes & owes
+        x, y, z = step.direction
+        side = (z < 0).astype(jnp.int32)
+        ring = jnp.minimum((jnp.abs(z) * polar).astype(jnp.int32), polar - 1)
+        turn = jnp.arctan2(y, x) / (2.0 * jnp.pi)
+        sector = jnp.minimum((jnp.where(turn < 0, turn + 1.0, turn) * azimuth).astype(jnp.int32), azimuth - 1)
+        assert step.order is not None
+        order = jnp.minimum(step.order, orders)
+        rows = jnp.stack([value for w in step.weight for value in (w, w * w)], axis=-1)
+        # what is not counted falls outside, and is dropped; so does light without an event, among the directions
+        cell = jnp.where(counted & (order > 0), (side * polar + ring) * azimuth + sector, bins)
+        slot = jnp.where(counted, side * (orders + 1) + order, 2 * (orders + 1))
+        return by_direction.at[cell].add(rows, mode="drop"), by_order.at[slot].add(rows, mode="drop")
+
+    def one(question: tuple[Array, Array]) -> tuple[Array, Array]:
+        index, direction = question
+        w = split(direction)
+        edge = horizon(dtype)
+        valid = w[2] > edge if stack.base is not None else jnp.abs(w[2]) > edge
+        w = upright(w, valid)
+        spread = jnp.full(lanes, w[0]), jnp.full(lanes, w[1]), jnp.full(lanes, w[2])
+        walk = Walk(scene, spread, None, microfacets, count_orders=True)
+        empty = jnp.zeros((bins, 2 * channels), dtype), jnp.zeros((2 * (orders + 1), 2 * channels), dtype)
+        lane = index.astype(jnp.uint32) * jnp.uint32(lanes) + jnp.arange(lanes, dtype=jnp.uint32)
+        remaining = jnp.where(valid, owed, 0)
+        cells, slots = follow(walk, record, empty, lane, remaining, words, dtype)
+        shaped = cells.reshape(2, polar, azimuth, channels, 2), slots.reshape(2, orders + 1, channels, 2)
+        # the side of the light comes first
+        near_cells, near_slots = (jnp.where(w[2] > 0, x, x[::-1]) for x in shaped)
+        return near_cells, near_slots
+
+    flat = wi.reshape(-1, 3)
+    cells, slots = jax.lax.map(one, (jnp.arange(math.prod(batch)), flat))
+    cells, slots = cells.reshape(*batch, *cells.shape[1:]), slots.reshape(*batch, *slots.shape[1:])
+
+    def estimate(sums: Array) -> tuple[Array, Array]:
+        mean = sums[..., 0] / paths
+        return mean, standard_error(mean, sums[..., 1], paths)
+
+    energy, by_order = estimate(cells), estimate(slots[..., 1:, :, :])
+    albedo = estimate(slots[..., 1:, :, :].sum(axis=-3))
+    straight = estimate(slots[..., 0, :, :].sum(axis=-3))
+    cosines = jnp.linspace(0.0, 1.0, polar + 1, dtype=dtype)
+    azimuths = jnp.linspace(0.0, 2.0 * jnp.pi, azimuth + 1, dtype=dtype)
+    return Goniogram(*energy, *by_order, *albedo, *straight, cosines, azimuths)

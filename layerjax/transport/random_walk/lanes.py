@@ -1,0 +1,141 @@
+"""Lanes that stay full: every lane owes a fixed number of paths and starts the next as soon as one ends.
+
+All paths that are started are finished. Stopping after a number of steps and counting what is done by then would favour
+short paths, by 3 % in a slab of optical depth 10.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax.channels import Channels
+from layerjax.directions import Vector, select
+from layerjax.transport.random_walk.random_numbers import key_words, uniforms
+from layerjax.transport.random_walk.state import Step
+from layerjax.transport.random_walk.walk import Walk
+
+Tally = Callable[[Step], Channels]
+"""What a step adds to its path's result, one number for each output."""
+
+Record = Callable[[Any, Step, Array], Any]
+"""Result with a step added, for the lanes that still owe paths."""
+
+
+def average(
+    walk: Callable[..., Walk],
+    tally: Tally,
+    outputs: int,
+    directions: tuple[Vector, ...],
+    valid: Array,
+    paths: int,
+    lanes: int,
+    key: Array,
+) -> tuple[Array, Array]:
+    """Mean over paths of what is tallied, and its standard error, for each of n questions: shape (n, outputs) each.
+
+    Args:
+        walk: makes the walk from directions, lane by lane.
+        tally: what a step brings.
+        directions: what the questions ask for.
+        valid: questions of which the answer is not known to be 0.
+        paths: number of paths for each question.
+        lanes: number of paths under way at a time, shared among the questions.
+        key: JAX random key.
+    """
+    dtype, (n,) = directions[0][2].dtype, valid.shape
+    if n == 0:
+        return jnp.zeros((0, outputs), dtype), jnp.zeros((0, outputs), dtype)
+    width = max(1, min(paths, lanes // n))  # lanes for each question
+    together = min(n, max(1, lanes // width))  # questions at a time
+    groups = math.ceil(n / together)
+    padding = groups * together - n
+    quota = quotas(paths, width)
+    words = key_words(key)
+    padded, asked = jax.tree.map(lambda x: jnp.pad(x, (0, padding)), (directions, valid))
+    known = tuple(upright(w, asked) for w in padded)
+    grouped = jax.tree.map(lambda x: x.reshape(groups, together), (known, asked))
+
+    def group(question: tuple[Array, Any]) -> tuple[Array, Array]:
+        index, (vectors, owed) = question
+        spread = jax.tree.map(lambda x: jnp.repeat(x, width), vectors)
+        count = together * width
+        lane = index.astype(jnp.uint32) * jnp.uint32(count) + jnp.arange(count, dtype=jnp.uint32)
+        remaining = jnp.where(owed[:, None], quota, 0).reshape(-1)
+        totals = _sums(walk(*spread), tally, outputs, lane, remaining, words, dtype)
+        first, second = (jnp.stack(x, axis=-1).reshape(together, width, outputs).sum(axis=1) for x in totals)
+        return first, second
+
+    sums, squares = jax.lax.map(group, (jnp.arange(groups), grouped))
+    mean = sums.reshape(-1, outputs)[:n] / paths
+    return mean, standard_error(mean, squares.reshape(-1, outputs)[:n], paths)
+
+
+def standard_error(mean: Array, squares: Array, paths: int) -> Array:
+    """Standard error of a mean over paths, from it and the sum of squares."""
+    return jnp.sqrt(jnp.maximum(squares / paths - mean * mean, 0.0) / (paths - 1))
+
+
+def quotas(paths: int, lanes: int) -> Array:
+    """Paths that each lane owes, as even as can be."""
+    return jnp.asarray([paths // lanes + (j < paths % lanes) for j in range(lanes)], jnp.int32)
+
+
+def upright(w: Vector, valid: Array) -> Vector:
+    """w, with the normal standing in where it is not valid."""
+    zero, one = jnp.zeros_like(w[2]), jnp.ones_like(w[2])
+    return select(valid, w, (zero, zero, one))
+
+
+def follow(
+    walk: Walk, record: Record, result: Any, lane: Array, remaining: Array, words: tuple[Array, Array], dtype: jnp.dtype
+) -> Any:
+    """Walk until no lane owes a path; `result` with every step of every path that is owed recorded.
+
+    Args:
+        lane: number of each lane, which no other lane of the key may have.
+        remaining: paths that each owes.
+        words: the key, see `layerjax.transport.random_walk.random_numbers.key_words`.
+    """
+
+    def draw(counter: Array) -> list[Array]:
+        # fusions would hash anew for every result that they make of the numbers
+        return jax.lax.optimization_barrier(uniforms(counter, lane, words, walk.blocks, dtype))
+
+    def step(carry: Any) -> Any:
+        counter, state, remaining, result = carry
+        u = draw(counter)
+        state, outcome = walk.step(state, u)
+        result = record(result, outcome, remaining > 0)
+        state = jax.tree.map(lambda new, old: jnp.where(outcome.ends, new, old), walk.start(u[-1]), state)
+        return counter + jnp.uint32(1), state, remaining - outcome.ends, result
+
+    start = (jnp.uint32(1), walk.start(draw(jnp.uint32(0))[-1]), remaining, result)
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[2] > 0), step, start)[-1]
+
+
+def _sums(
+    walk: Walk,
+    tally: Tally,
+    outputs: int,
+    lane: Array,
+    remaining: Array,
+    words: tuple[Array, Array],
+    dtype: jnp.dtype,
+) -> tuple[Channels, Channels]:
+    """Sums over each lane's paths of what a path brings, and of its square."""
+
+    def record(result: Any, step: Step, owes: Array) -> Any:
+        path, sums, squares = result
+        path = tuple(a + b for a, b in zip(path, tally(step), strict=True))
+        done = step.ends & owes
+        sums = tuple(s + jnp.where(done, p, 0.0) for s, p in zip(sums, path, strict=True))
+        squares = tuple(s + jnp.where(done, p * p, 0.0) for s, p in zip(squares, path, strict=True))
+        return tuple(jnp.where(step.ends, 0.0, p) for p in path), sums, squares
+
+    zero = (jnp.zeros(lane.shape, dtype),) * outputs
+    _, sums, squares = follow(walk, record, (zero, zero, zero), lane, remaining, words, dtype)
+    return sums, squares

@@ -1,0 +1,225 @@
+"""What happens to the walk at a surface: a rough interface or the base, by one reflection or refraction.
+
+Directions here are of travel, in the frame of the stack; inside each function they are turned away from the surface,
+with z positive on the side that light arrives from.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import safe_div
+from layerjax.channels import Channels, pick
+from layerjax.directions import Vector, select
+from layerjax.normals.facets import (
+    Distribution,
+    draw_weight,
+    masking,
+    twice_seen,
+)
+from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces.microfacet import (
+    between,
+    interface_event,
+    interface_pdf,
+    interface_reflection,
+    interface_transmission,
+    refraction_lobe,
+)
+from layerjax.transport.random_walk.scene import Scene, choose
+
+DIFFUSE_SHARE = 0.1
+"""Weight of a cosine lobe in densities that stand for those of multiple scattering, which are not known."""
+
+
+class Bounce(NamedTuple):
+    """Result of an event at a surface."""
+
+    towards_target: Channels
+    """Share of the light sent to the target direction, per solid angle."""
+    direction: Vector
+    """New direction of travel."""
+    crosses: Array
+    """Whether that lies on the other side."""
+    kept: Channels
+    """Share of the light that the new direction carries."""
+    survives: Array
+    """Whether it carries any."""
+
+
+def base_of(scene: Scene) -> Surface | None:
+    """The base, its index taken relative to the medium on it."""
+    if not isinstance(scene.base, Conductor) or not scene.interfaces:
+        return scene.base
+    above = scene.indices[-1]
+    return eqx.tree_at(lambda base: (base.ior, base.k), scene.base, (scene.base.ior / above, scene.base.k / above))
+
+
+def turned(w: Vector, from_above: Array, sign: float = 1.0) -> Vector:
+    """w (times the sign) with z positive on the side that light arrives from."""
+    return sign * w[0], sign * w[1], jnp.where(from_above, sign * w[2], -sign * w[2])
+
+
+def is_base(scene: Scene, surface: Array | None) -> Array | bool:
+    """Whether the surface is the base; a Python bool if there is no choice."""
+    if not scene.interfaces or scene.base is None:
+        return scene.base is not None
+    return surface == len(scene.interfaces)
+
+
+def roughness(scene: Scene, surface: Array | None) -> Array:
+    """Width of the normals of an interface."""
+    return choose(surface, [interface.alpha for interface in scene.interfaces])
+
+
+def bounce(
+    scene: Scene,
+    surface: Array | None,
+    from_above: Array,
+    travel: Vector,
+    target: Vector | None,
+    refracts: Array | None,
+    uniforms: tuple[Array, Array, Array],
+) -> Bounce:
+    """One reflection or refraction of light that travels along `travel` onto a surface.
+
+    Args:
+        target: a direction of travel away from the surface that the scattered light is asked for, or None.
+        refracts: lanes that are to refract wherever that is possible (their `kept` then lacks the transmittance).
+    """
+    wi = _facing(turned(travel, from_above, -1.0))
+    towards = None if target is None else turned(target, from_above)
+    u1, u2, u3 = uniforms
+    at_base = is_base(scene, surface)
+    results = []
+    if at_base is not True:
+        ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+        u3 = u3 if refracts is None else jnp.where(refracts, 2.0, u3)
+
+        def event(distribution: Distribution) -> Bounce:
+            wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
+            kept = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
+            if distribution != "ggx":
+                kept = kept * draw_weight(wi, m, alpha)
+            sent: Channels = ()
+            if towards is not None:
+                sent = (_interface(wi, towards, ior, alpha, distribution) * jnp.abs(towards[2]),)
+            return Bounce(sent, wo, wo[2] < 0, (kept,), leaves)
+
+        results.append(_by_distribution(scene, surface, event))
+    if at_base is not False:
+        base = base_of(scene)
+        assert base is not None
+        wo = base.sample(wi, u1, u2)
+        leaves = wo[2] > 0
+        inside = _facing(wo)
+        share = tuple(_weight(f * inside[2], base.pdf(wi, inside), base) for f in base.evaluate(wi, inside))
+        value: Channels = () if towards is None else base_towards(base, wi, towards)
+        results.append(Bounce(value, wo, jnp.zeros_like(leaves), share, leaves))
+    result = results[0] if len(results) == 1 else merge(at_base, results[1], results[0])
+    return result._replace(direction=turned(result.direction, from_above))
+
+
+def base_towards(base: Surface, wi: Vector, towards: Vector) -> Channels:
+    """Light that the base sends to a direction, per solid angle; 0 below it."""
+    inside = _facing(towards)
+    return tuple(jnp.where(towards[2] > 0, f * inside[2], 0.0) for f in base.evaluate(wi, inside))
+
+
+def merge(chosen: Array | bool, a: Bounce, b: Bounce) -> Bounce:
+    """a where chosen, else b."""
+
+    def channels(x: Channels, y: Channels) -> Channels:
+        return tuple(jnp.where(chosen, pick(x, c), pick(y, c)) for c in range(max(len(x), len(y))))
+
+    mask = jnp.asarray(chosen)
+    return Bounce(
+        channels(a.towards_target, b.towards_target),
+        select(mask, a.direction, b.direction),
+        jnp.where(mask, a.crosses, b.crosses),
+        channels(a.kept, b.kept),
+        jnp.where(mask, a.survives, b.survives),
+    )
+
+
+def density(
+    scene: Scene, surface: Array | None, from_above: Array, travel: Vector, onward: Vector, *, diffuse: bool
+) -> Array:
+    """Density, 1/sr, with which `bounce` turns `travel` into `onward`; with `diffuse`, a stand-in that is never 0."""
+    wi, wo = _facing(turned(travel, from_above, -1.0)), turned(onward, from_above)
+    at_base = is_base(scene, surface)
+    value: Array | None = None
+    if at_base is not True:
+        ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+
+        def drawn(distribution: Distribution) -> Array:
+            return interface_pdf(_interface(wi, wo, ior, alpha, distribution), wi, wo, ior, alpha, distribution)
+
+        value = _by_distribution(scene, surface, drawn)
+    if at_base is not False:
+        base = base_of(scene)
+        assert base is not None
+        below = jnp.where(wo[2] > 0, base.pdf(wi, _facing(wo)), 0.0)
+        value = below if value is None else jnp.where(at_base, below, value)
+    assert value is not None
+    return value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi if diffuse else value
+
+
+def exit_density(
+    scene: Scene, surface: Array, above: Array, leaving: Vector, inside: Vector, *, diffuse: bool
+) -> tuple[Array, Array]:
+    """Density with which an interface, seen from outside along `leaving`, refracts to the direction `inside`.
+
+    Both directions point away from the interface; `above` says on which side `leaving` lies. Also the transmittance of
+    the facet, G1 / cos of `inside` and what the draw weighs, multiplied.
+    """
+    wi, wo = turned(leaving, above), turned(inside, above)
+    ior, alpha = scene.surface_ior(surface, above), roughness(scene, surface)
+
+    def drawn(distribution: Distribution) -> tuple[Array, Array]:
+        lobe, transmittance = refraction_lobe(wi, wo, ior, alpha, distribution)
+        value = jnp.where(wo[2] < 0, 2.0 * lobe / twice_seen(wi[2], wi, alpha, distribution), 0.0)
+        passed = transmittance * 2.0 / twice_seen(jnp.abs(wo[2]), wo, alpha, distribution)
+        if distribution == "ggx":
+            return value, passed
+        weight = draw_weight(wi, between(wi, wo, ior), alpha)
+        return value / weight, passed * weight
+
+    value, passed = _by_distribution(scene, surface, drawn)
+    if diffuse:
+        value = value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi
+    return value, passed
+
+
+def _by_distribution(scene: Scene, surface: Array | None, function: Callable[[Distribution], Any]) -> Any:
+    """What the function gives for the normals of the interface; computed for every distribution that there is."""
+    kinds = [interface.distribution for interface in scene.interfaces]
+    result = function(kinds[0])
+    for other in sorted(set(kinds[1:]) - {kinds[0]}):
+        chosen = choose(surface, [jnp.asarray(kind == other) for kind in kinds])
+        result = jax.tree.map(partial(jnp.where, chosen), function(other), result)
+    return result
+
+
+def _weight(value: Array, density: Array, base: Surface) -> Array:
+    """Their quotient; 0 where vMF normals are so improbable that both are 0."""
+    vanishes = isinstance(base, Conductor) and base.distribution == "vmf"
+    return safe_div(value, density) if vanishes else value / density
+
+
+def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution) -> Array:
+    """BSDF of an interface, of whichever kind the side of wo asks for."""
+    above = wo[2] > 0
+    reflected = interface_reflection(wi, (wo[0], wo[1], jnp.where(above, wo[2], 0.5)), ior, alpha, distribution)
+    refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha, distribution)
+    return jnp.where(above, reflected, refracted)
+
+
+def _facing(w: Vector) -> Vector:
+    """w with its z kept above 0: rounding may leave it in the plane of the surface."""
+    return w[0], w[1], jnp.maximum(w[2], 1e-12)

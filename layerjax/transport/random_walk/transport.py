@@ -1,0 +1,157 @@
+"""Monte Carlo reference: unbiased random walks through anything that a `Stack` holds.
+
+See `layerjax.transport.random_walk.walk` for the estimator, `layerjax.transport.random_walk.lanes` for how paths share
+the lanes, and `layerjax.transport.random_walk.random_numbers` for the random numbers.
+"""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import horizon
+from layerjax.channels import Channels
+from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.normals.facets import facet_density, sample
+from layerjax.stack import Interface, Stack, simplify
+from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.transport.contract import Side, Transport, refuse_vmf
+from layerjax.transport.random_walk.lanes import average, upright
+from layerjax.transport.random_walk.scene import Scene
+from layerjax.transport.random_walk.state import Step
+from layerjax.transport.random_walk.walk import Microfacets, Orders, Walk
+
+
+class RandomWalk(Transport):
+    """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
+
+    Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. The same
+    key and the same shapes give the same numbers, bit for bit.
+
+    Args:
+        paths: number of paths for each pair of directions (for each direction, if an albedo is asked for), >= 2.
+        microfacets: ``"single"``, one reflection or refraction at a rough surface (Walter et al. 2007), which loses
+            what is masked; ``"multiple"``, light is followed on it until it leaves (Heitz et al. 2016).
+        orders: ``"all"``; ``"first"``, paths of one event; ``"multiple"``, of two and more. An event is a collision, a
+            reflection or refraction at an interface, or a reflection at the base.
+        lanes: number of paths that are under way at a time.
+    """
+
+    random: ClassVar[bool] = True
+
+    paths: int = eqx.field(static=True, default=16384)
+    microfacets: Microfacets = eqx.field(static=True, default="single")
+    orders: Orders = eqx.field(static=True, default="all")
+    lanes: int = eqx.field(static=True, default=4096)
+
+    def __check_init__(self) -> None:
+        if self.paths < 2:
+            raise ValueError(f"RandomWalk.paths: {self.paths!r} is less than 2, which give no standard error")
+        if self.lanes < 1:
+            raise ValueError(f"RandomWalk.lanes: {self.lanes!r} is less than 1")
+        for name, value, allowed in (
+            ("microfacets", self.microfacets, ("single", "multiple")),
+            ("orders", self.orders, ("all", "first", "multiple")),
+        ):
+            if value not in allowed:
+                raise ValueError(f"RandomWalk.{name}: {value!r} is not one of {', '.join(map(repr, allowed))}")
+
+    def check(self, stack: Stack) -> None:
+        if self.microfacets == "multiple":
+            refuse_vmf(stack, 'RandomWalk(microfacets="multiple")')
+
+    def prepare(self, stack: Stack) -> Stack:
+        return simplify(stack)
+
+    def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
+        raise ValueError("RandomWalk: evaluation draws random numbers and needs a key: evaluate(..., key=...)")
+
+    def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+        raise ValueError("RandomWalk: the albedo is drawn at random and needs a key: albedo(..., key=...)")
+
+    def estimate(
+        self, state: Stack, wi: Vector, wo: Vector, side: Side, channels: int, key: Array
+    ) -> tuple[Array, Array]:
+        """BSDF values of n pairs and their standard errors, shape (n, channels) each."""
+        scene = Scene(state, channels, wi[2].dtype)
+        edge = horizon(wi[2].dtype)
+        valid = (jnp.abs(wi[2]) > edge) & (jnp.abs(wo[2]) > edge)
+        if state.base is not None or side == "reflection":
+            valid = valid & (wi[2] > 0) & (wo[2] > 0)
+        if side == "transmission":
+            valid = valid & (wi[2] * wo[2] < 0)
+        wi, wo = upright(wi, valid), upright(wo, valid)
+
+        def walk(wi: Vector, wo: Vector) -> Walk:
+            return Walk(scene, wi, wo, self.microfacets, self.orders)
+
+        def tally(step: Step) -> Channels:
+            return step.contribution
+
+        return average(walk, tally, channels, (wi, wo), valid, self.paths, self.lanes, key)
+
+    def estimate_albedo(self, state: Stack, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
+        """Shares scattered to wi's side, then to the other, and standard errors, shape (n, 2 channels) each."""
+        scene = Scene(state, channels, wi[2].dtype)
+        valid = jnp.abs(wi[2]) > horizon(wi[2].dtype)
+        valid = valid & (wi[2] > 0) if state.base is not None else valid
+
+        def walk(wi: Vector) -> Walk:
+            return Walk(scene, wi, None, self.microfacets, self.orders, count_orders=True)
+
+        def tally(step: Step) -> Channels:
+            assert step.order is not None
+            counted = step.escapes & (step.order >= (2 if self.orders == "multiple" else 1))
+            above = step.direction[2] > 0
+            upwards = tuple(jnp.where(counted & above, w, 0.0) for w in step.weight)
+            downwards = tuple(jnp.where(counted & ~above, w, 0.0) for w in step.weight)
+            return (*upwards, *downwards)
+
+        value, error = average(walk, tally, 2 * channels, (upright(wi, valid),), valid, self.paths, self.lanes, key)
+        above = (wi[2] > 0)[:, None]
+
+        def near_first(x: Array) -> Array:
+            return jnp.where(above, x, jnp.roll(x, channels, axis=1))
+
+        return near_first(value), near_first(error)
+
+    def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        u, u1, u2 = uniforms
+        side = jnp.where(wi[2] < 0, -1.0, 1.0)
+        local = _lifted((wi[0], wi[1], wi[2] * side))
+        near, far = _diffuse_shares(state)
+        cosine = sample_cosine(u1, u2)
+        wo = select(u < near, cosine, (cosine[0], cosine[1], -cosine[2]))
+        facets = _facets(state)
+        if facets is not None:
+            m = sample(local, facets.alpha, u1, u2, facets.distribution)
+            wo = select(u < near + far, wo, reflect(local, m))
+        return wo[0], wo[1], wo[2] * side
+
+    def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
+        side = jnp.where(wi[2] < 0, -1.0, 1.0)
+        local, towards = _lifted((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
+        near, far = _diffuse_shares(state)
+        density = jnp.where(towards[2] > 0, near, far) * jnp.abs(towards[2]) / jnp.pi
+        facets = _facets(state)
+        if facets is not None:
+            h, _ = half_vector(local, towards)
+            mirrored = facet_density(h, local, facets.alpha, facets.distribution)
+            density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
+        return density
+
+
+def _diffuse_shares(state: Stack) -> tuple[float, float]:
+    """Shares of cosine lobes on wi's side and on the other; visible normals of the top interface take the rest."""
+    lobes = 1.0 if _facets(state) is None else 0.5
+    return (lobes, 0.0) if state.base is not None else (0.5 * lobes, 0.5 * lobes)
+
+
+def _facets(state: Stack) -> Interface | None:
+    return next((layer for layer in state.layers if isinstance(layer, Interface)), None)
+
+
+def _lifted(w: Vector) -> Vector:
+    edge = horizon(w[2].dtype)
+    return w[0], w[1], jnp.where(w[2] > edge, w[2], 0.5)

@@ -1,0 +1,83 @@
+"""Light that has reached a Lambertian base under dielectric coats, as one lobe (de Dinechin & Belcour 2022).
+
+The paper's form, from its tables; `layerjax.transport.statistical.diffuse_base` has the closed form beside it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import at_least, horizon, safe_sqrt
+from layerjax.channels import Channels, per_channel, pick
+from layerjax.directions import Vector
+from layerjax.stack import Interface, Medium, Stack, is_known
+from layerjax.surfaces import Lambertian
+from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
+from layerjax.transport.statistical.lobes import precision
+from layerjax.transport.statistical.tables import GRAZING, look_up, points
+
+
+class DiffuseLobe(eqx.Module):
+    """energy: at the points of a table, (POINTS, C or 1). alpha: GGX width of the lobe, (C or 1,)."""
+
+    energy: Array
+    alpha: Array
+
+
+def why_no_lobe(stack: Stack) -> str | None:
+    """What keeps a simplified stack from having this lobe, by name; None if nothing does."""
+    if not isinstance(stack.base, Lambertian):
+        return "base: the lobe of a diffuse base is that of a Lambertian"
+    if not stack.layers or not isinstance(stack.layers[0], Interface):
+        return "layers: the lobe of a diffuse base needs an Interface on top"
+    for index, layer in enumerate(stack.layers):
+        if isinstance(layer, Medium) and not is_known(layer.albedo, 0.0):
+            return f"layers[{index}]: the lobe of a diffuse base needs media that only absorb (albedo known to be 0)"
+    return None
+
+
+@eqx.filter_jit
+def make_diffuse_lobe(stack: Stack) -> DiffuseLobe:
+    """The lobe of a simplified stack for which `why_no_lobe` finds nothing."""
+    assert isinstance(stack.base, Lambertian)
+    dtype = precision(stack)
+    cosine = at_least(points(dtype), GRAZING)
+    albedos = per_channel(jnp.asarray(stack.base.albedo))
+    depths: list[list[Array]] = []
+    faces: list[Interface] = []
+    for layer in stack.layers:
+        if isinstance(layer, Interface):
+            faces.append(layer)
+            depths.append([jnp.zeros((1,), dtype)])
+        else:
+            depths[-1].append(jnp.stack(per_channel(layer.thickness)))
+    channels = max(len(albedos), *(depth.shape[0] for below in depths for depth in below))
+    through = [jnp.broadcast_to(jnp.exp(-sum(below[1:], below[0])), (channels,)) for below in depths]
+
+    def lobe(albedo: Array, through: list[Array]) -> tuple[Array, Array]:
+        coats = [
+            Coat(jnp.asarray(face.alpha), jnp.asarray(face.ior), tau) for face, tau in zip(faces, through, strict=True)
+        ]
+        return stack_lobe(coats, albedo, cosine)
+
+    energy, alpha = jax.vmap(lobe, out_axes=(1, 0))(jnp.stack([pick(albedos, c) for c in range(channels)]), through)
+    return DiffuseLobe(energy, alpha)
+
+
+def lobe_value(part: DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
+    """BRDF of the lobe, 0 unless both directions are above."""
+    edge = horizon(wi[2].dtype)
+    valid = (wi[2] > edge) & (wo[2] > edge)
+    energies = lobe_albedo(part, (wi[0], wi[1], jnp.where(valid, wi[2], 0.5)))
+    seen = (wo[0], wo[1], jnp.where(valid, wo[2], 0.5))
+    return tuple(
+        jnp.where(valid, indirect_lobe(seen, alpha, energy), 0.0)
+        for alpha, energy in zip(part.alpha, energies, strict=True)
+    )
+
+
+def lobe_albedo(part: DiffuseLobe, wi: Vector) -> Channels:
+    """Energy of `lobe_value` for light along wi, above."""
+    rows = look_up(part.energy, wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1]))
+    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points

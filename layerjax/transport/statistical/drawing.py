@@ -1,0 +1,155 @@
+"""Directions drawn from the lobes of a table: one lobe by its energy, then a facet that is seen from the light."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
+from layerjax.channels import Channels
+from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.normals.facets import facet_density
+from layerjax.normals.sggx import ggx_sample
+from layerjax.surfaces import Surface
+from layerjax.surfaces.lambertian import sample_cosine
+from layerjax.transport.first_order import mirror
+from layerjax.transport.single_scattering import Media, SingleScattering
+from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
+from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
+from layerjax.transport.statistical.lobes import bounded
+from layerjax.transport.statistical.tables import (
+    Columns,
+    Table,
+    folded,
+    look_up,
+    unfolded,
+)
+
+DiffusePart = DiffuseBase | DiffuseLobe | Surface
+"""Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""
+
+
+def planar(w: Vector) -> Array:
+    """Sine of the polar angle."""
+    return safe_sqrt(w[0] * w[0] + w[1] * w[1])
+
+
+def lifted(w: Vector, valid: Array) -> Vector:
+    """w, with a stand-in for its cosine where it is not to be looked at."""
+    return (w[0], w[1], jnp.where(valid, w[2], 0.5))
+
+
+def take(row: Array, columns: tuple[int, int]) -> Channels:
+    """These columns of rows, one array each."""
+    return tuple(row[..., columns[0] + c] for c in range(columns[1]))
+
+
+def read_energies(table: Table, wi: Vector) -> tuple[Channels, Channels]:
+    """Energy of all lobes on the side of the light and on the other."""
+    # a cubic may fall below its points
+    near, far = (at_least(look_up(rows, wi[2], planar(wi)), 0.0) for rows in (table.near, table.far))
+    return take(near, (0, near.shape[-1])), take(far, (0, far.shape[-1]))
+
+
+def widths(table: Table, wi: Vector) -> tuple[list[Array], list[Array]]:
+    """GGX width of every lobe for light along wi, mean of the channels: those reflected, those transmitted."""
+    row = look_up(table.rows, wi[2], planar(wi))
+
+    def width(columns: Columns) -> Array:
+        if columns.alpha is None:
+            assert table.facet is not None
+            return jnp.asarray(table.facet[0].alpha) * jnp.ones_like(wi[2])
+        alphas = take(row, columns.alpha)
+        return bounded(sum(alphas[1:], alphas[0]) / len(alphas))
+
+    return [width(columns) for columns in table.reflected], [width(columns) for columns in table.transmitted]
+
+
+def draw(
+    table: Table,
+    diffuse: DiffusePart | None,
+    wi: Vector,
+    uniforms: tuple[Array, Array, Array],
+    entry: Array,
+    exit: Array,
+) -> Vector:
+    """Outgoing directions for light above. entry, exit: indices before and behind over that of the folded medium."""
+    u, u1, u2 = uniforms
+    valid = wi[2] > horizon(wi[2].dtype)
+    wi = lifted(wi, valid)
+    shares = _probabilities(table, diffuse, wi)
+    reflected, transmitted = widths(table, wi)
+    alpha, passes, scatters = jnp.ones_like(u), jnp.zeros(u.shape, bool), jnp.ones(u.shape, bool)
+    reached = jnp.zeros_like(u)
+    for index, width in enumerate(reflected + transmitted):
+        chosen = scatters & (u < reached + shares[index]) & (u >= reached)
+        reached = reached + shares[index]
+        alpha = jnp.where(chosen, width, alpha)
+        passes = passes | (chosen & (index >= len(reflected)))
+        scatters = scatters & ~chosen
+    # what no lobe took is diffuse; where nothing is diffuse that is rounding, and drawn from a lobe of width 1
+    light = wi if not transmitted else select(passes, folded(wi, entry), wi)
+    wo = reflect(light, ggx_sample(light, alpha, u1, u2))
+    if transmitted:
+        wo = select(passes, unfolded(wo, exit), wo)
+    if diffuse is not None:
+        wo = select(scatters, sample_cosine(u1, u2), wo)
+    lost = ~valid | (~passes & (wo[2] < 0))
+    return (wo[0], wo[1], jnp.where(lost, 0.0, wo[2]))
+
+
+def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array) -> Array:
+    """Density of `draw` in solid angle, 1/sr."""
+    edge = horizon(wi[2].dtype)
+    lit = wi[2] > edge
+    wi = lifted(wi, lit)
+    shares = _probabilities(table, diffuse, wi)
+    reflected, transmitted = widths(table, wi)
+    above = wo[2] > edge
+    up = lifted(wo, above)
+    h, _ = half_vector(wi, up, same_side=True)
+    rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
+    total = jnp.zeros_like(wi[2] * wo[2])
+    for share, alpha in zip(shares, reflected, strict=False):
+        total = total + share * facet_density(h, wi, alpha)
+    if diffuse is not None:
+        total = total + rest * up[2] / np.pi
+    total = jnp.where(above, total, 0.0)
+    if transmitted:
+        below = wo[2] < -edge
+        under = lifted(mirror(wo), below)
+        a, b = folded(wi, entry), folded(under, exit)
+        below = below & (a[2] > edge) & (b[2] > edge)
+        a, b = lifted(a, below), lifted(b, below)
+        h, _ = half_vector(a, b, same_side=True)
+        stretch = exit * exit * under[2] / b[2]
+        for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):
+            total = total + jnp.where(below, share * stretch * facet_density(h, a, alpha), 0.0)
+    return jnp.where(lit, total, 0.0)
+
+
+def diffuse_energy(diffuse: DiffusePart, wi: Vector, nodes: int) -> Channels:
+    """Energy of the light that has met a diffuse base, of any form; `nodes`: see `layerjax.albedo`."""
+    if isinstance(diffuse, Surface):
+        return SingleScattering().albedo(Media((), diffuse), wi, nodes)[0]
+    return diffuse_albedo(diffuse, wi) if isinstance(diffuse, DiffuseBase) else lobe_albedo(diffuse, wi)
+
+
+def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
+    """BRDF of the light that has met a diffuse base, of any form; 0 unless both directions are above."""
+    if isinstance(diffuse, Surface):
+        return SingleScattering().evaluate(Media((), diffuse), wi, wo, "reflection")
+    return diffuse_value(diffuse, wi, wo) if isinstance(diffuse, DiffuseBase) else lobe_value(diffuse, wi, wo)
+
+
+def _probabilities(table: Table, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
+    """Of the lobes, in the order of the table; what is missing from 1 is that of the diffuse part."""
+    if table.shares.shape[-1] == 0:
+        return []
+    row = look_up(table.shares, wi[2], planar(wi))
+    energies = [jnp.where(row[..., k] > 1e-6, row[..., k], 1e-6) for k in range(row.shape[-1])]
+    total = sum(energies, jnp.zeros_like(wi[2]))
+    if diffuse is not None:
+        assert not isinstance(diffuse, Surface)  # which has no lobes beside it
+        parts = diffuse_energy(diffuse, wi, 0)
+        total = total + 1e-6 + sum(parts, jnp.zeros_like(wi[2])) / len(parts)
+    return [safe_div(energy, total) for energy in energies]
