@@ -12,7 +12,12 @@ from benchmarks.error_tables import VALUES, amortised, floored
 from benchmarks.models import Model, Row
 from benchmarks.suite import FAMILIES
 from benchmarks.truth import Judged
-from fits.pictures import CYCLE, GREY, INK, STYLE
+from fits.reporting.plots.data import (
+    CYCLE,
+    GREY,
+    INK,
+    STYLE,
+)
 
 MARKERS = "osD^v<>P*"
 HIGHEST = 10.0

@@ -15,7 +15,7 @@ from benchmarks.results import DIRECTORY, write
 from benchmarks.suite import Case
 from benchmarks.truth import REFERENCES, Judged, References, Truth, judge, pack, unpack
 from fits._files import write_bytes
-from fits.pictures import as_png
+from fits.reporting.plots.data import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)

@@ -19,7 +19,7 @@ import layerjax as lj
 from benchmarks.results import Bar, figure, table
 from benchmarks.scenes import pairs
 from benchmarks.timing import interleaved
-from fits.optimise import fit_many, fit_problem
+from fits.inference.optimise import fit_many, fit_problem
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import fits
 import layerjax as lj
 from benchmarks import environment
 from benchmarks.results import DIRECTORY, environment_lines, figure, table, write
-from fits.optimise import fit_many, fit_problem
+from fits.inference.optimise import fit_many, fit_problem
 
 Floats = NDArray[np.float64]
 

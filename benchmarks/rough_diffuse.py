@@ -14,7 +14,7 @@ import fits
 import layerjax as lj
 from benchmarks import environment, timing
 from benchmarks.results import DIRECTORY, environment_lines, figure, table, write
-from fits.geometry import Geometry
+from fits.data.geometry import Geometry
 from layerjax.surfaces import Surface
 
 NAME = "rough-diffuse"

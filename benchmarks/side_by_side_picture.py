@@ -12,7 +12,12 @@ import layerjax as lj
 from benchmarks.models import Model, supports
 from benchmarks.suite import FAMILIES, Case
 from benchmarks.truth import REFERENCES
-from fits.pictures import CYCLE, INK, STYLE, as_png
+from fits.reporting.plots.data import (
+    CYCLE,
+    INK,
+    STYLE,
+    as_png,
+)
 
 SHOWN = {
     "plastics_and_paints": "coated_sand",

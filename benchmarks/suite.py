@@ -1,6 +1,6 @@
 """The suite of stacks that every model is set against: what they are made of, and where they are looked at.
 
-Each stack is a file ``benchmarks/suite/FAMILY/NAME.toml`` in the syntax of `fits.stack_file`, so that
+Each stack is a file ``benchmarks/suite/FAMILY/NAME.toml`` in the syntax of `fits.problem.stack_file`, so that
 ``layerjax simulate --stack`` and the other commands take it as it is; its table ``[about]`` says where it comes from.
 
 The directions of a stack are fixed. Light comes from five polar angles (10 to 85 degrees, in the family
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from fits.stack_file import read_problem
+from fits.problem.stack_file import read_problem
 
 DIRECTORY = Path(__file__).parent / "suite"
 

@@ -6,8 +6,8 @@ import pytest
 
 import layerjax as lj
 from benchmarks.suite import DIRECTORY, FAMILIES, GROUP, load
-from fits.parameters import is_free
-from fits.stack_file import read_problem
+from fits.problem.parameters import is_free
+from fits.problem.stack_file import read_problem
 
 CASES = load()
 NAMES = {case.name: case for case in CASES}

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 
 import layerjax as lj
-from fits.fit_result import Fit
-from fits.formats.csv import write_csv
-from fits.geometry import slices
-from fits.measurements import Measurements
-from fits.optimise import fit
-from fits.simulate import simulate
-from fits.stack_file import read_problem
+from fits.data.formats.csv import write_csv
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.simulate import simulate
+from fits.problem.stack_file import read_problem
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
 PROBLEM = """\

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fits.measurements import Measurements
+from fits.data.measurements import Measurements
 
 
 def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:

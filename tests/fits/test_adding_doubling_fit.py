@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.fit_result import Fit
-from fits.optimise import fit
-from fits.parameters import Free
-from fits.problem import Model, Problem
-from fits.simulate import simulate, slices
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.parameters import Free
+from fits.problem.problem import Model, Problem
+from fits.problem.simulate import simulate, slices
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
 TRUTH = {"layers[0].thickness": 2.0, "base.albedo": 0.2}

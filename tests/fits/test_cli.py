@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.cli import main
-from fits.fit_result import Fit
-from fits.formats import read
-from fits.measurements import Measurements
-from fits.problem import Problem
-from fits.results import load_fit, load_posterior, save_fit
+from fits.cli.parser import main
+from fits.data.formats import read
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.problem.problem import Problem
+from fits.reporting.results import load_fit, load_posterior, save_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6  # of the stack behind coat_data
 ROOT = Path(__file__).parents[2]
@@ -235,7 +235,7 @@ def test_an_interrupted_sampler_says_how_to_go_on(
         raise KeyboardInterrupt
 
     save_fit(coat_fit, "result")
-    monkeypatch.setattr("fits.posterior.sample", interrupted)
+    monkeypatch.setattr("fits.inference.posterior.sample", interrupted)
     assert main(["sample", "result"]) == 130
     assert "`layerjax sample result` goes on with it" in capsys.readouterr().err
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.compare import compare
-from fits.optimise import fit
-from fits.parameters import Free
-from fits.posterior import sample
+from fits.inference.compare import compare
+from fits.inference.optimise import fit
+from fits.inference.posterior import sample
+from fits.problem.parameters import Free
 from tests.fits.models import design, line, measured
 
 COUNT = 120

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.formats import read, write_csv
-from fits.geometry import direction
-from fits.measurements import Measurements, Source
+from fits.data.formats import read, write_csv
+from fits.data.geometry import direction
+from fits.data.measurements import Measurements, Source
 
 DATA = Path(__file__).parents[2] / "examples" / "arizona_black_coatings"
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf"

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.chain import USER_BLOCK, read_chain
-from fits.fit_result import Fit
-from fits.posterior import load, sample
-from fits.results import load_fit, save_fit
-from fits.starts import End, start_points
-from fits.starts_file import StartsFile
+from fits.inference.chain import USER_BLOCK, read_chain
+from fits.inference.fit_result import Fit
+from fits.inference.posterior import load, sample
+from fits.inference.starts import start_points
+from fits.inference.starts_file import End, StartsFile
+from fits.reporting.results import load_fit, save_fit
 from tests.fits.test_interrupted import largest_file
 from tests.fits.test_posterior import line_fit
 

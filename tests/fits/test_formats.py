@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.formats import FORMATS, read
-from fits.geometry import direction, slices
+from fits.data.formats import FORMATS, read
+from fits.data.geometry import direction, slices
 
 DATA = Path(__file__).parents[2] / "examples" / "arizona_black_coatings"
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fits.identifiability import unresolved_combinations
+from fits.inference.identifiability import unresolved_combinations
 
 
 def test_a_sum_that_alone_is_known_is_told_from_its_parts() -> None:

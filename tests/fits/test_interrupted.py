@@ -14,19 +14,30 @@ import jax
 import numpy as np
 import pytest
 
-from fits import starts
 from fits._files import locked
-from fits.chain import FileChain
-from fits.cli import main
-from fits.fit_result import Fit
-from fits.likelihood import Noise
-from fits.optimise import fit
-from fits.pictures import data_picture
-from fits.posterior import Posterior, _identity, load, sample
-from fits.problem import Problem
-from fits.results import load_fit, load_posterior, reserved, save_fit, save_posterior
-from fits.starts import start_points
-from fits.starts_file import StartsFile
+from fits.cli.parser import main
+from fits.inference import starts
+from fits.inference.chain import FileChain
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.inference.posterior import (
+    Posterior,
+    _identity,
+    load,
+    sample,
+)
+from fits.inference.starts import start_points
+from fits.inference.starts_file import StartsFile
+from fits.problem.likelihood import Noise
+from fits.problem.problem import Problem
+from fits.reporting.plots.data import data_picture
+from fits.reporting.results import (
+    load_fit,
+    load_posterior,
+    reserved,
+    save_fit,
+    save_posterior,
+)
 from tests.fits.models import line
 from tests.fits.test_cli import ROOT, contents
 from tests.fits.test_posterior import LINE, line_data, line_fit
@@ -161,7 +172,7 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # any picture will do, and this one is drawn fast
-    monkeypatch.setattr("fits.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
+    monkeypatch.setattr("fits.reporting.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
     for directory in ("one", "two"):
         save_fit(coat_fit, directory)
     for output in ("out.csv", "out.png", "out.html", "one/report.html"):

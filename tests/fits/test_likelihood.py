@@ -7,9 +7,21 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits.likelihood import Noise, information_weights, log_density, named_residual, sigma_residual, tail_residual
-from fits.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem import Problem
+from fits.problem.likelihood import (
+    Noise,
+    information_weights,
+    log_density,
+    named_residual,
+    sigma_residual,
+    tail_residual,
+)
+from fits.problem.parameters import (
+    Free,
+    LogNormal,
+    LogUniform,
+    Normal,
+)
+from fits.problem.problem import Problem
 from tests.fits.models import design, line, measured
 
 COUNT = 40

@@ -6,8 +6,18 @@ import sys
 import numpy as np
 import pytest
 
-from fits.geometry import azimuth, direction, polar, slices
-from fits.measurements import Measurements, channel_names, check_quantity, to_bsdf
+from fits.data.geometry import (
+    azimuth,
+    direction,
+    polar,
+    slices,
+)
+from fits.data.measurements import (
+    Measurements,
+    channel_names,
+    check_quantity,
+    to_bsdf,
+)
 
 
 def _measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes) -> Measurements:
@@ -138,5 +148,5 @@ def test_channel_names():
 
 
 def test_reading_needs_no_jax():
-    code = "import sys, fits.formats; sys.exit('jax' in sys.modules)"
+    code = "import sys, fits.data.formats; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.diagnostics import in_plane, incidences, relative_azimuth
-from fits.formats import read
-from fits.formats.merl import half_difference
-from fits.geometry import Geometry, direction, slices
-from fits.measurements import Measurements
-from fits.optimise import fit
-from fits.parameters import Free
+from fits.data.formats import read
+from fits.data.formats.merl import half_difference
+from fits.data.geometry import Geometry, direction, slices
+from fits.data.measurements import Measurements
+from fits.inference.optimise import fit
+from fits.problem.parameters import Free
+from fits.reporting.diagnostics import in_plane, incidences, relative_azimuth
 
 SHAPE = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500

@@ -10,15 +10,25 @@ import pytest
 from scipy.optimize import least_squares
 
 import layerjax as lj
-from fits import verdicts
-from fits.compiled import _run
-from fits.geometry import slices
-from fits.identifiability import Combination
-from fits.likelihood import Noise
-from fits.optimise import fit, fit_many, fit_problem, start_points
-from fits.parameters import Free, LogNormal, LogUniform, Normal
-from fits.problem import Problem
-from fits.simulate import simulate
+from fits.data.geometry import slices
+from fits.inference.identifiability import Combination
+from fits.inference.optimise import (
+    fit,
+    fit_many,
+    fit_problem,
+    start_points,
+)
+from fits.problem.compiled import _run
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import (
+    Free,
+    LogNormal,
+    LogUniform,
+    Normal,
+)
+from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
+from fits.reporting import verdicts
 from tests.fits.models import LOBE, design, directions, line, lobe, measured
 
 COUNT = 300
@@ -323,7 +333,8 @@ def test_refused(options: dict, message: str) -> None:
 
 
 def test_jaxopt_and_the_sampler_wait_until_it_is_needed() -> None:
-    code = "import sys, fits.optimise; print([m for m in ('jaxopt', 'arviz', 'emcee', 'h5py') if m in sys.modules])"
+    unused = "[m for m in ('jaxopt', 'arviz', 'emcee', 'h5py') if m in sys.modules]"
+    code = f"import sys, fits.inference.optimise; print({unused})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -13,13 +13,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fits.chain import FileChain, MemoryChain
-from fits.fit_result import Fit
-from fits.laplace import Approximation
-from fits.likelihood import Noise
-from fits.optimise import fit
-from fits.parameters import Free
-from fits.posterior import _adapted, _identity, _sampler, load, sample
+from fits.inference.chain import FileChain, MemoryChain
+from fits.inference.fit_result import Fit
+from fits.inference.laplace import Approximation
+from fits.inference.optimise import fit
+from fits.inference.posterior import (
+    _adapted,
+    _identity,
+    _sampler,
+    load,
+    sample,
+)
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
 from tests.fits.models import design, line, measured
 
 COUNT = 100
@@ -209,7 +215,7 @@ import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
 import tests.fits.test_posterior as this
-from fits.posterior import sample
+from fits.inference.posterior import sample
 result = this.line_fit()
 print("ready", flush=True)
 posterior = sample(result, walkers=16, seed=1, path=sys.argv[1], progress=lambda *a: time.sleep(0.02))

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.cli import main
-from fits.render import SKY, SUN, _display, _sky, _sphere, render
+from fits.cli.parser import main
+from fits.reporting.render import (
+    SKY,
+    SUN,
+    _display,
+    _sky,
+    _sphere,
+    render,
+)
 
 WHITE = lj.Stack([], lj.Lambertian(1.0))
 SINGLE = lj.SingleScattering()

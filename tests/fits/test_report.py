@@ -9,8 +9,15 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from fits import model_pictures, parameter_pictures, pictures, tables, verdicts
-from fits.diagnostics import (
+from fits.data.geometry import direction, slices
+from fits.data.measurements import Measurements, Source
+from fits.inference.fit_result import Fit
+from fits.inference.identifiability import Combination
+from fits.inference.optimise import fit
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from fits.reporting import tables, verdicts
+from fits.reporting.diagnostics import (
     autocorrelation,
     in_plane,
     incidences,
@@ -19,14 +26,16 @@ from fits.diagnostics import (
     signed_angle,
     standardised,
 )
-from fits.fit_result import Fit
-from fits.geometry import direction, slices
-from fits.identifiability import Combination
-from fits.likelihood import Noise
-from fits.measurements import Measurements, Source
-from fits.optimise import fit
-from fits.parameters import Free
-from fits.report import report
+from fits.reporting.html import report
+from fits.reporting.plots import (
+    data as pictures,
+)
+from fits.reporting.plots import (
+    model as model_pictures,
+)
+from fits.reporting.plots import (
+    parameters as parameter_pictures,
+)
 
 
 def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:

@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.fit_result import Fit, Minimum
-from fits.identifiability import Combination
-from fits.likelihood import Noise
-from fits.parameters import Free, LogNormal
-from fits.problem import Problem
-from fits.results import load_fit, load_posterior, replacing, save_fit
+from fits.inference.fit_result import Fit, Minimum
+from fits.inference.identifiability import Combination
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free, LogNormal
+from fits.problem.problem import Problem
+from fits.reporting.results import (
+    load_fit,
+    load_posterior,
+    replacing,
+    save_fit,
+)
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
 

@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 
 import layerjax as lj
-from fits.optimise import fit
-from fits.parameters import Free, LogUniform
-from fits.posterior import sample
-from fits.ridge import ridge
+from fits.inference.optimise import fit
+from fits.inference.posterior import sample
+from fits.inference.ridge import ridge
+from fits.problem.parameters import Free, LogUniform
 from tests.fits.models import directions, measured
 
 COUNT, SIGMA, LEVEL = 40, 0.005, 0.5

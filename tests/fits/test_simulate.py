@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import layerjax as lj
-from fits.simulate import simulate, slices
+from fits.problem.simulate import simulate, slices
 
 PAINT = lj.Stack([], base=lj.Lambertian(albedo=[0.2, 0.4, 0.6]))
 

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from fits.cli import main
-from fits.parameters import Box, is_free
-from fits.stack_file import ProblemFile, read_problem, write_problem
+from fits.cli.parser import main
+from fits.problem.parameters import Box, is_free
+from fits.problem.stack_file import ProblemFile, read_problem, write_problem
 
 BASE = 'base = { kind = "Lambertian", albedo = 0.5 }\n'
 MEDIUM = 'layers = [{ kind = "Medium", thickness = 1.0, %s }]\n'

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fits import starts as starts_module
-from fits.bounded import cost_and_gradient
-from fits.fit_result import ENDED
-from fits.formats import read
-from fits.optimise import fit
-from fits.problem import Problem
-from fits.stack_file import read_problem
-from fits.starts import WORTH
+from fits.data.formats import read
+from fits.inference import starts as starts_module
+from fits.inference.bounded import cost_and_gradient
+from fits.inference.fit_result import ENDED
+from fits.inference.optimise import fit
+from fits.inference.starts import WORTH
+from fits.problem.problem import Problem
+from fits.problem.stack_file import read_problem
 from tests.fits.models import LOBE, directions, lobe, measured
 from tests.fits.test_optimise import LOBE_STACK, noisy_lobe
 

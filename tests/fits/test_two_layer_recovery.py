@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits import verdicts
-from fits.fit_result import Fit
-from fits.geometry import slices
-from fits.optimise import fit
-from fits.parameters import Free, LogNormal
-from fits.simulate import simulate
+from fits.data.geometry import slices
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.parameters import Free, LogNormal
+from fits.problem.simulate import simulate
+from fits.reporting import verdicts
 
 pytestmark = pytest.mark.slow  # its derivatives compile for more than a minute
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from fits.formats import read
-from fits.geometry import direction
+from fits.data.formats import read
+from fits.data.geometry import direction
 
 DATA = Path(__file__).parents[2] / "examples" / "arizona_black_coatings"
 

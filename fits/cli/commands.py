@@ -1,0 +1,348 @@
+"""What each command of `layerjax` does with its arguments; `cli` says how it is asked for and what errors look like.
+
+Inputs are checked, and outputs refused, before any work begins. Numbers go to stdout, progress to stderr.
+"""
+
+import os
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fits._files import write_bytes, write_text, write_together
+from fits.data.formats import read
+from fits.data.measurements import Measurements
+from fits.progress import show_progress
+
+if TYPE_CHECKING:
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+    from layerjax import Stack
+
+DONE, DOUBTFUL = 0, 1
+WALKERS = 32
+
+
+def fit(arguments: Namespace) -> int:
+    """Fit a stack, save the result with its report, and print the table."""
+    _use_jax()
+    from fits.inference.optimise import fit as run_fit
+    from fits.problem.stack_file import read_problem
+    from fits.reporting import results, tables, verdicts
+
+    directory = Path(arguments.out)
+    results.check_directory(directory, arguments.force)
+    data = _measurements(arguments)
+    given = read_problem(arguments.stack)
+    objective = arguments.objective or given.objective
+    if arguments.sample and objective != "likelihood":
+        raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
+    done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
+    kept = f"{directory} was not written; the same command again goes on with the starts that are done"
+    with results.reserved(directory, arguments.force), show_progress() as progress, _hint(kept):
+        result = run_fit(
+            given.stack,
+            data,
+            transport=given.transport,
+            noise=given.noise,
+            scale=given.scale,
+            objective=objective,
+            starts=arguments.starts,
+            seed=arguments.seed,
+            solver=arguments.solver,
+            progress=progress,
+            checkpoint=done,
+        )
+        progress("pictures and report", 0, 1)
+        with results.replacing(directory, arguments.force) as folder:
+            text = given.text if objective == given.objective else None
+            results.write_fit(result, folder, text)
+            write_report(folder, directory.resolve().name, result)
+        done.unlink(missing_ok=True)
+        progress("pictures and report", 1, 1)
+    for table in (tables.parameter_table(result), *([tables.minima_table(result)] if len(result.minima) > 1 else [])):
+        tables.print_table(table, sys.stdout)
+    for sentence in (*verdicts.outcome(result), f"Report: {directory / results.REPORT}"):
+        print(sentence)
+    if arguments.sample:
+        return _sample(directory, arguments)
+    return DONE if result.converged else DOUBTFUL
+
+
+def sample(arguments: Namespace) -> int:
+    """Sample the posterior of a saved fit, going on with the chain that is there."""
+    _use_jax()
+    return _sample(Path(arguments.directory), arguments)
+
+
+def _sample(directory: Path, arguments: Namespace) -> int:
+    from fits.inference.posterior import sample as run_sampler
+    from fits.reporting import results, tables, verdicts
+
+    result = results.load_fit(directory)
+    if not result.is_posterior:
+        raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
+    walkers, seed = _chain_settings(directory / results.CHAIN, arguments)
+    again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
+    with show_progress() as progress, _hint(again):
+        posterior = run_sampler(
+            result,
+            walkers=walkers,
+            max_steps=arguments.max_steps,
+            seed=seed,
+            path=directory / results.CHAIN,
+            resume=not arguments.force,
+            allow_short=arguments.allow_short,
+            progress=progress,
+        )
+        progress("pictures and report", 0, 1)
+        if verdicts.reportable(posterior):
+            results.save_posterior(posterior, directory)
+        else:
+            (directory / results.SUMMARY).unlink(missing_ok=True)
+        write_report(directory, directory.resolve().name, result, posterior)
+        progress("pictures and report", 1, 1)
+    if verdicts.reportable(posterior):
+        tables.print_table(tables.posterior_table(posterior), sys.stdout)
+    for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
+        print(sentence)
+    if not posterior.converged:
+        print(f"To go on: layerjax sample {directory} --max-steps {2 * len(posterior.chain)}")
+    return DONE if posterior.converged else DOUBTFUL
+
+
+def _chain_settings(path: Path, arguments: Namespace) -> tuple[int, int]:
+    """Walkers and seed: those of the chain that is there, which arguments must not contradict, or the defaults."""
+    from fits.inference.chain import read_chain
+
+    settings = {"walkers": arguments.walkers, "seed": arguments.seed}
+    stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
+    for name, default in (("walkers", WALKERS), ("seed", 0)):
+        wanted, there = settings[name], stored.get(name)
+        if wanted is not None and there is not None and wanted != there:
+            raise ValueError(f"--{name} is {wanted}, the chain in {path} has {there} (--force starts it again)")
+        settings[name] = wanted if wanted is not None else int(default if there is None else there)
+    return settings["walkers"], settings["seed"]
+
+
+def report(arguments: Namespace) -> int:
+    """Write the report of a saved fit again, if asked for beside others."""
+    _use_jax()
+    from fits.reporting import results
+    from fits.reporting.html import report as write_page
+
+    _refuse_existing(arguments.out, arguments.force)
+    directory = Path(arguments.directory)
+    name, out = directory.resolve().name, arguments.out or directory / results.REPORT
+    result, posterior = results.load_fit(directory), results.load_posterior(directory)
+    if arguments.out is None and not os.access(directory, os.W_OK):
+        raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
+    others = _candidates([Path(other) for other in arguments.compare], own=directory)
+    with show_progress() as progress:
+        progress("pictures and report", 0, 1)
+        if arguments.out is None:
+            write_report(directory, name, result, posterior, others)
+        else:
+            write_page(result, posterior, out, others=others, name=name, force=arguments.force)
+        progress("pictures and report", 1, 1)
+    print(f"Report: {out}")
+    return DONE
+
+
+def compare(arguments: Namespace) -> int:
+    """Print which of several saved fits explains the data."""
+    if len(arguments.directories) < 2:
+        raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
+    _refuse_existing(arguments.out, arguments.force)
+    _use_jax()
+    from fits.inference.compare import compare as run_compare
+    from fits.reporting import tables
+
+    candidates = _candidates([Path(directory) for directory in arguments.directories])
+    compared = run_compare(candidates)
+    tables.print_table(tables.comparison_table(compared), sys.stdout)
+    for sentence in compared.verdict:
+        print(sentence)
+    if arguments.out:
+        from fits.reporting.html import comparison_page
+
+        write_text(arguments.out, comparison_page(candidates), force=arguments.force)
+        print(f"Comparison: {arguments.out}")
+    return DONE
+
+
+def info(arguments: Namespace) -> int:
+    """Print what is in a measurement file, and draw it."""
+    from fits.reporting import tables
+    from fits.reporting.plots.data import as_png, data_picture
+
+    out = arguments.out or f"{Path(arguments.data).stem}.png"
+    if arguments.out is not None:
+        _refuse_existing(out, arguments.force)
+    data = _measurements(arguments)
+    for table in (tables.source_table(data), tables.data_table(data)):
+        tables.print_table(table, sys.stdout)
+    if Path(out).exists() and not arguments.force:
+        print(f"Picture: {out} exists already (--force draws it again)")
+        return DONE
+    write_bytes(out, as_png(data_picture(data)), arguments.force)
+    print(f"Picture: {out}")
+    return DONE
+
+
+def convert(arguments: Namespace) -> int:
+    """Read any supported format and write csv."""
+    from fits.data.formats.csv import write_csv
+
+    _require_ending(arguments.out, ".csv", "measurements")
+    _refuse_existing(arguments.out, arguments.force)
+    data = _measurements(arguments)
+    write_csv(data, arguments.out, force=arguments.force)
+    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
+    return DONE
+
+
+def simulate(arguments: Namespace) -> int:
+    """Write what a goniometer would measure of a stack."""
+    _require_ending(arguments.out, ".csv", "measurements")
+    _refuse_existing(arguments.out, arguments.force)
+    _use_jax()
+    from fits.data.formats.csv import write_csv
+    from fits.data.geometry import slices
+    from fits.problem.simulate import simulate as run_simulation
+    from fits.problem.stack_file import read_problem
+
+    given = read_problem(arguments.stack)
+    geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
+    data = run_simulation(
+        _at_start(given.stack),
+        geometry,
+        transport=given.transport,
+        noise=arguments.noise,
+        floor=arguments.floor,
+        seed=arguments.seed,
+    )
+    write_csv(data, arguments.out, force=arguments.force)
+    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
+    return DONE
+
+
+def render(arguments: Namespace) -> int:
+    """Draw a material of the gallery, or of a file."""
+    _require_ending(arguments.out, ".png", "pictures")
+    _refuse_existing(arguments.out, arguments.force)
+    _use_jax()
+    from fits.problem.stack_file import read_problem
+    from fits.reporting.plots.data import as_png
+    from fits.reporting.render import render as run_render
+    from layerjax import gallery
+
+    name, transport = arguments.material, None
+    if name in gallery.names():
+        stack = gallery.stack(name)
+    elif Path(name).suffix == ".toml":
+        given = read_problem(name)
+        stack, transport = _at_start(given.stack), None if given.transport == "auto" else given.transport
+    else:
+        raise ValueError(f"{name}: neither a .toml file nor one of the gallery: {', '.join(gallery.names())}")
+    figure = run_render(stack, transport, title=Path(name).stem.replace("_", " "), size=arguments.size)
+    write_bytes(arguments.out, as_png(figure), force=arguments.force)
+    print(f"{arguments.out}: {name}")
+    return DONE
+
+
+def write_report(
+    folder: Path,
+    name: str,
+    result: "Fit",
+    posterior: "Posterior | None" = None,
+    others: "dict[str, Fit | Posterior] | None" = None,
+) -> None:
+    """The report of a result directory, and its pictures as files beside it."""
+    from fits.reporting import results
+    from fits.reporting.html import draw, page
+
+    images = draw(result, posterior, others, name)
+    text = page(result, posterior, images, others, name)
+    pictures = {f"{picture}.png": content for picture, content in images.items()}
+    write_together(folder, {**pictures, results.REPORT: text.encode()})
+
+
+def _use_jax() -> None:
+    """Double precision, and compiled programs kept in the user's cache folder from one run to the next."""
+    import warnings
+
+    import jax
+
+    # arviz announces its next version on import; compiled programs that cannot be kept are compiled again
+    warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.values["jax_compilation_cache_dir"] is None:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "layerjax"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _measurements(arguments: Namespace) -> Measurements:
+    data = read(arguments.data, format=arguments.format, quantity=arguments.quantity)
+    if arguments.mask_retro is not None:
+        data = data.without_retro(arguments.mask_retro)
+    if arguments.mask_grazing is not None:
+        data = data.without_grazing(arguments.mask_grazing)
+    return data
+
+
+def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":
+    """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
+
+    own: a result that they are compared with, whose place and name are taken.
+    """
+    from fits.reporting import results, verdicts
+
+    places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
+    names = [place.name for place in places]
+    candidates: dict[str, Fit | Posterior] = {}
+    for directory, place in zip(directories, places, strict=False):
+        if places.count(place) > 1:
+            raise ValueError(f"{directory} is given twice")
+        posterior = results.load_posterior(directory)
+        found = posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
+        candidates[place.name if names.count(place.name) == 1 else str(directory)] = found
+    return candidates
+
+
+def _at_start(stack: "Stack") -> "Stack":
+    """The stack with every free parameter at its start value."""
+    import jax
+
+    from fits.problem.parameters import is_free
+
+    return jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free)
+
+
+def _require_ending(path: str, ending: str, what: str) -> None:
+    if Path(path).suffix.lower() != ending:
+        raise ValueError(f"{path}: {what} can be written as {ending} only")
+
+
+def _refuse_existing(path: str | None, force: bool) -> None:
+    if path is None:
+        return
+    if Path(path).is_dir():
+        raise ValueError(f"{path}: is a directory, must be a file")
+    if not Path(path).resolve().parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
+    if Path(path).exists() and not force:
+        raise ValueError(f"{path}: the file exists already (--force overwrites it)")
+
+
+@contextmanager
+def _hint(what: str) -> Iterator[None]:
+    """Says on an interrupt what has become of the work."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(what) from None

@@ -1,0 +1,284 @@
+"""The `layerjax` command: what may be asked for, and how it ends.
+
+Exit codes: 0 done; 1 done, but not to be relied on (a chain that is too short, a fit that did not converge); 2 bad
+input, bad usage or a full disk, named on stderr, with nothing written but what the same command goes on with; 130
+interrupted.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
+QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
+FORMATS = ("csv", "merl", "zemax", "fred")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code; bad usage leaves through `SystemExit` as argparse does."""
+    arguments = build_parser().parse_args(argv)
+
+    from fits.cli import commands
+
+    try:
+        code = int(getattr(commands, arguments.command)(arguments))
+        sys.stdout.flush()  # here, where a full disk or a reader that has gone can still be told
+        return code
+    except KeyboardInterrupt as interrupt:
+        print(f"layerjax: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone, as in `layerjax info FILE | head`
+        _end_output()
+        return 0
+    except (ValueError, OSError) as error:
+        _end_output()
+        if arguments.traceback:
+            raise
+        print(f"layerjax: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+
+
+def _end_output() -> None:
+    """What cannot be written to stdout goes nowhere: Python would try again as it ends, and complain."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """All commands and options; it imports nothing beyond the standard library."""
+    parser = _Parser(
+        prog="layerjax", description="Fit layered materials to measured reflectance, with honest uncertainty."
+    )
+    parser.add_argument("--version", action=_Version, help="print the version and exit")
+    parser.add_argument("--traceback", action="store_true", help="show where an error comes from (for bug reports)")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_add_fit, _add_sample, _add_report, _add_compare, _add_info, _add_convert, _add_simulate, _add_render):
+        add(commands)
+    return parser
+
+
+def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "fit",
+        "fit a stack to measured data and write a result directory with a report",
+        "layerjax fit slices.csv --stack coat.toml --out result --mask-grazing 80 --starts 32",
+    )
+    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
+    parser.add_argument("--stack", required=True, metavar="TOML", help="the stack, with its free parameters")
+    parser.add_argument("--out", required=True, metavar="DIR", help="result directory to write")
+    parser.add_argument("--starts", type=_count, default=32, metavar="N", help="starting points (default: %(default)s)")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
+    parser.add_argument(
+        "--solver",
+        choices=("least_squares", "bounded"),
+        default="least_squares",
+        help="bounded: for best values that lie on a bound (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        help="what is minimised; all but the likelihood give no posterior (default: the stack file's, or likelihood)",
+    )
+    _add_reading(parser)
+    parser.add_argument("--sample", action="store_true", help="sample the posterior as well (see `layerjax sample`)")
+    _add_sampling(parser)
+    _add_force(parser, "replace DIR if it holds an earlier result")
+
+
+def _add_sample(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "sample",
+        "sample the posterior of a fit; goes on where it stopped when it is run again",
+        "layerjax sample result --walkers 32 --max-steps 50000",
+    )
+    parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
+    _add_sampling(parser)
+    parser.add_argument("--seed", type=_seed, metavar="S", help="seed (default: the chain's, or 0)")
+    _add_force(parser, "throw an earlier chain away and start again")
+
+
+def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "report",
+        "write the report and the pictures of a result directory again",
+        "layerjax report result --compare other_result",
+    )
+    parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
+    parser.add_argument(
+        "--compare", nargs="+", default=(), metavar="DIR2", help="results for the same data to compare with"
+    )
+    parser.add_argument("--out", metavar="HTML", help="write the report to this file, and leave DIR as it is")
+    _add_force(parser, "overwrite the file of --out")
+
+
+def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "compare",
+        "compare fits of the same data: which stack explains it",
+        "layerjax compare coated bare --out comparison.html",
+    )
+    parser.add_argument("directories", nargs="+", metavar="DIR", help="two or more result directories")
+    parser.add_argument("--out", metavar="HTML", help="write the comparison with its pictures to this file")
+    _add_force(parser, "overwrite the file")
+
+
+def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "info",
+        "say what is in a measurement file, and draw it",
+        "layerjax info slices.csv",
+    )
+    parser.add_argument("data", metavar="FILE", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
+    parser.add_argument(
+        "--out", metavar="PNG", help="picture to draw (default: FILE's name as .png, in the current directory)"
+    )
+    _add_reading(parser)
+    _add_force(parser, "overwrite the picture")
+
+
+def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "convert",
+        "write measurements as csv in this project's convention",
+        "layerjax convert AnoBlackNiTEonSteel.bsdf steel.csv",
+    )
+    parser.add_argument("data", metavar="IN", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
+    parser.add_argument("out", metavar="OUT", help="file to write; its name ends in .csv")
+    _add_reading(parser)
+    _add_force(parser, "overwrite the file")
+
+
+def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "simulate",
+        "write what a goniometer would measure of a stack, with noise",
+        "layerjax simulate --stack coat.toml --incidence 10 30 50 70 --noise 0.05 --out simulated.csv",
+    )
+    parser.add_argument(
+        "--stack", required=True, metavar="TOML", help="the stack; free parameters take their start value"
+    )
+    parser.add_argument("--out", required=True, metavar="CSV", help="file to write; its name ends in .csv")
+    parser.add_argument(
+        "--incidence", type=float, nargs="+", default=(10, 30, 50, 70), metavar="DEG", help="(default: 10 30 50 70)"
+    )
+    parser.add_argument(
+        "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
+    )
+    parser.add_argument("--noise", type=_level, default=0.0, metavar="REL", help="relative noise (default: none)")
+    parser.add_argument("--floor", type=_level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
+    parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
+    _add_force(parser, "overwrite the file")
+
+
+def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "render",
+        "draw a material: spheres, lobes and a map of its BSDF",
+        "layerjax render window_shade --out window_shade.png",
+    )
+    parser.add_argument(
+        "material", metavar="NAME|TOML", help="a material of the gallery, or a stack (free parameters at their start)"
+    )
+    parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
+    parser.add_argument("--size", type=_count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
+    _add_force(parser, "overwrite the file")
+
+
+def _command(
+    commands: "argparse._SubParsersAction[_Parser]", name: str, what: str, example: str
+) -> argparse.ArgumentParser:
+    return commands.add_parser(
+        name, help=what, description=f"{what[0].upper()}{what[1:]}.", epilog=f"example: {example}"
+    )
+
+
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("reading the data")
+    group.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
+    group.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
+    group.add_argument(
+        "--mask-retro", type=_angle, metavar="DEG", help="leave out readings within DEG of retro-reflection"
+    )
+    group.add_argument(
+        "--mask-grazing", type=_angle, metavar="DEG", help="leave out readings beyond DEG from the normal"
+    )
+
+
+def _add_sampling(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("sampling")
+    group.add_argument("--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32)")
+    group.add_argument("--max-steps", type=_count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
+    group.add_argument(
+        "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"
+    )
+
+
+def _add_force(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument("--force", action="store_true", help=what)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as every other error of the command."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+class _Version(argparse.Action):
+    """Prints the version; only then is the library imported."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None):
+        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from layerjax import __version__
+
+        print(f"layerjax {__version__}")
+        parser.exit()
+
+
+def _count(word: str) -> int:
+    return int(_number(word, int, 1, None))
+
+
+def _seed(word: str) -> int:
+    return int(_number(word, int, 0, 2**32 - 1))
+
+
+def _angle(word: str) -> float:
+    return _number(word, float, 0.0, 90.0)
+
+
+def _level(word: str) -> float:
+    return _number(word, float, 0.0, None)
+
+
+def _number(word: str, kind: type[int] | type[float], low: float, high: float | None) -> float:
+    allowed = f"{'a whole number' if kind is int else 'a number'} " + (
+        f">= {low:g}" if high is None else f"in [{low:g}, {high:g}]"
+    )
+    try:
+        value = kind(word)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{word!r} given, must be {allowed}") from None
+    if not low <= value <= (float("inf") if high is None else high) or value == float("inf"):
+        raise argparse.ArgumentTypeError(f"{word} given, must be {allowed}")
+    return value
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    return " ".join(str(error).split()) or type(error).__name__

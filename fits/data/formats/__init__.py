@@ -1,0 +1,89 @@
+"""Readers of measured BSDFs, one file format a module; `read` looks at the content first and at the name last."""
+
+from pathlib import Path
+
+from fits.data.formats import (
+    csv,
+    fred,
+    merl,
+    zemax,
+)
+from fits.data.formats.csv import write_csv as write_csv
+from fits.data.geometry import Geometry
+from fits.data.measurements import Measurements, check_quantity
+
+FORMATS = ("csv", "merl", "zemax", "fred")
+
+_KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
+    b"tensor_file": "an RGL tensor file (Dupuy and Jakob)",
+    b"<?xml": "an XML file (Radiance or WINDOW BSDF)",
+    b"\x89HDF": "an HDF5 file",
+    b"PK\x03\x04": "a zip archive (a spreadsheet?)",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook",
+    b"LightTools": "a LightTools BSDF",
+    b"OPTIS": "an OPTIS (Speos) BSDF",
+}
+
+
+def read(
+    path: str | Path,
+    format: str | None = None,
+    quantity: str | None = None,
+    *,
+    geometry: Geometry | None = None,
+    lookup: str = "centre",
+) -> Measurements:
+    """Read a measurement file: CSV, MERL binary, Zemax BSDF or FRED text.
+
+    format: one of `FORMATS`; None finds out from the content.
+    quantity: what the numbers in the file are, "brdf", "brdf_cos" or "reflectance_factor". A CSV says so in its column
+        names, and then this picks among them; Zemax and FRED files hold "brdf" unless this says otherwise.
+    geometry, lookup: for MERL only, the directions to look up and how (see `fits.data.formats.merl.read`).
+    Raises ValueError, on one line, that names the file and, where there is one, line, column, value and allowed range.
+    """
+    path = Path(path)
+    checked = check_quantity(quantity)
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    kind = sniff(path) if format is None else format
+    if kind != "merl" and (geometry is not None or lookup != "centre"):
+        raise ValueError(f"{path}: geometry and lookup apply to MERL files only, this is a {kind} file")
+    if kind == "csv":
+        return csv.read(path, checked)
+    if kind == "merl":
+        if checked not in (None, "brdf"):
+            raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
+        return merl.read(path, geometry=geometry, lookup=lookup)
+    if kind == "zemax":
+        return zemax.read(path, checked or "brdf")
+    if kind == "fred":
+        return fred.read(path, checked or "brdf")
+    raise ValueError(f"format is {format!r}, must be one of {', '.join(FORMATS)}")
+
+
+def sniff(path: Path) -> str:
+    """Which of `FORMATS` a file is in, by its content and then by its name; ValueError that names what was seen."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16)
+    if not head.strip():
+        raise ValueError(f"{path}: the file is empty")
+    for magic, what in _KNOWN_ELSEWHERE.items():
+        if head.startswith(magic):
+            raise ValueError(f"{path}: this is {what}, which has no reader here (formats: {', '.join(FORMATS)})")
+    if merl.recognises(head) or path.suffix.lower() == ".binary":
+        return "merl"
+    if b"\0" in head:
+        raise ValueError(
+            f"{path}: unknown binary file, starts with {head[:8].hex(' ')} (formats: {', '.join(FORMATS)})"
+        )
+    lines = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    first = lines[0] if lines else ""
+    if fred.recognises(first):
+        return "fred"
+    if zemax.recognises(lines):
+        return "zemax"
+    if csv.recognises(first) or path.suffix.lower() in (".csv", ".tsv"):
+        return "csv"
+    seen = f"the first line is {first[:60]!r}" if first else "it holds only comments"
+    raise ValueError(f"{path}: unknown format, {seen} (formats: {', '.join(FORMATS)})")

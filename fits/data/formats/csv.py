@@ -1,0 +1,286 @@
+"""CSV with named columns, the format that this project writes.
+
+Columns                      meaning
+theta_i, theta_o             polar angles in degrees, [0, 90] and [0, 180] (above 90: transmission). In files that this
+                             project wrote theta_i may go to 180: light from below.
+phi_i, phi_o                 azimuths in degrees, [-360, 360]; phi_o = phi_i + 180 is the mirror direction.
+                             Both may be missing: then theta_o is signed, in [-180, 180], positive on the mirror side.
+brdf | brdf_cos | reflectance_factor
+                             f in 1/sr | f |cos theta_o| | pi f. For several channels one column each: brdf_red, ...
+bsdf | bsdf_cos | brf, reflectance
+                             other names for the same; a note says what they were taken for
+<that column>_std | _sigma   its standard deviation (optional); an empty cell means unknown
+used                         1 or 0 (optional): whether the sample takes part in fits
+
+Other columns are left out and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
+them. The delimiter is a comma, semicolon or tab.
+"""
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from fits._files import write_text
+from fits.data import geometry
+from fits.data.formats._text import (
+    Line,
+    content,
+    plural,
+    read_lines,
+)
+from fits.data.geometry import Floats
+from fits.data.measurements import (
+    QUANTITIES,
+    Measurements,
+    Quantity,
+    Source,
+    channel_names,
+    check_quantity,
+    to_bsdf,
+)
+
+_ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
+_NOT_NEGATIVE = (0.0, float("inf"))
+_SUFFIXES = ("_std", "_sigma")
+_QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
+    **{quantity: quantity for quantity in QUANTITIES},
+    "bsdf": "brdf",
+    "bsdf_cos": "brdf_cos",
+    "brf": "reflectance_factor",
+    "reflectance": "reflectance_factor",
+}
+_MEANING: dict[Quantity, str] = {
+    "brdf": "the BRDF in 1/sr",
+    "brdf_cos": "the BRDF times the cosine of theta_o",
+    "reflectance_factor": "the reflectance factor pi times the BRDF",
+}
+_FIRST_LINE = "# layerjax measurements"
+
+
+def recognises(first_line: str) -> bool:
+    """Whether the first line that is no comment names the columns we need."""
+    return {"theta_i", "theta_o"} <= {name.strip().strip('"') for name in first_line.split(_delimiter(first_line))}
+
+
+def read(path: Path, quantity: Quantity | None = None) -> Measurements:
+    """Read a CSV; `quantity` chooses where the file holds more than one. Errors as in `fits.read`.
+
+    Samples in the tangent plane are masked. Where only some samples have a standard deviation, the others get the
+    median relative one of their channel, times the value, but at least the smallest one given; where none has, sigma is
+    None.
+    """
+    lines = read_lines(path)
+    rows = content(lines)
+    if not rows:
+        raise ValueError(f"{path}: the file holds only comments, must have a header line")
+    header, body = rows[0], rows[1:]
+    table = _Table(header, body)
+    kind, channels = _value_columns(header, table.names, quantity)
+    chosen = _QUANTITY_OF[kind]
+
+    written_here = lines[0].text == _FIRST_LINE
+
+    theta_i = table.column("theta_i", _BELOW_TOO if written_here else _ABOVE)
+    if "phi_i" in table.names or "phi_o" in table.names:
+        phi_i, phi_o = table.column("phi_i", _PHI), table.column("phi_o", _PHI)
+        theta_o = table.column("theta_o", _BELOW_TOO)
+        notes = []
+    else:
+        phi_i, phi_o = np.full(len(body), geometry.LIGHT_AZIMUTH), np.zeros(len(body))
+        theta_o = table.column("theta_o", _SIGNED)
+        notes = ["no azimuth columns: theta_o is signed, in the plane of incidence, positive on the mirror side"]
+    if kind != chosen:
+        notes.append(f"{_named(list(channels.values()))} taken for {_MEANING[chosen]}")
+    wi, wo = geometry.direction(theta_i, phi_i), geometry.direction(theta_o, phi_o)
+
+    values = to_bsdf(np.stack([table.column(name) for name in channels.values()], axis=-1), wo, chosen)
+    used = table.column("used", (0.0, 1.0)) == 1 if "used" in table.names else np.ones(len(body), bool)
+    tangent = np.minimum(abs(wi[:, 2]), abs(wo[:, 2])) < geometry.TANGENT_COSINE
+    if (used & tangent).any():
+        notes.append(
+            f"masked: {plural(int((used & tangent).sum()), 'sample')} in the tangent plane (theta of 90 degrees)"
+        )
+    used &= ~tangent
+
+    spread = [_spread_column(table.names, name) for name in channels.values()]
+    sigma = _sigma(table, spread, used, notes)
+    if sigma is not None:
+        sigma = to_bsdf(sigma, wo, chosen)
+        _fill_unknown(sigma, values, header, tuple(channels), notes)
+    known = {"theta_i", "phi_i", "theta_o", "phi_o", "used", *channels.values(), *(name for name in spread if name)}
+    ignored = [name for name in table.names if name not in known]
+    if ignored:
+        notes.append(f"columns not used: {', '.join(ignored)}")
+    if (values < 0).any():
+        notes.append(f"{plural(int((values < 0).any(axis=1).sum()), 'sample')} below zero, kept as measured")
+    source = _source(path, lines, chosen, notes, written_here)
+    return Measurements(wi, wo, values, sigma, used, tuple(channels), source)
+
+
+def write_csv(measurements: Measurements, path: str | Path, force: bool = False) -> None:
+    """Write samples as CSV in this project's convention (BSDF in 1/sr), with their source in comments.
+
+    Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees. An existing file is a ValueError
+    unless `force`; the file appears whole or not at all.
+    """
+    suffixes = [""] if measurements.channels == channel_names(1) else [f"_{name}" for name in measurements.channels]
+    names = ["theta_i", "phi_i", "theta_o", "phi_o", *(f"brdf{suffix}" for suffix in suffixes)]
+    columns = [
+        measurements.theta_i,
+        measurements.phi_i,
+        measurements.theta_o,
+        measurements.phi_o,
+        *measurements.values.T,
+    ]
+    if measurements.sigma is not None:
+        names += [f"brdf{suffix}_sigma" for suffix in suffixes]
+        columns += [*measurements.sigma.T]
+    source = measurements.source
+    comments = {"source": source.path, "format": source.format, "quantity": source.quantity}
+    if source.attribution:
+        comments["attribution"] = source.attribution
+    text = io.StringIO()
+    text.write(f"{_FIRST_LINE}\n")
+    text.writelines(f"# {key}: {_one_line(comment)}\n" for key, comment in comments.items())
+    text.writelines(f"# note: {_one_line(note)}\n" for note in source.notes)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*names, "used"])
+    for *numbers, used in zip(*columns, measurements.mask, strict=True):
+        writer.writerow([*(repr(float(number)) for number in numbers), int(used)])
+    write_text(path, text.getvalue(), force)
+
+
+class _Table:
+    """The cells below a header line; columns are parsed when asked for, so that unused ones may hold anything."""
+
+    def __init__(self, header: Line, body: list[Line]) -> None:
+        self.header, self.body = header, body
+        delimiter = _delimiter(header.text)
+        self.names = [name.strip() for name in _cells(header, delimiter)]
+        for position, name in enumerate(self.names):
+            if name in self.names[:position]:
+                raise header.error("this column appears twice, each may appear once", name)
+        if not body:
+            raise header.error("no samples below the header, must be at least one")
+        self.cells = [_cells(line, delimiter) for line in body]
+        for line, cells in zip(body, self.cells, strict=True):
+            if len(cells) != len(self.names):
+                raise line.error(f"{plural(len(cells), 'cell')}, must be {len(self.names)} as in the header")
+
+    def column(self, name: str, allowed: tuple[float, float] = (-np.inf, np.inf), empty: float | None = None) -> Floats:
+        """The numbers of a column, (N,); an empty cell gives `empty`, or is an error where that is None."""
+        if name not in self.names:
+            raise self.header.error(f"no column {name!r}, the file has {', '.join(self.names)}")
+        position = self.names.index(name)
+        return np.array(
+            [
+                empty
+                if empty is not None and not cells[position].strip()
+                else line.parse(cells[position], name, allowed)
+                for line, cells in zip(self.body, self.cells, strict=True)
+            ],
+            dtype=float,
+        )
+
+
+def _cells(line: Line, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([line.text], delimiter=delimiter, strict=True))
+    except csv.Error as error:
+        raise line.error(f"not a line of CSV ({error})") from None
+
+
+def _delimiter(header: str) -> str:
+    return max(",;\t", key=header.count)
+
+
+def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
+    """What the names of the value columns begin with, one of `_QUANTITY_OF`, and they, as channel name -> column."""
+    found: dict[str, dict[str, str]] = {}
+    longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
+    for name in names:
+        match = next((known for known in longest_first if name == known or name.startswith(f"{known}_")), None)
+        if match is not None and not name.endswith(_SUFFIXES):
+            channel = name.removeprefix(match).removeprefix("_") or channel_names(1)[0]
+            found.setdefault(match, {})[channel] = name
+    if not found:
+        allowed = ", ".join(_QUANTITY_OF)
+        raise header.error(f"no value column: must be one of {allowed}; the file has {', '.join(names)}")
+    quantities = dict.fromkeys(_QUANTITY_OF[kind] for kind in found)
+    if wanted is not None and wanted not in quantities:
+        raise header.error(f"no column {wanted!r}, the file has {', '.join(names)}")
+    if wanted is None and len(quantities) > 1:
+        raise header.error(f"{len(quantities)} quantities ({', '.join(quantities)}): choose one with quantity")
+    chosen = next(iter(quantities)) if wanted is None else wanted
+    kinds = [kind for kind in found if _QUANTITY_OF[kind] == chosen]
+    if len(kinds) > 1:
+        raise header.error(f"columns {', '.join(kinds)}: names of one quantity, must be only one of them")
+    columns = found[kinds[0]]
+    if kinds[0] in columns.values() and len(columns) > 1:
+        raise header.error(
+            f"columns {', '.join(columns.values())}: one without a channel name cannot stand beside others"
+        )
+    return kinds[0], columns
+
+
+def _named(columns: list[str]) -> str:
+    if len(columns) == 1:
+        return f"column {columns[0]}"
+    return f"columns {', '.join(columns if len(columns) < 5 else [columns[0], '...', columns[-1]])}"
+
+
+def _spread_column(names: list[str], column: str) -> str | None:
+    return next((column + suffix for suffix in _SUFFIXES if column + suffix in names), None)
+
+
+def _sigma(table: _Table, columns: list[str | None], used: np.ndarray, notes: list[str]) -> Floats | None:
+    """Standard deviations (N, C) in the file's quantity, NaN where unknown; None where nothing is known at all."""
+    if not any(columns):
+        return None
+    unknown = np.full(len(table.body), np.nan)
+    sigma = np.stack(
+        [table.column(name, _NOT_NEGATIVE, empty=np.nan) if name else unknown for name in columns], axis=-1
+    )
+    zero = used & (sigma == 0).any(axis=1)
+    if zero.any():
+        row, name = int(np.argmax(zero)), columns[int(np.argmax((sigma == 0)[np.argmax(zero)]))]
+        raise table.body[row].error("0 is not allowed, must be > 0 (leave the cell empty where it is unknown)", name)
+    if np.isnan(sigma).all():
+        notes.append("the standard deviation columns are empty: sigma is unknown")
+        return None
+    return sigma
+
+
+def _fill_unknown(sigma: Floats, values: Floats, header: Line, channels: tuple[str, ...], notes: list[str]) -> None:
+    """Replace NaN in sigma (N, C), in place, by the median relative spread of the samples that have one."""
+    for channel, name in enumerate(channels):
+        known, given = np.isfinite(sigma[:, channel]), sigma[:, channel]
+        if known.all():
+            continue
+        usable = known & (given > 0) & (values[:, channel] != 0)
+        if not usable.any():
+            raise header.error(f"channel {name!r} has no standard deviation to estimate the missing ones from")
+        relative = float(np.median(given[usable] / abs(values[usable, channel])))
+        estimate = np.maximum(relative * abs(values[:, channel]), given[usable].min())
+        sigma[:, channel] = np.where(known, given, estimate)
+        notes.append(
+            f"{plural(int((~known).sum()), 'sample')} of channel {name!r} without a standard deviation: "
+            f"taken as {relative:.3g} of the value, the median of the {int(usable.sum())} that have one"
+        )
+
+
+def _source(path: Path, lines: list[Line], quantity: Quantity, notes: list[str], written_here: bool) -> Source:
+    """The source of a file: what its comments say, of an earlier source too where `write_csv` made it."""
+    comments = [line.text.lstrip("# ").partition(": ") for line in lines if line.text.startswith("#")]
+    said = {key: text for key, _, text in comments}
+    if written_here:
+        quantity = check_quantity(said.get("quantity")) or quantity
+        origin = f"written by layerjax from {said.get('source') or 'memory'} ({said.get('format', 'unknown')})"
+        notes = [*notes, *(text for key, _, text in comments if key == "note"), origin]
+    return Source(str(path), "csv", quantity, tuple(notes), said.get("attribution", ""))
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,169 @@
+"""Measured (or simulated) BSDF samples, in one convention whatever the file used.
+
+Values are the BSDF in 1/sr without the cosine. Readers convert once, on the way in, and `Source` records what came in.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fits.data.geometry import (
+    TANGENT_COSINE,
+    Floats,
+    azimuth,
+    polar,
+)
+
+Quantity = Literal["brdf", "brdf_cos", "reflectance_factor"]
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where samples came from and in which convention.
+
+    quantity: what the file held. "brdf": f in 1/sr; "brdf_cos": f |cos theta_o|; "reflectance_factor": pi f.
+    notes: what a reader decided or left out, one sentence each.
+    """
+
+    path: str
+    format: str
+    quantity: Quantity = "brdf"
+    notes: tuple[str, ...] = ()
+    attribution: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """N samples of a BSDF in C channels.
+
+    wi, wo: (N, 3) unit vectors towards the light and the viewer, pointing away from the surface.
+    values: (N, C) BSDF in 1/sr. sigma: (N, C) standard deviations in 1/sr, or None where nothing is known.
+    mask: (N,) bool, True where a sample takes part in fits. channels: C names.
+    Raises ValueError for shapes that do not fit together, numbers that are not finite, directions that are not unit
+    vectors, and a sigma that is negative, or zero in a sample that is used.
+    """
+
+    wi: Floats
+    wo: Floats
+    values: Floats
+    sigma: Floats | None
+    mask: NDArray[np.bool_]
+    channels: tuple[str, ...]
+    source: Source = field(default=Source(path="", format="memory"))
+
+    def __post_init__(self) -> None:
+        count, channels = len(self.values), len(self.channels)
+        shapes = {"wi": (count, 3), "wo": (count, 3), "values": (count, channels), "mask": (count,)}
+        if self.sigma is not None:
+            shapes["sigma"] = (count, channels)
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=bool if name == "mask" else np.float64)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, must be {shape}")
+            if not np.isfinite(array).all():
+                raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]}, must be finite")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for name in ("wi", "wo"):
+            length = np.linalg.norm(getattr(self, name), axis=-1)
+            if (abs(length - 1) > 1e-6).any():
+                raise ValueError(f"{name} has length {length[abs(length - 1) > 1e-6][0]:g}, must be 1")
+        if self.sigma is not None:
+            if (self.sigma < 0).any():
+                raise ValueError(f"sigma is {self.sigma.min():g}, must be >= 0")
+            if (self.sigma[self.mask] == 0).any():
+                raise ValueError("sigma is 0 in a sample that is used, must be > 0 (sigma=None where it is unknown)")
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def theta_i(self) -> Floats:
+        """Polar angle of the light, (N,), degrees in [0, 180]."""
+        return polar(self.wi)
+
+    @property
+    def phi_i(self) -> Floats:
+        """Azimuth of the light, (N,), degrees in [0, 360)."""
+        return azimuth(self.wi)
+
+    @property
+    def theta_o(self) -> Floats:
+        """Polar angle of the viewer, (N,), degrees in [0, 180]; above 90 is transmission for light from above."""
+        return polar(self.wo)
+
+    @property
+    def phi_o(self) -> Floats:
+        """Azimuth of the viewer, (N,), degrees in [0, 360)."""
+        return azimuth(self.wo)
+
+    def used(self) -> "Measurements":
+        """Only the samples that take part in fits."""
+        keep = self.mask
+        sigma = None if self.sigma is None else self.sigma[keep]
+        return replace(
+            self, wi=self.wi[keep], wo=self.wo[keep], values=self.values[keep], sigma=sigma, mask=self.mask[keep]
+        )
+
+    def where(self, keep: ArrayLike, note: str | None = None) -> "Measurements":
+        """The same samples, used only where `keep` (bool, shape (N,)) holds as well; `note` is added to the source."""
+        keep = np.asarray(keep)
+        if keep.dtype != bool or keep.shape != self.mask.shape:
+            raise ValueError(f"keep has shape {keep.shape} and type {keep.dtype}, must be {self.mask.shape} bool")
+        changed = replace(self, mask=self.mask & keep)
+        return changed if note is None else changed.noted(note)
+
+    def without_retro(self, degrees: float) -> "Measurements":
+        """Mask samples closer than `degrees` to retro-reflection, where a detector head shades the beam."""
+        _check_angle(degrees, 180.0)
+        angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))
+        return self.where(angle >= degrees, f"masked: within {degrees:g} degrees of retro-reflection")
+
+    def without_grazing(self, degrees: float) -> "Measurements":
+        """Mask samples whose light or viewer is more than `degrees` away from the normal line (0 to 90)."""
+        _check_angle(degrees, 90.0)
+        tilt = np.maximum(np.minimum(self.theta_i, 180 - self.theta_i), np.minimum(self.theta_o, 180 - self.theta_o))
+        return self.where(tilt <= degrees, f"masked: more than {degrees:g} degrees from the normal")
+
+    def noted(self, *notes: str) -> "Measurements":
+        """The same samples with notes added to their source."""
+        return replace(self, source=replace(self.source, notes=self.source.notes + notes))
+
+
+def to_bsdf(values: Floats, wo: Floats, quantity: Quantity) -> Floats:
+    """BSDF in 1/sr from values (N, C) of `quantity` seen along wo (N, 3); also right for standard deviations.
+
+    A product with the cosine says nothing about f in the tangent plane: such rows become 0, and readers mask them.
+    """
+    if quantity == "reflectance_factor":
+        return values / np.pi
+    if quantity == "brdf_cos":
+        cosine = abs(wo[:, 2:])
+        tangent = cosine < TANGENT_COSINE
+        return np.where(tangent, 0.0, values / np.where(tangent, 1.0, cosine))
+    return values
+
+
+def check_quantity(quantity: str | None) -> Quantity | None:
+    """The name of a quantity, or None; anything else is a ValueError."""
+    if quantity is None:
+        return None
+    for known in QUANTITIES:
+        if quantity == known:
+            return known
+    raise ValueError(f"quantity is {quantity!r}, must be one of {', '.join(QUANTITIES)}")
+
+
+def channel_names(count: int) -> tuple[str, ...]:
+    """Names for channels that have none: value, or red, green, blue, or channel1, channel2, ..."""
+    known: dict[int, Sequence[str]] = {1: ("value",), 3: ("red", "green", "blue")}
+    return tuple(known.get(count, [f"channel{number}" for number in range(1, count + 1)]))
+
+
+def _check_angle(degrees: float, high: float) -> None:
+    if not 0 <= degrees <= high:
+        raise ValueError(f"degrees is {degrees}, must be in [0, {high:g}]")

@@ -1,0 +1,1 @@
+"""Answers to a `fits.Problem`: the best fit and its uncertainty, samples of the posterior, comparisons of fits."""

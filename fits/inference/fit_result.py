@@ -1,0 +1,135 @@
+"""The outcome of a fit: values, how far to trust them, and what else would explain the data."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.inference.identifiability import Combination
+from fits.problem.problem import Model, Problem
+
+Floats = NDArray[np.float64]
+
+ENDED = {
+    "this minimum": "reached this minimum",
+    "other minima": "ended at other minima",
+    "out of steps": "ran out of steps",
+    "failed": "failed",
+}
+"""What is said of the starts that ended in each way (see `Fit.ended`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A minimum that `count` starts reached: values by name, half the sum of squared residuals, and the stack."""
+
+    values: dict[str, float]
+    cost: float
+    count: int
+    stack: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best minimum of a `Problem` with P parameters, N used samples and C channels.
+
+    vector: (P,) values in the problem's order. errors: (P,) standard errors, NaN for a parameter at a bound, infinite
+    where the data leave it open; those of the others hold with the parameters in `at_bound` kept there.
+    covariance: (P, P). cost: half the sum of squared residuals. iterations: steps of the solver to this minimum.
+    condition_number: of the information about the parameters, each scaled to unit length.
+    unresolved: the combinations of parameters that the data alone do not separate, worst first.
+    minima: best first. alternatives: those among them, other than the best, that explain the data equally well.
+    without_influence: parameters that the data say nothing about.
+    settings: starts, seed and solver. ended: how many starts ended where ("this minimum", "other minima", "out of
+    steps", "failed").
+    """
+
+    problem: Problem
+    vector: Floats
+    errors: Floats
+    covariance: Floats
+    cost: float
+    at_bound: tuple[str, ...]
+    converged: bool
+    status: str
+    iterations: int
+    condition_number: float
+    unresolved: tuple[Combination, ...]
+    minima: tuple[Minimum, ...]
+    alternatives: tuple[Minimum, ...]
+    without_influence: tuple[str, ...] = ()
+    settings: Mapping[str, int | str] = field(default_factory=dict)
+    ended: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Best value of each parameter."""
+        return dict(zip(self.problem.names, map(float, self.vector), strict=True))
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard error of each parameter."""
+        return dict(zip(self.problem.names, map(float, self.errors), strict=True))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return self.problem.units
+
+    @cached_property
+    def stack(self) -> Any:
+        """The stack with the best values."""
+        return self.problem.build(self.vector).stack
+
+    @cached_property
+    def scale(self) -> float | tuple[float, ...]:
+        """The calibration factor, one number or one a channel."""
+        scale = np.asarray(self.problem.build(self.vector).scale, float)
+        return float(scale) if scale.ndim == 0 else tuple(scale.tolist())
+
+    @property
+    def is_posterior(self) -> bool:
+        """Whether the objective was a likelihood, so that errors are those of a posterior."""
+        return self.problem.objective == "likelihood"
+
+    @cached_property
+    def predicted(self) -> Floats:
+        """The model at the used samples, (N, C), in 1/sr."""
+        return np.asarray(self.problem.predict(self.vector), float)
+
+    @cached_property
+    def residuals(self) -> Floats:
+        """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure."""
+        if self.is_posterior:
+            return np.asarray(self.problem.call(Model.standardised, self.vector), float)
+        return -np.asarray(self.problem.residuals(self.vector), float).reshape(self.problem.model.values.shape)
+
+    @property
+    def chi_square(self) -> float:
+        """Sum of squared `residuals`; for a named objective this is its value and has no absolute scale."""
+        return float(np.sum(self.residuals**2))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of data less number of parameters."""
+        return self.problem.count - len(self.vector)
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """`chi_square` per degree of freedom; NaN without any."""
+        return self.chi_square / self.degrees_of_freedom if self.degrees_of_freedom > 0 else float("nan")
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Normalised log-likelihood of the best values; NaN for a named objective."""
+        return float(self.problem.log_likelihood(self.vector)) if self.is_posterior else float("nan")
+
+    @property
+    def correlation(self) -> Floats:
+        """(P, P); NaN in the rows and columns of parameters at a bound."""
+        spread = np.sqrt(np.diagonal(self.covariance))
+        spread = np.where(spread > 0, spread, np.nan)
+        return self.covariance / np.outer(spread, spread)

@@ -1,0 +1,142 @@
+"""The posterior along a ridge: a mixture of heavy-tailed densities in the box, to draw proposals from.
+
+In the box, not in log-odds: there a posterior has no long tails towards its bounds. What is drawn outside is refused.
+"""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.special import expit, logit, logsumexp
+
+from fits.inference.bounded import cost_and_gradient
+from fits.inference.fit_result import Fit
+from fits.inference.laplace import student, student_draws
+from fits.inference.ridge import (
+    height,
+    open_directions,
+    ridge,
+    vector_at,
+)
+from fits.inference.uncertainty import local_information
+
+LEAST_PART = 0.01  # of the squared length of an open direction
+LOOSE = 10.0  # in the log-posterior, a box
+SMALLEST_REACH, WIDEST_REACH = 1e-9, 0.3  # of the box
+REFINEMENTS = 10
+MOST_SAMPLES = 4000
+OWN_SAMPLES = 2.0  # that a component counts as
+KEPT = 0.1  # of a mixture that is refined
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """A density over the unconstrained vectors of a problem with P parameters: M Student-t densities in the box.
+
+    centre: (M, P). root: (M, P, P), whose product with its transpose is a covariance. log_weight: (M,). held: (P,)
+    bool, at a bound: a component is folded over there, and the parameter independent of the others.
+    """
+
+    centre: Floats
+    root: Floats
+    log_weight: Floats
+    held: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, fit: Fit) -> "Mixture | None":
+        """From the points of a fit's ridge and the information there; None if it has none."""
+        problem = fit.problem
+        optimum = np.asarray(problem.model.box.to_unit(jnp.asarray(fit.vector)), float)
+        slope = np.abs(np.asarray(problem.call(cost_and_gradient, optimum)[1], float))
+        held = np.isin(problem.names, fit.at_bound)
+        # what is hardly pressed against its bound, and open with others, lies along the ridge
+        if held.any():
+            part = np.sum(open_directions(problem, optimum, np.ones_like(held)) ** 2, axis=0)
+            held &= (part < LEAST_PART) | (slope > LOOSE)
+        points, bounds = ridge(problem, optimum, ~held)
+        if len(points) == 1:
+            return None
+        reach = np.clip(1.0 / np.maximum(slope, SMALLEST_REACH), SMALLEST_REACH, WIDEST_REACH)
+        bounds = np.concatenate([bounds, np.tile(np.diag(1.0 / reach)[held], (len(points), 1, 1))], axis=1)
+        root = np.empty((len(points), len(held), len(held)))
+        for index, (point, rows) in enumerate(zip(points, bounds, strict=True)):
+            information = local_information(problem, vector_at(problem, point))[0]
+            information[:, held] = 0.0
+            wide = np.eye(len(held)) / WIDEST_REACH
+            _, values, directions = np.linalg.svd(np.vstack([information, rows, wide]))
+            root[index] = directions.T / values
+        log_weight = np.array([height(problem, point) for point in points]) + np.linalg.slogdet(root)[1]
+        return cls(points, root, log_weight - logsumexp(log_weight), held)
+
+    def refined(self, positions: Floats) -> "Mixture":
+        """It, fitted to samples (count, P) of the posterior, with a share of what it was.
+
+        By expectation and maximisation; every component counts as samples of its own, so that it keeps its full rank.
+        """
+        samples = expit(positions[:: -(-len(positions) // MOST_SAMPLES)])
+        dimension = samples.shape[1]
+        prior = self.root @ np.swapaxes(self.root, 1, 2)
+        now = self
+        for _ in range(REFINEMENTS):
+            parts = now._log_parts(samples)
+            share = np.exp(parts - logsumexp(parts, axis=0))
+            count = share.sum(axis=1)
+            centre = (share @ samples + OWN_SAMPLES * self.centre) / (count + OWN_SAMPLES)[:, None]
+            centre[:, self.held] = self.centre[:, self.held]
+            away, moved = samples - centre[:, None], (self.centre - centre)[:, :, None]
+            scatter = np.einsum("mn,mni,mnj->mij", share, away, away) + OWN_SAMPLES * moved * np.swapaxes(moved, 1, 2)
+            own = OWN_SAMPLES + dimension
+            covariance = (scatter + own * prior) / (count + own)[:, None, None]
+            covariance *= np.where(self.held[:, None] | self.held, np.eye(dimension), 1.0)
+            log_weight = np.log((count + 1.0) / (count + 1.0).sum())
+            now = Mixture(centre, np.linalg.cholesky(covariance), log_weight, self.held)
+        centres, roots = np.concatenate([now.centre, self.centre]), np.concatenate([now.root, self.root])
+        weights = np.concatenate([np.log1p(-KEPT) + now.log_weight, np.log(KEPT) + self.log_weight])
+        return Mixture(centres, roots, weights, self.held)
+
+    def mean_log_density(self, positions: Floats) -> float:
+        """Over samples of the posterior: the higher, the closer the mixture is to it."""
+        return float(np.mean(self.log_density(positions)))
+
+    def log_density(self, positions: Floats) -> Floats:
+        """Log-density at unconstrained `positions` (count, P)."""
+        units = expit(positions)
+        stretch = np.sum(stats.logistic.logpdf(positions), axis=1)  # d box / d log-odds
+        return logsumexp(self._log_parts(units), axis=0) + np.log(2.0) * np.sum(self.held) + stretch
+
+    def draw(self, generator: np.random.RandomState, count: int, shrink: float = 1.0) -> Floats:
+        """(count, P) independent draws inside the box, `shrink` times closer to points of the ridge."""
+        drawn = np.empty((0, len(self.held)))
+        while len(drawn) < count:
+            more = self._draw(generator, count, shrink)
+            drawn = np.concatenate([drawn, more[_inside(more)]])
+        return logit(drawn[:count])
+
+    def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
+        """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
+        drawn = self._draw(generator, len(positions), 1.0)
+        inside = _inside(drawn)
+        proposed = positions.copy()
+        proposed[inside] = logit(drawn[inside])
+        ratio = self.log_density(positions) - self.log_density(proposed)
+        return proposed, np.where(inside, ratio, -np.inf)
+
+    def _draw(self, generator: np.random.RandomState, count: int, shrink: float) -> Floats:
+        which = generator.choice(len(self.centre), count, p=np.exp(self.log_weight))
+        away = np.einsum("nij,nj->ni", self.root[which], student_draws(generator, count, len(self.held)))
+        bound = np.where(self.centre[which] < 0.5, 1.0, -1.0)
+        away = np.where(self.held, bound * np.abs(away), away)
+        return self.centre[which] + shrink * away
+
+    def _log_parts(self, units: Floats) -> Floats:
+        """What every component adds to the log-density in the box, unfolded, (M, count)."""
+        parts = zip(self.log_weight, self.centre, self.root, strict=True)
+        return np.stack([weight + student(centre, root, units) for weight, centre, root in parts])
+
+
+def _inside(units: Floats) -> NDArray[np.bool_]:
+    return np.all((units > 0.0) & (units < 1.0), axis=1)

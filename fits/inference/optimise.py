@@ -1,0 +1,270 @@
+"""Fitting: many starts through one compiled program, then what the best minimum is worth."""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike, NDArray
+
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import ENDED, Fit, Minimum
+from fits.inference.identifiability import OPEN_BEYOND
+from fits.inference.starts import (
+    End,
+    Solver,
+    polished,
+    run_starts,
+    solve_start,
+    start_points,
+)
+from fits.inference.uncertainty import Uncertainty, uncertainty
+from fits.problem.likelihood import Noise, Objective
+from fits.problem.parameters import Free
+from fits.problem.problem import Model, Problem, Transport
+from fits.progress import Progress
+
+Floats = NDArray[np.float64]
+
+SAME_BOX, SAME_ERRORS, SAME_AT_MOST = 1e-3, 0.5, 0.05
+"""Ends of two starts are one minimum if no parameter differs by more than a thousandth of its box plus half its
+standard error, the error counted up to a twentieth of the box. Of one that the data leave open any value will do, if
+the costs agree."""
+SAME_COST = 1e-3
+"""Costs agree within this, in the log-posterior, times the reduced chi-square where that is above 1."""
+EQUALLY_WELL = 2.0
+"""Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
+where that is above 1."""
+
+
+class Repeats(NamedTuple):
+    """Fits of K data sets: vectors and standard errors (K, P), cost and convergence (K,)."""
+
+    vectors: Floats
+    standard_errors: Floats
+    cost: Floats
+    converged: NDArray[np.bool_]
+
+
+def fit(
+    stack: Any,
+    data: Measurements,
+    *,
+    transport: Transport = "auto",
+    noise: Noise | None = None,
+    scale: float | Free | None = None,
+    objective: Objective = "likelihood",
+    starts: int = 32,
+    seed: int = 0,
+    solver: Solver = "least_squares",
+    progress: Progress | None = None,
+    checkpoint: str | Path | None = None,
+) -> Fit:
+    """Find the parameters of `stack` that explain `data` best, and how well the data determine them.
+
+    Args:
+        stack: holds `Free` where a number is to be fitted.
+        data: only the samples that its mask leaves in are used.
+        transport, noise, scale, objective: see `Problem`.
+        starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
+            parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
+        solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or
+            "bounded" (L-BFGS-B throughout).
+        progress: called with ("fit", starts done, starts, note).
+        checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
+            done. It stays; one of another problem is replaced.
+
+    Raises:
+        ValueError: as `Problem`; starts < 1; an unknown solver.
+    """
+    problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective)
+    return fit_problem(problem, starts=starts, seed=seed, solver=solver, progress=progress, checkpoint=checkpoint)
+
+
+def fit_problem(
+    problem: Problem,
+    *,
+    starts: int = 32,
+    seed: int = 0,
+    solver: Solver = "least_squares",
+    progress: Progress | None = None,
+    checkpoint: str | Path | None = None,
+) -> Fit:
+    """`fit` for a problem that is already put together."""
+    if starts < 1:
+        raise ValueError(f"starts is {starts}; it must be at least 1")
+    if solver not in get_args(Solver):
+        raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
+    points = start_points(problem, starts, seed)
+    if checkpoint is None:
+        ends = run_starts(problem, points, solver, progress or _silent)
+    else:
+        from fits.inference.starts_file import StartsFile
+
+        with StartsFile(checkpoint, problem, points, solver) as kept:
+            ends = run_starts(problem, points, solver, progress or _silent, kept)
+    best = int(np.argmin([end.cost for end in ends]))
+    lowest, improved = ends[best], False
+    found = uncertainty(problem, lowest.vector, lowest.cost)
+    if solver == "least_squares" and (found.at_bound.any() or not lowest.converged):
+        lowest, improved = polished(problem, lowest)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
+    lowest = lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound))
+    ends[best] = lowest
+    at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
+    result = Fit(
+        problem=problem,
+        vector=lowest.vector,
+        errors=found.standard_errors,
+        covariance=found.covariance,
+        cost=lowest.cost,
+        at_bound=at_bound,
+        converged=lowest.converged,
+        status="",
+        iterations=lowest.steps,
+        condition_number=found.condition_number,
+        unresolved=found.unresolved,
+        without_influence=found.without_influence,
+        minima=(),
+        alternatives=(),
+        settings={"starts": starts, "seed": seed, "solver": solver},
+    )
+    excess = max(1.0, result.reduced_chi_square if result.degrees_of_freedom > 0 else 1.0)
+    if not result.is_posterior:  # in units of the residual variance
+        excess = 2.0 * lowest.cost / max(result.degrees_of_freedom, 1)
+    minima, ended = _minima(problem, ends, best, found, SAME_COST * excess)
+    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * excess)
+    notes = ("L-BFGS-B improved on Levenberg-Marquardt",) if improved else ()
+    result = replace(result, minima=minima, alternatives=as_good, ended=ended)
+    return replace(result, status="; ".join((*_status(result), *notes)))
+
+
+def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int = 0) -> Repeats:
+    """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
+
+    Each is the lowest end of `starts` starts, converged or not. Standard errors are those of the unbounded optimum:
+    they mean nothing for parameters that end on a bound.
+    """
+    values = np.asarray(values, float)
+    expected = problem.model.values.shape
+    if values.ndim != 3 or values.shape[1:] != expected:
+        raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")
+    points = start_points(problem, starts, seed)
+    # a fit keeps one core busy: equal shares (the last one padded) of one program, the first of which compiles it
+    workers = max(1, min(os.cpu_count() or 1, len(values)))
+    share = -(-len(values) // (4 * workers)) if workers > 1 else len(values)
+    firsts = range(0, len(values), share)
+
+    def solve(first: int) -> list[NDArray[Any]]:
+        part = values[first : first + share]
+        padded = np.concatenate([part, np.repeat(part[-1:], share - len(part), axis=0)])
+        return [np.asarray(result)[: len(part)] for result in problem.call(_solve_repeats, points, padded)]
+
+    with ThreadPoolExecutor(workers) as pool:
+        shares = [solve(firsts[0]), *pool.map(solve, firsts[1:])]
+    return Repeats(*map(np.concatenate, zip(*shares, strict=True)))
+
+
+def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
+    def one(row: Array) -> tuple[Array, Array, Array, Array]:
+        repeat = eqx.tree_at(lambda m: m.values, model, row)
+        vectors, costs, _, success, _ = jax.lax.map(lambda start: solve_start(repeat, start, jnp.asarray(True)), starts)
+        best = jnp.argmin(costs)
+        vector, cost, converged = vectors[best], costs[best], success[best]
+        rows, prior_rows, _ = jax.jacfwd(repeat.information_rows)(vector)
+        width = model.box.slope(vector)
+        rows, prior_rows = rows * width, prior_rows * width
+        covariance = jnp.linalg.pinv(rows.T @ rows + prior_rows.T @ prior_rows, hermitian=True)
+        if model.objective != "likelihood":
+            covariance = covariance * 2.0 * cost / max(rows.shape[0] - vector.size, 1)
+        return vector, jnp.sqrt(jnp.diagonal(covariance)) * width, cost, converged
+
+    return jax.lax.map(one, values)
+
+
+def _on_bounds(problem: Problem, vector: Floats, held: NDArray[np.bool_]) -> Floats:
+    """Exact bounds where the solver ended on them."""
+    nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
+    return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
+
+
+def _minima(
+    problem: Problem, ends: list[End], best: int, found: Uncertainty, same_cost: float
+) -> tuple[tuple[Minimum, ...], dict[str, int]]:
+    """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
+    cost = np.array([end.cost for end in ends])
+    units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(np.stack([end.vector for end in ends]))))
+    width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
+    spread = np.nan_to_num(found.standard_errors / width, nan=0.0, posinf=np.inf)
+    same = SAME_BOX + SAME_ERRORS * np.minimum(spread, SAME_AT_MOST)
+    open_ = (spread > OPEN_BEYOND) | np.isin(problem.names, found.without_influence)
+    alike = np.where(open_, np.inf, same)
+    leaders: list[int] = []
+    counts: list[int] = []
+    ended = dict.fromkeys(ENDED, 0)
+    for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
+        if not np.isfinite(cost[index]) and index != best:
+            ended["failed"] += 1
+            continue
+        near = [
+            place
+            for place, other in enumerate(leaders)
+            if np.all(
+                np.abs(units[index] - units[other]) <= (alike if abs(cost[index] - cost[other]) <= same_cost else same)
+            )
+        ]
+        leads = not near and (index == best or ends[index].converged)
+        if leads:
+            leaders.append(index)
+            counts.append(0)
+        if near or leads:
+            place = near[0] if near else len(leaders) - 1
+            counts[place] += 1
+            ended["other minima" if place else "this minimum"] += 1
+        else:
+            ended["out of steps" if ends[index].unfinished else "failed"] += 1
+    minima = tuple(
+        Minimum(
+            values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
+            cost=float(cost[leader]),
+            count=count,
+            stack=problem.build(ends[leader].vector).stack,
+        )
+        for leader, count in zip(leaders, counts, strict=True)
+    )
+    return minima, ended
+
+
+def _status(fit: Fit) -> list[str]:
+    total, reached = sum(fit.ended.values()), fit.ended["this minimum"]
+    words = [
+        f"converged; {reached} of {total} starts reached this minimum"
+        if fit.converged
+        else f"not converged: the lowest of {total} starts did not; these are the best values seen"
+    ]
+    words += [
+        f"{fit.ended[key]} of {total} starts {word}"
+        for key, word in ENDED.items()
+        if key != "this minimum" and fit.ended[key]
+    ]
+    if fit.at_bound:
+        words.append(f"at a bound: {', '.join(fit.at_bound)}; the errors of the others hold with them kept there")
+    if fit.without_influence:
+        words.append(f"without influence on the data: {', '.join(fit.without_influence)}")
+    if fit.unresolved:
+        words.append(f"the data leave {len(fit.unresolved)} direction(s) unresolved")
+    if not fit.is_posterior:
+        words.append(
+            f"objective {fit.problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"
+        )
+    return words
+
+
+def _silent(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+    pass

@@ -1,0 +1,46 @@
+"""Simulated goniometer data: a stack seen along slices, with noise of known size."""
+
+import math
+from typing import Literal
+
+import numpy as np
+
+import layerjax as lj
+from fits.data.geometry import Geometry as Geometry
+from fits.data.geometry import slices as slices
+from fits.data.measurements import Measurements, Source, channel_names
+from fits.problem.problem import forward
+
+
+def simulate(
+    stack: lj.Stack,
+    geometry: Geometry,
+    transport: lj.Transport | Literal["auto"] = "auto",
+    noise: float = 0.0,
+    floor: float = 0.0,
+    seed: int = 0,
+) -> Measurements:
+    """The BSDF of a stack along `geometry`, with Gaussian noise of standard deviation sqrt((noise f)^2 + floor^2).
+
+    noise: relative, >= 0. floor: in 1/sr, >= 0. The deviation that was used becomes `sigma`, None if both are 0.
+    Samples where the stack gives 0 and floor is 0 carry no noise, which no measurement does: they are masked.
+    """
+    for name, level in (("noise", noise), ("floor", floor)):
+        if not (math.isfinite(level) and level >= 0):
+            raise ValueError(f"{name} is {level}, must be finite and >= 0")
+    # evaluate picks the precision of the directions: float64 if the session has it turned on
+    exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)
+    sigma = np.hypot(noise * exact, floor)
+    noisy = exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape)
+    notes = (f"noise: relative {noise:g}, floor {floor:g} 1/sr, seed {seed}",)
+    noiseless = (sigma == 0).any(axis=1)
+    known = noise > 0 or floor > 0
+    return Measurements(
+        geometry.wi,
+        geometry.wo,
+        noisy,
+        sigma if known else None,
+        ~noiseless if known else np.ones_like(noiseless),
+        channel_names(exact.shape[1]),
+        Source("", "simulated", "brdf", notes),
+    )

@@ -1,0 +1,202 @@
+"""How a set of measurements is laid out in angle, and what structure the residuals of a fit have left along it.
+
+White residuals are what the error bars assume. Here is the evidence: per incidence their mean and size, and over all of
+them the correlation of neighbours in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits.data.geometry import LIGHT_AZIMUTH
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+    from fits.inference.fit_result import Fit
+
+SAME_ANGLE = 0.5  # degrees: closer incidences are one incidence, closer azimuths one plane
+AT_NORMAL = 1e-6  # degrees from the normal below which a direction has no azimuth
+SHORTEST_TRACK = 5  # points in one plane before neighbours in it mean anything
+
+
+@dataclass(frozen=True)
+class Incidence:
+    """One direction of the light: its angles in degrees and the rows of the measurements that have it."""
+
+    theta: float
+    phi: float
+    rows: np.ndarray
+
+    @property
+    def label(self) -> str:
+        return f"θᵢ = {self.theta:g}°"
+
+
+def incidences(data: "Measurements") -> list[Incidence]:
+    """The distinct incident directions, by polar angle then azimuth; rows within `SAME_ANGLE` count as the same."""
+    # Angles come back from unit vectors: rounding first keeps a value that sits between two bins in one of them.
+    theta, phi = np.round(data.theta_i, 6), np.round(data.phi_i, 6) % 360.0
+    phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, phi)
+    keys = np.stack([np.round(theta / SAME_ANGLE), np.round(phi / SAME_ANGLE) % round(360 / SAME_ANGLE)], axis=-1)
+    unique, which = np.unique(keys, axis=0, return_inverse=True)
+    groups = [np.flatnonzero(which.ravel() == index) for index in range(len(unique))]
+    return [Incidence(_tidy(theta[rows]), _tidy(phi[rows]), rows) for rows in groups]
+
+
+def relative_azimuth(data: "Measurements") -> np.ndarray:
+    """Azimuth of the viewer seen from the mirror side, (N,) degrees in (-180, 180]: 0 is forward, 180 backward.
+
+    Light along the normal has no azimuth of its own: it counts as standing at `LIGHT_AZIMUTH`.
+    """
+    phi_i = np.where(data.theta_i < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
+    return 180.0 - (phi_i - data.phi_o) % 360.0
+
+
+def signed_angle(data: "Measurements") -> np.ndarray:
+    """Polar angle of the viewer, (N,) degrees, positive on the forward side of its own plane and negative behind."""
+    side = np.where(np.abs(relative_azimuth(data)) <= 90.0, 1.0, -1.0)
+    return side * data.theta_o
+
+
+def in_plane(data: "Measurements") -> np.ndarray:
+    """(N,) bool: the viewer lies in the plane of incidence, or the light in that of the viewer, to `SAME_ANGLE`."""
+    light, viewer = np.sin(np.radians(data.theta_i)), np.sin(np.radians(data.theta_o))
+    # near the normal the azimuth of the light hardly matters; on it, it counts as `relative_azimuth` says
+    arm = np.where(light < np.sin(np.radians(AT_NORMAL)), viewer, np.minimum(light, viewer))
+    off_plane = np.abs(np.sin(np.radians(relative_azimuth(data)))) * arm
+    return off_plane < np.sin(np.radians(SAME_ANGLE))
+
+
+def tracks(data: "Measurements") -> list[np.ndarray]:
+    """Rows in the order of the angle, one array per incidence and plane: neighbours in it are neighbours in angle."""
+    angle, azimuth = signed_angle(data), relative_azimuth(data) % 180.0
+    plane = np.where(in_plane(data), 0, np.round(azimuth / SAME_ANGLE).astype(int) % round(180 / SAME_ANGLE))
+    ordered = []
+    for incidence in incidences(data):
+        for index in np.unique(plane[incidence.rows]):
+            rows = incidence.rows[plane[incidence.rows] == index]
+            if len(rows) >= SHORTEST_TRACK:
+                ordered.append(rows[np.argsort(angle[rows], kind="stable")])
+    return ordered
+
+
+@dataclass(frozen=True)
+class ResidualGroup:
+    """Residuals, in units of sigma, of one incidence: white noise has mean 0 and root mean square 1."""
+
+    theta: float
+    count: int
+    mean: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class ResidualStructure:
+    """What the standardised residuals of a fit look like, over the rows and channels that were fitted."""
+
+    count: int
+    mean: float
+    rms: float
+    beyond_three: float  # share of |residual| > 3; a normal law has 0.0027
+    normal_distance: float  # Kolmogorov-Smirnov distance from the unit normal
+    lag_one: float  # correlation of neighbours in angle; NaN when no plane holds enough points
+    pairs: int
+    lag_one_sigma: float  # lag_one over its standard error under white noise, 1 / sqrt(pairs)
+    by_incidence: tuple[ResidualGroup, ...]
+
+    @property
+    def worst(self) -> ResidualGroup:
+        return max(self.by_incidence, key=lambda group: group.rms)
+
+    @property
+    def independent_share(self) -> float:
+        """Independent readings per reading, (1 - r) / (1 + r) for neighbours correlated by r; 1 where r <= 0."""
+        if not self.lag_one > 0.0:
+            return 1.0
+        return (1.0 - self.lag_one) / (1.0 + self.lag_one)
+
+
+def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+    """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
+    mask = fit.problem.data.mask
+    spread = np.full((len(mask), np.shape(values)[1]), np.nan)
+    spread[mask] = values
+    return spread
+
+
+def standardised(fit: "Fit") -> np.ndarray:
+    """Residuals of every row in units of the noise, (N, C), NaN in rows that were not used.
+
+    A named objective has no noise model: there the unit is the scatter that the fit has left.
+    """
+    unit = 1.0 if fit.is_posterior else np.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
+    return over_all_rows(fit, fit.residuals / unit)
+
+
+def residual_label(fit: "Fit") -> str:
+    """What `standardised` residuals are, for an axis of a picture."""
+    return r"(data $-$ model) / $\sigma$" if fit.is_posterior else f"residual of {fit.problem.objective} / its scatter"
+
+
+def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualStructure:
+    """Summary of standardised residuals (N, C) over the rows of `data`; NaN rows are left out.
+
+    Raises:
+        ValueError: no residual is finite.
+    """
+    from scipy import stats
+
+    finite = residuals[np.isfinite(residuals)]
+    if not finite.size:
+        raise ValueError("residuals must hold at least one finite value, got none")
+    groups = []
+    for incidence in incidences(data):
+        values = residuals[incidence.rows]
+        values = values[np.isfinite(values)]
+        if values.size:
+            groups.append(ResidualGroup(incidence.theta, values.size, float(values.mean()), _rms(values)))
+    first, second = _neighbours(data, residuals)
+    norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
+    lag_one = float(np.sum(first * second) / norm) if norm > 0.0 else float("nan")
+    return ResidualStructure(
+        count=finite.size,
+        mean=float(finite.mean()),
+        rms=_rms(finite),
+        beyond_three=float(np.mean(np.abs(finite) > 3.0)),
+        normal_distance=float(stats.kstest(finite, "norm").statistic),
+        lag_one=lag_one,
+        pairs=first.size,
+        lag_one_sigma=lag_one * float(np.sqrt(first.size)),
+        by_incidence=tuple(groups),
+    )
+
+
+def autocorrelation(data: "Measurements", residuals: np.ndarray, longest: int = 20) -> np.ndarray:
+    """Correlation of residuals (N, C) that lie 1, 2, ... `longest` readings apart in one plane; NaN where none do."""
+    values = []
+    for lag in range(1, longest + 1):
+        first, second = _neighbours(data, residuals, lag)
+        norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
+        values.append(np.sum(first * second) / norm if norm > 0.0 else np.nan)
+    return np.array(values)
+
+
+def _neighbours(data: "Measurements", residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    # The mean is not subtracted: a bias over a stretch of angle is structure too.
+    pairs = []
+    for rows in tracks(data):
+        track = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
+        if len(track) > lag:
+            pairs.append((track[:-lag].ravel(), track[lag:].ravel()))
+    if not pairs:
+        return np.empty(0), np.empty(0)
+    return np.concatenate([first for first, _ in pairs]), np.concatenate([second for _, second in pairs])
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _tidy(angles: np.ndarray) -> float:
+    return round(float(np.mean(angles)), 2)

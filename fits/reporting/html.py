@@ -1,0 +1,254 @@
+"""One HTML file that holds all of a fit: what was fitted, the values, and how far they can be trusted."""
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING
+
+from fits._files import write_text
+from fits.data.measurements import Measurements
+from fits.reporting import tables, verdicts
+from fits.reporting.diagnostics import (
+    ResidualStructure,
+    incidences,
+    residual_label,
+    residual_structure,
+    standardised,
+)
+from fits.reporting.plots import (
+    data as pictures,
+)
+from fits.reporting.plots import (
+    model as model_pictures,
+)
+from fits.reporting.plots import (
+    parameters as parameter_pictures,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+
+Pictures = Mapping[str, bytes]
+
+_PAGE = Template("""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>$title</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; display: block; overflow-x: auto; }
+th, td { padding: 0.2rem 0.8rem 0.2rem 0; text-align: left; vertical-align: top; } td { border-top: 1px solid #eee; }
+.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+caption { text-align: left; font-weight: 600; white-space: nowrap; }
+figure { margin: 1rem 0; } img { max-width: 100%; } figcaption, .note { font-size: 13px; color: #555; }
+pre { background: #f6f6f6; padding: 0.8rem; font-size: 12.5px; overflow-x: auto; }
+.verdict { background: #fff6e5; border-left: 4px solid #E69F00; padding: 0.5rem 1rem; }
+.verdict.fine { background: #eef7f2; border-color: #009E73; }
+</style></head><body>
+$body
+</body></html>
+""")
+
+
+def report(
+    fit: "Fit",
+    posterior: "Posterior | None" = None,
+    path: str | Path = "report.html",
+    *,
+    others: "Mapping[str, Fit | Posterior] | None" = None,
+    name: str = "this fit",
+    force: bool = True,
+) -> None:
+    """Writes the report of a fit to `path`, whole or not at all.
+
+    others: further fits of the same data by name, or their posteriors, to be compared with this one, called `name`.
+    Raises ValueError where `path` exists and `force` is False, and for `others` that cannot be compared.
+    """
+    images = draw(fit, posterior, others, name)
+    write_text(path, page(fit, posterior, images, others, name), force=force)
+
+
+def draw(
+    fit: "Fit",
+    posterior: "Posterior | None" = None,
+    others: "Mapping[str, Fit | Posterior] | None" = None,
+    name: str = "this fit",
+) -> dict[str, bytes]:
+    """Every picture that applies, as PNG by name."""
+    data = fit.problem.data
+    estimates = posterior if posterior is not None and verdicts.reportable(posterior) else None
+    figures: dict[str, Figure | None] = {
+        "stack": parameter_pictures.stack_picture(fit.stack),
+        "model": model_pictures.curves_picture({name: fit}, estimates),
+        "maps": model_pictures.maps_picture(fit),
+        "residuals": pictures.residual_picture(data, standardised(fit), residual_label(fit)),
+        "correlation": parameter_pictures.correlation_picture(fit),
+    }
+    if estimates is not None:
+        figures["corner"] = parameter_pictures.corner_picture(estimates)
+    if posterior is not None:
+        figures["trace"] = parameter_pictures.trace_picture(posterior)
+    if others:
+        figures["comparison"] = model_pictures.curves_picture({name: fit, **_fits(others)})
+    return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
+
+
+def page(
+    fit: "Fit",
+    posterior: "Posterior | None",
+    images: Pictures,
+    others: "Mapping[str, Fit | Posterior] | None" = None,
+    name: str = "this fit",
+) -> str:
+    """The HTML text of the report, with the pictures inside."""
+    structure = residual_structure(fit.problem.data, standardised(fit))
+    title = f"Fit of {source_name(fit.problem.data)}"
+    sections = [
+        f"<h1>{html.escape(title)}</h1>",
+        _verdict(fit, structure),
+        _fitted(fit),
+        _section(
+            "The stack", _image(images, "stack", "Fitted stack, from top to bottom; not to scale."), _stack_text(fit)
+        ),
+        _section("Values", tables.html_table(tables.parameter_table(fit))),
+        _section(
+            "Data and model",
+            _image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),
+            _image(
+                images,
+                "maps",
+                "Seen from above, forward to the right, rings at 30°, 60° and 90°; the star is the light.",
+            ),
+        ),
+        _section(
+            "How well the model explains the data",
+            _sentences(verdicts.explains(fit, structure)),
+            tables.html_table(tables.incidence_table(structure)),
+            _image(images, "residuals", "What independent noise of the stated size would not show."),
+        ),
+        _section(
+            "What the data cannot tell",
+            _sentences(verdicts.determines(fit)),
+            tables.html_table(tables.unresolved_table(fit)) if fit.unresolved else "",
+            _image(images, "correlation", "Correlation of the fitted parameters."),
+        ),
+        _section("Minima", _sentences(verdicts.minima(fit)), tables.html_table(tables.minima_table(fit))),
+        _posterior(fit, posterior, images),
+    ]
+    if others:
+        own = fit if posterior is None or not verdicts.reportable(posterior) else posterior
+        sections.append(comparison_section({name: own, **others}, images))
+    sections.append(_made_with())
+    return _PAGE.substitute(title=html.escape(title), body="\n".join(sections))
+
+
+def comparison_page(candidates: "Mapping[str, Fit | Posterior]") -> str:
+    """The HTML text of a comparison of fits of the same data, with its picture inside."""
+    fits = _fits(candidates)
+    figure = model_pictures.curves_picture(fits)
+    images = {} if figure is None else {"comparison": pictures.as_png(figure)}
+    title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
+    body = [f"<h1>{html.escape(title)}</h1>", comparison_section(candidates, images)]
+    body += [
+        _section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
+    ]
+    return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
+
+
+def comparison_section(candidates: "Mapping[str, Fit | Posterior]", images: Pictures) -> str:
+    """Which of several fits explains the data, as an HTML fragment."""
+    from fits.inference.compare import compare
+
+    compared = compare(candidates)
+    return _section(
+        "Comparison",
+        _sentences(compared.verdict),
+        tables.html_table(tables.comparison_table(compared)),
+        _image(images, "comparison", "The fits beside the same data."),
+    )
+
+
+def source_name(data: Measurements) -> str:
+    """The file's name, or what the data is where there is none."""
+    return Path(data.source.path).name or f"{data.source.format} data"
+
+
+def _fits(candidates: "Mapping[str, Fit | Posterior]") -> "dict[str, Fit]":
+    from fits.inference.posterior import Posterior
+
+    return {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}
+
+
+def _verdict(fit: "Fit", structure: ResidualStructure) -> str:
+    sentences, fine = verdicts.in_short(fit, structure)
+    return f'<p class="verdict{" fine" if fine else ""}">{html.escape(" ".join(sentences))}</p>'
+
+
+def _fitted(fit: "Fit") -> str:
+    data, problem = fit.problem.data, fit.problem
+    rows = [
+        ("file", data.source.path or "none"),
+        ("format", data.source.format),
+        ("values came as", f"{data.source.quantity}; converted to BRDF in 1/sr"),
+        ("channels", ", ".join(data.channels)),
+        ("readings", f"{int(data.mask.sum())} of {len(data.mask)} used, {int((~data.mask).sum())} masked"),
+        ("incidence", ", ".join(f"{group.theta:g}°" for group in incidences(data))),
+        ("noise", verdicts.noise_in_words(problem)),
+        ("objective", problem.objective),
+        ("common scale", verdicts.scale_in_words(problem)),
+        ("starts", verdicts.starts_in_words(fit)),
+        ("transport", problem.transport if isinstance(problem.transport, str) else type(problem.transport).__name__),
+        *(("note", note) for note in data.source.notes),
+        *((("attribution", data.source.attribution),) if data.source.attribution else ()),
+    ]
+    return _section("What was fitted", tables.html_table(tables.Table("", ("", ""), tuple(rows))))
+
+
+def _stack_text(fit: "Fit") -> str:
+    import tomli_w
+
+    from fits.problem.stack_file import stack_to_dict
+
+    return f"<pre>{html.escape(tomli_w.dumps(stack_to_dict(fit.stack)))}</pre>"
+
+
+def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures) -> str:
+    if posterior is None:
+        if fit.is_posterior:
+            return _section("Posterior", "<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>")
+        return _section("Posterior", "<p>There is none: the objective is a named residual, not a likelihood.</p>")
+    return _section(
+        "Posterior",
+        _sentences(verdicts.sampled(posterior)),
+        tables.html_table(tables.posterior_table(posterior)) if verdicts.reportable(posterior) else "",
+        _image(images, "corner", "Samples of the posterior; orange: the best fit."),
+        _image(images, "trace", "Every walker; estimates use what is right of the orange line."),
+    )
+
+
+def _made_with() -> str:
+    from fits.reporting.results import versions
+
+    words = [f"{package} {version}" for package, version in versions().items()]
+    return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
+
+
+def _section(head: str, *parts: str) -> str:
+    return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
+
+
+def _sentences(sentences: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences) + "</ul>"
+
+
+def _image(images: Pictures, name: str, caption: str) -> str:
+    if name not in images:
+        return ""
+    content = base64.b64encode(images[name]).decode("ascii")
+    caption = html.escape(caption)
+    picture = f'<img alt="{caption}" src="data:image/png;base64,{content}">'
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"

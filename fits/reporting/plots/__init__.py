@@ -1,0 +1,1 @@
+"""Pictures of data, models and parameters, as matplotlib figures that are neither shown nor written."""

@@ -1,0 +1,316 @@
+"""A fit as a directory: written whole or not at all, and opened again as the same fit.
+
+data.csv       the measurements that were fitted, with the rows that were left out marked
+problem.toml   the stack with its free parameters, noise and scale, as given
+fitted.toml    the same stack with the fitted values
+fit.json       every number of the fit, its settings, and the versions that made it; checksums of it and of these files
+chain.h5       the posterior's chain, once sampled, and summary.json with its estimates
+report.html    all of it to read, and its pictures as *.png
+"""
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fits._files import locked, read_json, text_checksum, write_json, write_text
+from fits.data.formats import read
+from fits.data.formats.csv import write_csv
+from fits.data.measurements import Source
+
+if TYPE_CHECKING:
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+
+SCHEMA = 2
+REPORT, SUMMARY = "report.html", "summary.json"
+FIT, DATA, PROBLEM, FITTED, CHAIN = "fit.json", "data.csv", "problem.toml", "fitted.toml", "chain.h5"
+LOCK = "chain.lock"
+_STORED = (
+    "vector",
+    "errors",
+    "covariance",
+    "cost",
+    "at_bound",
+    "converged",
+    "status",
+    "iterations",
+    "condition_number",
+)
+_DERIVED = (
+    "scale",
+    "chi_square",
+    "degrees_of_freedom",
+    "reduced_chi_square",
+    "log_likelihood",
+    "correlation",
+    "predicted",
+    "residuals",
+)
+PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
+
+
+def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
+    """Writes a result directory, without report, whole or not at all.
+
+    Raises ValueError where `directory` is not empty, unless `force` is given and it holds an earlier result; and for a
+    transport that a file cannot name (a function).
+    """
+    with reserved(directory, force), replacing(directory, force) as folder:
+        write_fit(fit, folder)
+
+
+def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
+    """The files of a fit, into a folder that holds none.
+
+    text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
+    """
+    from fits.problem.parameters import Free
+    from fits.problem.stack_file import write_problem
+    from layerjax import Transport
+
+    problem, transport = fit.problem, fit.problem.transport
+    if transport != "auto" and not isinstance(transport, Transport):
+        raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
+    scale = problem.scale if isinstance(problem.scale, Free) else None
+    write_csv(problem.data, folder / DATA)
+    if text is not None:
+        write_text(folder / PROBLEM, text)
+    else:
+        write_problem(
+            folder / PROBLEM,
+            problem.stack,
+            transport=transport,
+            noise=problem.noise,
+            scale=scale,
+            objective=problem.objective,
+        )
+    write_problem(folder / FITTED, fit.stack, transport=transport)
+    content = {
+        "layerjax_result": SCHEMA,
+        "versions": versions(),
+        "settings": fit.settings,
+        "starts_ended": fit.ended,
+        "source": asdict(problem.data.source),
+        "fixed_scale": None if scale is not None else problem.scale,
+        "parameters": [
+            {
+                "name": name,
+                "value": value,
+                "standard_error": fit.standard_errors[name],
+                "unit": fit.units[name],
+                "low": float(problem.low[index]),
+                "high": float(problem.high[index]),
+                "at_bound": name in fit.at_bound,
+            }
+            for index, (name, value) in enumerate(fit.values.items())
+        ],
+        "fit": {name: getattr(fit, name) for name in _STORED},
+        "without_influence": fit.without_influence,
+        "unresolved": [asdict(combination) for combination in fit.unresolved],
+        "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
+        "alternatives": [list(map(id, fit.minima)).index(id(one)) for one in fit.alternatives],
+        "derived": {name: getattr(fit, name) for name in _DERIVED},
+        "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
+    }
+    write_json(folder / FIT, content)
+
+
+def load_fit(directory: str | Path) -> "Fit":
+    """The fit that was saved in a directory. ValueError, on one line, for one that holds none or a damaged one."""
+    from fits.inference.fit_result import Fit, Minimum
+    from fits.inference.identifiability import Combination
+    from fits.problem.problem import Problem
+    from fits.problem.stack_file import read_problem
+
+    directory = Path(directory)
+    content = _content(directory)
+    given, data = read_problem(directory / PROBLEM), read(directory / DATA, format="csv")
+    try:
+        source = content["source"] | {"notes": tuple(content["source"]["notes"])}
+        data = replace(data, source=Source(**source))
+        scale = given.scale if given.scale is not None else content["fixed_scale"]
+        problem = Problem(given.stack, data, given.transport, given.noise, scale, given.objective)
+        stored, count = content["fit"], len(problem.names)
+        minima = tuple(
+            Minimum(values, _number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack)
+            for one in content["minima"]
+            for values in ({name: _number(value) for name, value in one["values"].items()},)
+        )
+        return Fit(
+            problem=problem,
+            vector=_array(stored["vector"], count),
+            errors=_array(stored["errors"], count),
+            covariance=_array(stored["covariance"], count, count),
+            cost=_number(stored["cost"]),
+            at_bound=tuple(stored["at_bound"]),
+            converged=stored["converged"],
+            status=stored["status"],
+            iterations=stored["iterations"],
+            condition_number=_number(stored["condition_number"]),
+            unresolved=tuple(
+                Combination(
+                    _number(one["error"]), one["weights"], {name: _number(e) for name, e in one["alone"].items()}
+                )
+                for one in content["unresolved"]
+            ),
+            minima=minima,
+            alternatives=tuple(minima[index] for index in content["alternatives"]),
+            # not in results of layerjax 0.1.0
+            without_influence=tuple(content.get("without_influence", ())),
+            settings=content.get("settings", {}),
+            ended=content.get("starts_ended", {}),
+        )
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
+    except ValueError as error:
+        raise ValueError(f"{directory / FIT}: {error}") from None
+
+
+def load_posterior(directory: str | Path) -> "Posterior | None":
+    """The posterior that was sampled in a result directory, as far as it got; None before its first step.
+
+    Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
+    Raises ValueError, on one line, for a damaged file.
+    """
+    from fits.inference.posterior import NoSteps, load
+
+    directory = Path(directory)
+    if not (directory / CHAIN).is_file():
+        return None
+    summary = read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
+    try:
+        posterior = load(load_fit(directory), directory / CHAIN)
+    except NoSteps:
+        return None
+    allowed = summary.get("allow_short") is True and summary.get("steps", 0) <= len(posterior.chain)
+    return replace(posterior, allow_short=allowed)  # not by a summary of a longer chain, which has been replaced
+
+
+def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
+    """Writes the estimates beside the chain that `fits.sample` keeps in the directory.
+
+    Raises ValueError for a chain that is too short to report from.
+    """
+    content = {
+        "layerjax_result": SCHEMA,
+        "versions": versions(),
+        "converged": posterior.converged,
+        "allow_short": posterior.allow_short,
+        "steps": len(posterior.chain),
+        "walkers": posterior.chain.shape[1],
+        "burn_in": posterior.burn_in,
+        "acceptance": posterior.acceptance,
+        "parameters": [
+            {
+                "name": name,
+                **dict(zip(("median", "low_68", "high_68", "mean", "sd"), estimates, strict=True)),
+                "autocorrelation_time": posterior.autocorrelation_time[index],
+                "effective_samples": posterior.effective_samples[index],
+            }
+            for index, (name, estimates) in enumerate(posterior.summary().items())
+        ],
+    }
+    write_json(Path(directory) / SUMMARY, content, force=True)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a result depends on."""
+    import layerjax
+
+    return {"layerjax": layerjax.__version__} | {package: metadata.version(package) for package in PACKAGES}
+
+
+def _content(directory: Path) -> dict[str, Any]:
+    """What fit.json holds, if it and the files that it has checksums of are as they were written."""
+    if not (directory / FIT).is_file():
+        raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
+    content = read_json(directory / FIT)
+    version = content.get("layerjax_result")
+    if version != SCHEMA:
+        raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
+    for name, checksum in content.get("checksums", {}).items():  # layerjax 0.1.0 wrote none
+        path = directory / name
+        if path.is_file() and text_checksum(path) != checksum:
+            raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
+    return content
+
+
+def _number(value: float | str) -> float:
+    return float(value)
+
+
+def _array(values: list[Any], *shape: int) -> np.ndarray:
+    return np.array(values, dtype=float).reshape(shape)
+
+
+def check_directory(directory: Path, force: bool) -> None:
+    """Refuses a place where a result cannot be written, or is being sampled: ValueError that says why."""
+    if not directory.resolve().parent.is_dir():
+        raise ValueError(f"{directory}: there is no directory {directory.resolve().parent}")
+    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+        return
+    if not (directory / FIT).is_file():
+        raise ValueError(f"{directory}: exists and is not a result directory (it holds no {FIT}), will not be replaced")
+    if not force:
+        raise ValueError(f"{directory}: holds a result already (--force, or force=True, replaces it)")
+    if (directory / LOCK).exists():
+        with locked(directory / LOCK, str(directory)):
+            pass
+
+
+@contextmanager
+def reserved(directory: str | Path, force: bool = False) -> Iterator[None]:
+    """While the block lasts, no other process writes this result: a ValueError where one does, or as `replacing`."""
+    directory = Path(directory)
+    check_directory(directory, force)
+    target = directory.resolve()
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
+        new, old = _beside(target)  # as a killed process left them
+        if old.exists() and not target.exists():
+            old.rename(target)
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+        yield
+
+
+def _beside(target: Path) -> tuple[Path, Path]:
+    return target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
+
+
+@contextmanager
+def replacing(directory: str | Path, force: bool = False) -> Iterator[Path]:
+    """A new folder beside `directory` that takes its place when the block ends well, and is removed when it does not.
+
+    The directory must be `reserved`. Raises ValueError for one that is not empty, unless `force` is given and it is an
+    earlier result.
+    """
+    directory = Path(directory)
+    check_directory(directory, force)
+    target = directory.resolve()
+    folder, old = _beside(target)
+    try:
+        folder.mkdir()
+        yield folder
+        check_directory(directory, force)  # someone else may have written there in the meantime
+        if not target.exists():
+            folder.rename(target)
+            return
+        with locked(target / LOCK, str(directory)):
+            target.rename(old)
+            try:
+                folder.rename(target)
+            except OSError:
+                old.rename(target)
+                raise
+        shutil.rmtree(old)
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
+            error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+        raise

@@ -1,0 +1,287 @@
+"""Tables of a fit: built once as words, then shown by rich on a terminal or as plain HTML in the report."""
+
+import html
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO
+
+import numpy as np
+
+from fits.reporting.diagnostics import ResidualStructure, in_plane, incidences
+from fits.reporting.verdicts import identifiability
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as Boxed
+
+    from fits.data.measurements import Measurements
+    from fits.inference.compare import Comparison, Row
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+
+MOST_MINIMA = 8
+LONGEST_WORD = 30  # letters of a text that is never wrapped
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, column heads, and rows of as many words; `note` stands below.
+
+    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    keys: int = 1
+
+
+def print_table(table: Table, stream: TextIO) -> None:
+    """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none.
+
+    One that does not fit becomes several below each other, so that every column is shown.
+    """
+    from rich.console import Console
+
+    console = Console(file=stream, width=None if stream.isatty() else 120, highlight=False, markup=False)
+    parts = _parts(table, console)
+    for number, part in enumerate(parts, start=1):
+        title = table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"
+        console.print(_boxed(table, part, title, squeezed=_least_width(table, part, console) > console.width))
+    if table.note:
+        console.print(table.note)
+
+
+def _parts(table: Table, console: "Console") -> list[list[int]]:
+    """The columns of the tables that this one is printed as: its keys, and as many of the others as fit."""
+    keys = list(range(table.keys))
+    parts = [keys]
+    for column in range(table.keys, len(table.columns)):
+        if parts[-1] != keys and _least_width(table, [*parts[-1], column], console) > console.width:
+            parts.append(keys)
+        parts[-1] = [*parts[-1], column]
+    return parts
+
+
+def _least_width(table: Table, columns: list[int], console: "Console") -> int:
+    return console.measure(_boxed(table, columns), options=console.options.update(width=10_000)).minimum
+
+
+def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = False) -> "Boxed":
+    """These columns in a box. Texts may be wrapped, numbers only where the box is to be `squeezed`."""
+    from rich import box
+    from rich.cells import cell_len
+    from rich.table import Table as Boxed
+
+    boxed = Boxed(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index in columns:
+        words = [table.columns[index], *(row[index] for row in table.rows)]
+        longest = max(map(cell_len, words))
+        number = _numeric(table, index)
+        wraps = not number and (index == len(table.columns) - 1 or longest > LONGEST_WORD)
+        boxed.add_column(
+            table.columns[index],
+            justify="right" if number else "left",
+            no_wrap=not (wraps or squeezed),
+            overflow="fold",
+            min_width=None if squeezed else min(longest, 12) if wraps else longest,
+        )
+    for row in table.rows:
+        boxed.add_row(*(row[index] for index in columns))
+    return boxed
+
+
+def html_table(table: Table) -> str:
+    """The table as an HTML fragment, every word escaped."""
+    kinds = [' class="number"' if _numeric(table, index) else "" for index in range(len(table.columns))]
+    head = "".join(f"<th{kind}>{html.escape(word)}</th>" for kind, word in zip(kinds, table.columns, strict=True))
+    body = "".join(
+        "<tr>"
+        + "".join(f"<td{kind}>{html.escape(word)}</td>" for kind, word in zip(kinds, row, strict=True))
+        + "</tr>\n"
+        for row in table.rows
+    )
+    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    caption = f"<caption>{html.escape(table.title)}</caption>" if table.title else ""
+    return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>{note}\n"
+
+
+def parameter_table(fit: "Fit") -> Table:
+    """Value, standard error, unit, bounds and what the data says about each fitted parameter."""
+    verdicts = identifiability(fit)
+    rows = []
+    for index, (name, value) in enumerate(fit.values.items()):
+        low, high = float(fit.problem.low[index]), float(fit.problem.high[index])
+        error = fit.standard_errors[name]
+        number, spread = with_error(value, error)
+        rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
+    note = (
+        ""
+        if fit.is_posterior
+        else "The objective is a named residual, not a likelihood: the errors are only indicative."
+    )
+    return Table(
+        "Fitted parameters", ("parameter", "value", "error", "unit", "bounds", "identified"), tuple(rows), note
+    )
+
+
+def minima_table(fit: "Fit") -> Table:
+    """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
+    shown = fit.minima[:MOST_MINIMA]
+    as_good = {id(minimum) for minimum in fit.alternatives}
+    heads = ["best", *("as good" if id(minimum) in as_good else "worse" for minimum in shown[1:])]
+    rows = [
+        ("starts", *(str(minimum.count) for minimum in shown)),
+        ("cost", *(f"{minimum.cost:.6g}" for minimum in shown)),
+        *((name, *(f"{minimum.values[name]:.4g}" for minimum in shown)) for name in fit.values),
+    ]
+    hidden = len(fit.minima) - len(shown)
+    note = f"{hidden} more, with higher cost, are in the result." if hidden else ""
+    return Table("Minima that the starts reached", ("", *heads), tuple(rows), note)
+
+
+def unresolved_table(fit: "Fit") -> Table:
+    """Combinations of parameters that the data do not resolve: how badly, and what they would know of each alone."""
+    rows = []
+    for combination in fit.unresolved:
+        weights, alone = combination.weights, combination.alone
+        size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
+        mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
+        known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
+        rows.append((size, "OPEN" if combination.open else "LOOSE", mixture, known))
+    note = (
+        "In widths of the bounds, from the data alone; along what is OPEN only bounds and priors decide. The last "
+        "column is the standard error that the data would give each parameter if all others were known."
+    )
+    columns = ("error", "", "along", "each alone")
+    return Table("Combinations that the data do not resolve", columns, tuple(rows), note if rows else "")
+
+
+def posterior_table(posterior: "Posterior") -> Table:
+    """Median, 68 % interval, mean, autocorrelation time and effective sample size of each parameter."""
+    summary = posterior.summary()
+    time, effective = (
+        np.ravel(posterior.autocorrelation_time),
+        np.broadcast_to(posterior.effective_samples, len(posterior.names)),
+    )
+    rows = []
+    for index, name in enumerate(posterior.names):
+        median, low, high, mean, deviation = summary[name]
+        width = (high - low) / 2.0
+        words = (with_error(number, width)[0] for number in (median, low, high, mean))
+        rows.append((name, *words, f"{deviation:.2g}", f"{time[index]:.0f}", f"{effective[index]:.0f}"))
+    columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "autocorr. steps", "effective samples")
+    return Table("Posterior", columns, tuple(rows))
+
+
+def incidence_table(structure: ResidualStructure) -> Table:
+    """Residuals of each incidence in units of sigma."""
+    rows = tuple(
+        (degrees(group.theta), str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
+        for group in structure.by_incidence
+    )
+    note = "In units of the assumed sigma: a model that explains the data has mean 0 and rms 1 at every incidence."
+    return Table("Residuals by incidence", ("incidence", "readings", "mean", "rms"), rows, note)
+
+
+def source_table(data: "Measurements") -> Table:
+    """What a file is: format, convention, counts, channels, sigma, and what its reader noted."""
+    source = data.source
+    used = int(np.count_nonzero(data.mask))
+    rows = [
+        ("format", source.format),
+        ("values came as", f"{source.quantity}, converted to BRDF in 1/sr"),
+        ("readings", f"{len(data)}, {used} used, {len(data) - used} masked"),
+        ("channels", ", ".join(data.channels)),
+        ("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}"),
+        ("sigma", _sigma_words(data)),
+        *(("attribution", word) for word in (source.attribution,) if word),
+        *(("note", note) for note in source.notes),
+    ]
+    return Table(source.path, ("", ""), tuple(rows))
+
+
+def _sigma_words(data: "Measurements") -> str:
+    if data.sigma is None:
+        return "none"
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = (data.sigma / np.abs(data.values))[data.mask]
+    return f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
+
+
+def data_table(data: "Measurements") -> Table:
+    """One row per incidence of a measurement: angles, readings, and the range of each channel's values."""
+    flat = in_plane(data)
+    rows = []
+    for incidence in incidences(data):
+        theta, values = data.theta_o[incidence.rows], data.values[incidence.rows]
+        ranges = [
+            f"{values[:, channel].min():.3g} to {values[:, channel].max():.3g}" for channel in range(values.shape[1])
+        ]
+        counts = (
+            len(incidence.rows),
+            np.count_nonzero(data.mask[incidence.rows]),
+            np.count_nonzero(flat[incidence.rows]),
+        )
+        angles = (degrees(incidence.theta), degrees(incidence.phi), f"{degrees(theta.min())} to {degrees(theta.max())}")
+        rows.append((*angles, *map(str, counts), *ranges))
+    heads = tuple(f"BRDF {channel}" for channel in data.channels)
+    columns = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
+    return Table("Angles, and BRDF in 1/sr", columns, tuple(_shortened(rows, 40)), keys=2)
+
+
+def comparison_table(comparison: "Comparison") -> Table:
+    """One row per fit, the best first: how well it explains the data, with how many parameters, and how far behind."""
+    compared = comparison.rows
+    aic, bic = min(row.aic for row in compared), min(row.bic for row in compared)
+    columns: list[tuple[str, Callable[[Row], str]]] = [
+        ("fit", lambda row: row.name),
+        ("parameters", lambda row: str(row.parameters)),
+        ("chi2/dof", lambda row: f"{row.reduced_chi_square:.4g}"),
+        ("chi2", lambda row: f"{row.chi_square:.5g}"),
+    ]
+    if math.isfinite(aic):
+        columns += [
+            ("log-lik.", lambda row: f"{row.log_likelihood:.2f}"),
+            ("AIC - best", lambda row: f"{row.aic - aic:.1f}"),
+            ("BIC - best", lambda row: f"{row.bic - bic:.1f}"),
+        ]
+    if all(math.isfinite(row.loo) for row in compared):
+        columns += [("LOO behind best", lambda row: f"{row.loo_behind:.1f} ± {row.loo_behind_error:.1f}")]
+    columns += [
+        ("converged", lambda row: "yes" if row.converged else "NO"),
+        ("at a bound", lambda row: ", ".join(row.at_bound)),
+    ]
+    rows = tuple(tuple(word(row) for _, word in columns) for row in compared)
+    order = {"loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}[comparison.sorted_by]
+    note = " ".join(f"{line[0].upper()}{line[1:]}." for line in (f"sorted by {order}, best first", *comparison.notes))
+    return Table("Comparison", tuple(head for head, _ in columns), rows, note)
+
+
+def degrees(angle: float) -> str:
+    """An angle in degrees as a word, to 0.01 at most: ``"89.85°"``, ``"30°"``."""
+    return f"{round(float(angle), 2) + 0.0:g}°"  # the sum makes 0 of -0
+
+
+def with_error(value: float, error: float) -> tuple[str, str]:
+    """Value and error as words, both to two digits of the error; ``("0.532", "0.021")``."""
+    if not (math.isfinite(error) and error > 0.0):
+        return f"{value:.6g}", "unknown"
+    digits = 1 - math.floor(math.log10(error))
+    if not -3 <= digits <= 9:
+        return f"{value:.6g}", f"{error:.2g}"
+    return f"{value:.{max(digits, 0)}f}", f"{error:.{max(digits, 0)}f}"
+
+
+def _shortened(rows: list[tuple[str, ...]], most: int) -> list[tuple[str, ...]]:
+    if len(rows) <= most:
+        return rows
+    gap = (f"... {len(rows) - most} more", *[""] * (len(rows[0]) - 1))
+    return [*rows[: most // 2], gap, *rows[len(rows) - most // 2 :]]
+
+
+def _numeric(table: Table, column: int) -> bool:
+    words = [row[column] for row in table.rows if row[column]]
+    return bool(words) and all(word.rstrip("°%").lstrip("+-")[:1].isdigit() or word == "unknown" for word in words)
