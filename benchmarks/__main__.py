@@ -31,7 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--work", type=Path, default=Path("spongecake-data"), help="folder for the truth of its materials"
     )
     compared = commands.choices["error-vs-time"]
-    families = sorted(path.name for path in (Path(__file__).parent / "suite").iterdir())
+    families = sorted({path.parent.name for path in (Path(__file__).parent / "suite").glob("*/*.toml")})
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
     compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
     compared.add_argument("--resume", action="store_true", help="measure only what the directory does not hold yet")
@@ -55,13 +55,13 @@ def main(arguments: list[str] | None = None) -> int:
     if given.benchmark == "spongecake":
         options["work"] = given.work
     if given.benchmark == "error-vs-time":
-        from benchmarks.models import named
+        from benchmarks.studies.error_vs_time.models import named
 
         try:
             options |= {"families": given.families, "models": named(given.models), "resume": given.resume}
         except ValueError as error:
             parser.error(str(error))
-    study = importlib.import_module(f"benchmarks.{given.benchmark.replace('-', '_')}").study
+    study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
     text, paths = study(**options)
     print(text)
     report(f"written: {', '.join(map(str, paths))}")

@@ -19,13 +19,7 @@ from jax import Array
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, floating, is_placeholder, parameter
 from layerjax.directions import Vector, add, combine, dot, frame, half_vector, normalize, reflect, scale, split
-from layerjax.normals.sggx import (
-    Kind,
-    radii,
-    sggx_area,
-    sggx_density,
-    sggx_sample,
-)
+from layerjax.normals.sggx import Kind, radii, sggx_area, sggx_density, sggx_sample
 from layerjax.quadrature import Rule, flake_rule, henyey_greenstein_inverse, henyey_greenstein_rule
 
 

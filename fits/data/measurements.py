@@ -10,12 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fits.data.geometry import (
-    TANGENT_COSINE,
-    Floats,
-    azimuth,
-    polar,
-)
+from fits.data.geometry import TANGENT_COSINE, Floats, azimuth, polar
 
 Quantity = Literal["brdf", "brdf_cos", "reflectance_factor"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)

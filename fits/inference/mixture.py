@@ -14,12 +14,7 @@ from scipy.special import expit, logit, logsumexp
 from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import student, student_draws
-from fits.inference.ridge import (
-    height,
-    open_directions,
-    ridge,
-    vector_at,
-)
+from fits.inference.ridge import height, open_directions, ridge, vector_at
 from fits.inference.uncertainty import local_information
 
 LEAST_PART = 0.01  # of the squared length of an open direction

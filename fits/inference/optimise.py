@@ -16,14 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from fits.data.measurements import Measurements
 from fits.inference.fit_result import ENDED, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
-from fits.inference.starts import (
-    End,
-    Solver,
-    polished,
-    run_starts,
-    solve_start,
-    start_points,
-)
+from fits.inference.starts import End, Solver, polished, run_starts, solve_start, start_points
 from fits.inference.uncertainty import Uncertainty, uncertainty
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.parameters import Free

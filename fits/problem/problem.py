@@ -35,15 +35,7 @@ from fits.problem.likelihood import (
     tail_residual,
     total_sigma,
 )
-from fits.problem.parameters import (
-    Box,
-    Free,
-    LogNormal,
-    Normal,
-    Template,
-    is_free,
-    split,
-)
+from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from layerjax.stack import with_known
 
 Transport = Any

@@ -34,14 +34,7 @@ import tomli_w
 import layerjax as lj
 from fits._files import write_text
 from fits.problem.likelihood import LEVELS, Noise, Objective
-from fits.problem.parameters import (
-    Free,
-    LogNormal,
-    LogUniform,
-    Normal,
-    Prior,
-    Uniform,
-)
+from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
 from fits.problem.values import (
     ANY,
     Range,

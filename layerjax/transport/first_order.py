@@ -16,12 +16,7 @@ from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.normals.facets import (
-    Distribution,
-    facet_density,
-    rule,
-    sample,
-)
+from layerjax.normals.facets import Distribution, facet_density, rule, sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths

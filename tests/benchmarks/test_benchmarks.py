@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks import environment, fitting, forward_models, peers, plain_numpy, recovery, results, throughput
-from benchmarks.scenes import CONDUCTOR, SCENES, Scene, pairs
+from benchmarks.measuring import environment
+from benchmarks.measuring import writing as results
+from benchmarks.peers import functions as peers
+from benchmarks.peers import plain_numpy
+from benchmarks.studies import recovery
+from benchmarks.studies.throughput import fitting, forward_models
+from benchmarks.studies.throughput import run as throughput
+from benchmarks.suite.scenes import CONDUCTOR, SCENES, Scene, pairs
 
 COUNT = 200
 BY_NAME = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)

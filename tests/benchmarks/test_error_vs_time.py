@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks import __main__, accuracy, error_vs_time
-from benchmarks.models import MODELS, Model, Size, named
-from benchmarks.suite import Case, Directions
-from benchmarks.truth import References, compare
+from benchmarks import __main__
+from benchmarks.measuring import accuracy
+from benchmarks.studies.error_vs_time import run as error_vs_time
+from benchmarks.studies.error_vs_time.models import MODELS, Model, Size, named
+from benchmarks.studies.error_vs_time.truth import References, compare
+from benchmarks.suite.cases import Case, Directions
 
 DIRECTIONS = Directions(
     wi=np.array([[0, 0, 1.0], [0, 0.6, 0.8]]),

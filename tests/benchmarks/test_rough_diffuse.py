@@ -3,7 +3,7 @@
 import numpy as np
 
 import layerjax as lj
-from benchmarks import rough_diffuse
+from benchmarks.studies import rough_diffuse
 
 
 def test_white_sky_of_surfaces_that_are_known():

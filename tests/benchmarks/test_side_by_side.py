@@ -2,8 +2,10 @@
 
 import pytest
 
-from benchmarks import side_by_side, side_by_side_picture, suite
-from benchmarks.models import MODELS, Row
+from benchmarks.studies.error_vs_time.models import MODELS, Row
+from benchmarks.studies.side_by_side import picture as side_by_side_picture
+from benchmarks.studies.side_by_side import run as side_by_side
+from benchmarks.suite import cases as suite
 
 
 def row(stack, model, step, l2, nanoseconds, family="coated_metals", limits=False):

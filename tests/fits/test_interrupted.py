@@ -20,24 +20,13 @@ from fits.inference import starts
 from fits.inference.chain import FileChain
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
-from fits.inference.posterior import (
-    Posterior,
-    _identity,
-    load,
-    sample,
-)
+from fits.inference.posterior import Posterior, _identity, load, sample
 from fits.inference.starts import start_points
 from fits.inference.starts_file import StartsFile
 from fits.problem.likelihood import Noise
 from fits.problem.problem import Problem
 from fits.reporting.plots.data import data_picture
-from fits.reporting.results import (
-    load_fit,
-    load_posterior,
-    reserved,
-    save_fit,
-    save_posterior,
-)
+from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
 from tests.fits.models import line
 from tests.fits.test_cli import ROOT, contents
 from tests.fits.test_posterior import LINE, line_data, line_fit

@@ -15,12 +15,7 @@ from fits.problem.likelihood import (
     sigma_residual,
     tail_residual,
 )
-from fits.problem.parameters import (
-    Free,
-    LogNormal,
-    LogUniform,
-    Normal,
-)
+from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
 from fits.problem.problem import Problem
 from tests.fits.models import design, line, measured
 

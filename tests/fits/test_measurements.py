@@ -6,18 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from fits.data.geometry import (
-    azimuth,
-    direction,
-    polar,
-    slices,
-)
-from fits.data.measurements import (
-    Measurements,
-    channel_names,
-    check_quantity,
-    to_bsdf,
-)
+from fits.data.geometry import azimuth, direction, polar, slices
+from fits.data.measurements import Measurements, channel_names, check_quantity, to_bsdf
 
 
 def _measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes) -> Measurements:

@@ -12,20 +12,10 @@ from scipy.optimize import least_squares
 import layerjax as lj
 from fits.data.geometry import slices
 from fits.inference.identifiability import Combination
-from fits.inference.optimise import (
-    fit,
-    fit_many,
-    fit_problem,
-    start_points,
-)
+from fits.inference.optimise import fit, fit_many, fit_problem, start_points
 from fits.problem.compiled import _run
 from fits.problem.likelihood import Noise
-from fits.problem.parameters import (
-    Free,
-    LogNormal,
-    LogUniform,
-    Normal,
-)
+from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reporting import verdicts

@@ -7,15 +7,7 @@ import pytest
 from scipy import integrate, stats
 
 import layerjax as lj
-from fits.problem.parameters import (
-    Box,
-    Free,
-    LogNormal,
-    LogUniform,
-    Normal,
-    Uniform,
-    split,
-)
+from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, Uniform, split
 
 PRIORS = {
     "uniform": (Free(0.5, 0.2, 0.9, Uniform()), stats.uniform(0.2, 0.7)),

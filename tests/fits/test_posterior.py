@@ -17,13 +17,7 @@ from fits.inference.chain import FileChain, MemoryChain
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
 from fits.inference.optimise import fit
-from fits.inference.posterior import (
-    _adapted,
-    _identity,
-    _sampler,
-    load,
-    sample,
-)
+from fits.inference.posterior import _adapted, _identity, _sampler, load, sample
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from tests.fits.models import design, line, measured

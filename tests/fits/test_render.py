@@ -5,14 +5,7 @@ import pytest
 
 import layerjax as lj
 from fits.cli.parser import main
-from fits.reporting.render import (
-    SKY,
-    SUN,
-    _display,
-    _sky,
-    _sphere,
-    render,
-)
+from fits.reporting.render import SKY, SUN, _display, _sky, _sphere, render
 
 WHITE = lj.Stack([], lj.Lambertian(1.0))
 SINGLE = lj.SingleScattering()

@@ -27,15 +27,9 @@ from fits.reporting.diagnostics import (
     standardised,
 )
 from fits.reporting.html import report
-from fits.reporting.plots import (
-    data as pictures,
-)
-from fits.reporting.plots import (
-    model as model_pictures,
-)
-from fits.reporting.plots import (
-    parameters as parameter_pictures,
-)
+from fits.reporting.plots import data as pictures
+from fits.reporting.plots import model as model_pictures
+from fits.reporting.plots import parameters as parameter_pictures
 
 
 def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks import disort
+from benchmarks.peers import disort
 
 pytestmark = [pytest.mark.peers, pytest.mark.skipif(disort.why_not() is not None, reason=str(disort.why_not()))]
 

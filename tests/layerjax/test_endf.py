@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks import endf_truth
-from benchmarks.operations import count
-from layerjax.transport.endf.chains import (
-    Coat,
-    Face,
-    Mirror,
-    Options,
-    reflections,
-)
+from benchmarks.measuring.operations import count
+from benchmarks.peers import endf_walk as endf_truth
+from layerjax.transport.endf.chains import Coat, Face, Mirror, Options, reflections
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 
 RECIPROCAL, PAPER, SURFACE = lj.ENDF(), lj.ENDF(form="paper"), lj.ENDF(bounces=0)

@@ -5,17 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import endf_truth
+from benchmarks.peers import endf_walk as endf_truth
 from layerjax import fresnel
 from layerjax.directions import direction, frame, join, normalize, reflect, refract, split
 from layerjax.normals import vmf
 from layerjax.transport.endf import warping as warping
-from layerjax.transport.endf.chains import (
-    Face,
-    Mirror,
-    chain_concentration,
-    inner_concentration,
-)
+from layerjax.transport.endf.chains import Face, Mirror, chain_concentration, inner_concentration
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration
 
 IOR = 1.5

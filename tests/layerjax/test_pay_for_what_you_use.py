@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import layerjax as lj
-from benchmarks.operations import count, total
+from benchmarks.measuring.operations import count, total
 
 WI, WO = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
 BASE = lj.Lambertian(0.5)

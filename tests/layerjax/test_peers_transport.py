@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks import peers
-from benchmarks.mitsuba_volpath import Volpath, surface_values
+from benchmarks.peers import functions as peers
+from benchmarks.peers.mitsuba_volpath import Volpath, surface_values
 from tests.cases import X, flakes, haze
 
 TILTED = (0.4, 0.2, 0.9)

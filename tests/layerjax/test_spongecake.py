@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks.operations import count
+from benchmarks.measuring.operations import count
 from layerjax.tables import load
 from layerjax.transport.spongecake.layers import pair_of
 from tests.layerjax.test_box import POINTS, draw

@@ -5,14 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from layerjax.transport.statistical.adding import (
-    Element,
-    add_element,
-    nothing,
-    plus,
-    retain,
-    times,
-)
+from layerjax.transport.statistical.adding import Element, add_element, nothing, plus, retain, times
 from layerjax.transport.statistical.variance import (
     phase_variance,
     refracted_cosine,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import pytest
 
 import layerjax as lj
-from benchmarks.operations import count
+from benchmarks.measuring.operations import count
 
 WI, WO = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
 METAL, DIFFUSE = lj.Conductor(0.2, 3.9, 0.3), lj.Lambertian(0.5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks.statistics import cases, compare
+from benchmarks.studies.statistics import cases, compare
 from layerjax.transport.statistical.lobes import Options, statistics
 
 LIGHT = lj.direction(jnp.radians(jnp.array([0.0, 60.0])), 0.0)

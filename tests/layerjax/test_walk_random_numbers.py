@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from layerjax.transport.random_walk.random_numbers import (
-    circle,
-    key_words,
-    pcg4d,
-    uniforms,
-)
+from layerjax.transport.random_walk.random_numbers import circle, key_words, pcg4d, uniforms
 
 SIGNIFICANCE = 1e-4
 

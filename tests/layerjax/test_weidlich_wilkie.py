@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from benchmarks.operations import count
+from benchmarks.measuring.operations import count
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 
 WW = lj.WeidlichWilkie()

@@ -2,12 +2,7 @@
 
 from pathlib import Path
 
-from fits.data.formats import (
-    csv,
-    fred,
-    merl,
-    zemax,
-)
+from fits.data.formats import csv, fred, merl, zemax
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity

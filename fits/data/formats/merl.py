@@ -19,14 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.formats._text import plural
-from fits.data.geometry import (
-    LIGHT_AZIMUTH,
-    Floats,
-    Geometry,
-    azimuth,
-    polar,
-    slices,
-)
+from fits.data.geometry import LIGHT_AZIMUTH, Floats, Geometry, azimuth, polar, slices
 from fits.data.measurements import Measurements, Source
 
 Indices = NDArray[np.int_]

@@ -8,12 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from fits.reporting.plots.data import (
-    CYCLE,
-    GREY,
-    INK,
-    STYLE,
-)
+from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit

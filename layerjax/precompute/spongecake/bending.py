@@ -18,21 +18,11 @@ from jax import Array
 from numpy.typing import NDArray
 
 from layerjax.precompute.learning import CURVE, Schedule, learn
-from layerjax.precompute.spongecake.data import (
-    KINDS,
-    WIDTHS,
-    draw_layers,
-    stack_of,
-)
+from layerjax.precompute.spongecake.data import KINDS, WIDTHS, draw_layers, stack_of
 from layerjax.precompute.spongecake.energy import Rule, balance
 from layerjax.precompute.spongecake.training import numbers_of
 from layerjax.stack import media_of
-from layerjax.transport.spongecake.bending import (
-    POWER,
-    bend_network,
-    coefficients_of,
-    polynomial,
-)
+from layerjax.transport.spongecake.bending import POWER, bend_network, coefficients_of, polynomial
 from layerjax.transport.spongecake.mapping import Numbers
 
 SHARD = 256

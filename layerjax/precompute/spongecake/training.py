@@ -23,14 +23,7 @@ from numpy.typing import NDArray
 
 from layerjax.precompute.learning import Schedule, learn
 from layerjax.precompute.spongecake.data import KINDS, Layers, Samples
-from layerjax.transport.spongecake.mapping import (
-    Numbers,
-    Shape,
-    Weights,
-    network,
-    shape_of,
-    weights_of,
-)
+from layerjax.transport.spongecake.mapping import Numbers, Shape, Weights, network, shape_of, weights_of
 
 HG = KINDS.index("hg")
 ENERGY = 0.5

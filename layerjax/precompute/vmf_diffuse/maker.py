@@ -11,12 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax.precompute.vmf_diffuse.half_space import (
-    HalfSpace,
-    all_orders,
-    half_space,
-    orders,
-)
+from layerjax.precompute.vmf_diffuse.half_space import HalfSpace, all_orders, half_space, orders
 from layerjax.surfaces.vmf_diffuse import all_orders as surface
 
 NODES = {False: 40, True: 20}

@@ -24,12 +24,7 @@ from layerjax.directions import Vector, add, combine, dot, frame, normalize, sca
 from layerjax.quadrature import gauss_legendre
 from layerjax.surfaces.contract import Surface
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.vmf_diffuse.coefficients import (
-    Terms,
-    first_order,
-    second_order,
-    third_order,
-)
+from layerjax.surfaces.vmf_diffuse.coefficients import Terms, first_order, second_order, third_order
 from layerjax.surfaces.vmf_diffuse.flakes import LEAST_ROUGHNESS, areas, concentration
 
 Form = Literal["paper", "literal", "transport"]

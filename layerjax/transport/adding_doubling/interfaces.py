@@ -24,12 +24,7 @@ from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import interface_reflection
 from layerjax.transport.adding_doubling.grid import Grid, Region, spread
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import (
-    BALANCING,
-    balance,
-    modes_at_nodes,
-    straight_on,
-)
+from layerjax.transport.adding_doubling.sampling import BALANCING, balance, modes_at_nodes, straight_on
 
 Microfacets = Literal["single", "multiple"]
 

@@ -20,14 +20,7 @@ from layerjax.directions import Vector, half_vector
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
-from layerjax.transport.adding_doubling.operators import (
-    Layer,
-    Operator,
-    Parts,
-    double,
-    matmul,
-    turned,
-)
+from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
 from layerjax.transport.adding_doubling.sampling import balance, modes_at_nodes, straight_on
 
 Pair = tuple[Array, Array]

@@ -18,13 +18,7 @@ from jax import Array
 from layerjax._numerics import at_least, horizon, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
-from layerjax.transport.adding_doubling.grid import (
-    Grid,
-    Region,
-    cubic,
-    stencil,
-    table_matrix,
-)
+from layerjax.transport.adding_doubling.grid import Grid, Region, cubic, stencil, table_matrix
 from layerjax.transport.adding_doubling.operators import Layer, Operator, turned
 from layerjax.transport.contract import Side
 

@@ -22,12 +22,7 @@ from layerjax.stack import Stack, simplify
 from layerjax.transport.adding_doubling.interfaces import Microfacets
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
-from layerjax.transport.adding_doubling.tables import (
-    Tables,
-    make_tables,
-    read_energy,
-    read_rest,
-)
+from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import Side, Transport, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, caught, evaluate_first, first_order
 from layerjax.transport.single_scattering import SingleScattering

@@ -21,16 +21,7 @@ from layerjax.stack import Interface, Medium, Stack, is_known, media_of, simplif
 from layerjax.surfaces import Conductor
 from layerjax.transport.contract import Side, Transport
 from layerjax.transport.endf import drawing as drawing
-from layerjax.transport.endf.chains import (
-    Coat,
-    Face,
-    Form,
-    Mirror,
-    Options,
-    is_above,
-    lifted,
-    reflections,
-)
+from layerjax.transport.endf.chains import Coat, Face, Form, Mirror, Options, is_above, lifted, reflections
 from layerjax.transport.endf.slab import transmissions
 from layerjax.transport.first_order import mirror
 

@@ -22,13 +22,7 @@ from layerjax.normals.sggx import ggx_density, ggx_sample
 from layerjax.surfaces import Conductor
 from layerjax.surfaces.microfacet import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.surfaces import (
-    Bounce,
-    base_of,
-    is_base,
-    roughness,
-    turned,
-)
+from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, roughness, turned
 
 
 class Position(NamedTuple):

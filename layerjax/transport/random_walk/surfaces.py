@@ -16,12 +16,7 @@ from jax import Array
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, select
-from layerjax.normals.facets import (
-    Distribution,
-    draw_weight,
-    masking,
-    twice_seen,
-)
+from layerjax.normals.facets import Distribution, draw_weight, masking, twice_seen
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import (
     between,

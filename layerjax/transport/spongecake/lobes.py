@@ -28,18 +28,8 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, answered, layer_lobes
-from layerjax.transport.spongecake.bending import (
-    Bend,
-    coefficients_of,
-    factors,
-    share_of,
-)
-from layerjax.transport.spongecake.mapping import (
-    Numbers,
-    Weights,
-    shape_of,
-    weights_of,
-)
+from layerjax.transport.spongecake.bending import Bend, coefficients_of, factors, share_of
+from layerjax.transport.spongecake.mapping import Numbers, Weights, shape_of, weights_of
 
 ABOVE, BELOW, THROUGH = range(3)
 

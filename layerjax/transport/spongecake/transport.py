@@ -16,13 +16,7 @@ from layerjax.transport.contract import Side, Transport
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.bending import bend_network
 from layerjax.transport.spongecake.layers import MOST, is_traced, pair_of
-from layerjax.transport.spongecake.lobes import (
-    Hemisphere,
-    SecondLobe,
-    evaluate_second,
-    second_albedo,
-    second_lobe,
-)
+from layerjax.transport.spongecake.lobes import Hemisphere, SecondLobe, evaluate_second, second_albedo, second_lobe
 from layerjax.transport.spongecake.mapping import network, unpack
 
 Proposal = Literal["first", "both"]

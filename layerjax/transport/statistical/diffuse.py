@@ -29,12 +29,7 @@ from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.quadrature import gauss_legendre, panels
 from layerjax.tables import load
-from layerjax.transport.statistical.variance import (
-    refracted_cosine,
-    roughness,
-    transmission_scale,
-    variance,
-)
+from layerjax.transport.statistical.variance import refracted_cosine, roughness, transmission_scale, variance
 
 Table = Mapping[str, np.ndarray]
 

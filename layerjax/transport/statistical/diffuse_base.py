@@ -28,13 +28,7 @@ from layerjax.directions import Vector
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
-from layerjax.transport.adding_doubling.grid import (
-    Grid,
-    Region,
-    interpolated,
-    lifted,
-    table_region,
-)
+from layerjax.transport.adding_doubling.grid import Grid, Region, interpolated, lifted, table_region
 from layerjax.transport.adding_doubling.interfaces import Microfacets, Normals, entering_energy
 from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve

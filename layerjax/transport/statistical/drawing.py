@@ -16,13 +16,7 @@ from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
 from layerjax.transport.statistical.lobes import bounded
-from layerjax.transport.statistical.tables import (
-    Columns,
-    Table,
-    folded,
-    look_up,
-    unfolded,
-)
+from layerjax.transport.statistical.tables import Columns, Table, folded, look_up, unfolded
 
 DiffusePart = DiffuseBase | DiffuseLobe | Surface
 """Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""

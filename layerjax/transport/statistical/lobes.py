@@ -16,22 +16,11 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._numerics import at_least, at_most
 from layerjax.channels import per_channel
-from layerjax.microsurface.directional_albedo import (
-    conductor_energy,
-    interface_energies,
-    is_smooth,
-    retained,
-)
+from layerjax.microsurface.directional_albedo import conductor_energy, interface_energies, is_smooth, retained
 from layerjax.phase import HenyeyGreenstein
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
-from layerjax.transport.statistical.adding import (
-    Element,
-    Lobe,
-    add_element,
-    nothing,
-    retain,
-)
+from layerjax.transport.statistical.adding import Element, Lobe, add_element, nothing, retain
 from layerjax.transport.statistical.variance import (
     phase_variance,
     refracted_cosine,

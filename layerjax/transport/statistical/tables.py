@@ -14,24 +14,11 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._numerics import at_least, safe_sqrt
 from layerjax.directions import Vector
-from layerjax.microsurface.directional_albedo import (
-    conductor_energy,
-    is_smooth,
-    lobe_energy,
-    retained,
-    single_energy,
-)
+from layerjax.microsurface.directional_albedo import conductor_energy, is_smooth, lobe_energy, retained, single_energy
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.grid import cubic
-from layerjax.transport.statistical.lobes import (
-    STEEPEST,
-    Options,
-    Statistics,
-    lobe_roughness,
-    precision,
-    statistics,
-)
+from layerjax.transport.statistical.lobes import STEEPEST, Options, Statistics, lobe_roughness, precision, statistics
 from layerjax.transport.statistical.variance import refracted_cosine
 
 POINTS = 97

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks import environment, fitting, forward_models, peers
-from benchmarks.results import DIRECTORY, environment_lines, write
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, write
+from benchmarks.peers import functions as peers
+from benchmarks.studies.throughput import fitting, forward_models
 
 TEXT = """\
 # Throughput

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks.operations import count
-from benchmarks.spongecake_tables import Cost
-from benchmarks.timing import interleaved
+from benchmarks.measuring.operations import count
+from benchmarks.measuring.timing import interleaved
+from benchmarks.studies.spongecake.tables import Cost
 
 Side = Literal["all", "reflection"]
 

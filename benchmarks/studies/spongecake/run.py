@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 import fits
 import layerjax as lj
-from benchmarks import environment
-from benchmarks.results import DIRECTORY, write
-from benchmarks.spongecake_cost import ROUNDS, costs
-from benchmarks.spongecake_tables import Errors, Figure, Fitted, Furnace, Gain, markdown
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, write
+from benchmarks.studies.spongecake.cost import ROUNDS, costs
+from benchmarks.studies.spongecake.tables import Errors, Figure, Fitted, Furnace, Gain, markdown
 from layerjax.normals.sggx import Kind
 from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import data as materials

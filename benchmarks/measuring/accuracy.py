@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.suite import Directions
+from benchmarks.suite.cases import Directions
 
 FLOOR = 0.01
 """Share of the value of a Lambertian surface of the same albedo below which a value counts as that."""

@@ -15,8 +15,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks.accuracy import Values, relative_l2, scale, worst
-from benchmarks.suite import Case, Directions
+from benchmarks.measuring.accuracy import Values, relative_l2, scale, worst
+from benchmarks.suite.cases import Case, Directions
 
 STANDARD_ERRORS, TOLERANCE = 4.0, 0.01
 """Two references agree within the larger of so many standard errors and this share of the value."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks import environment
-from benchmarks.results import DIRECTORY, environment_lines, table, write
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, table, write
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.statistical.lobes import Options, statistics
 

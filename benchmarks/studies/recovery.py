@@ -15,8 +15,8 @@ from scipy import stats
 
 import fits
 import layerjax as lj
-from benchmarks import environment
-from benchmarks.results import DIRECTORY, environment_lines, figure, table, write
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from fits.inference.optimise import fit_many, fit_problem
 
 Floats = NDArray[np.float64]

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks import operations, timing
-from benchmarks.accuracy import relative_l2, scale, worst
-from benchmarks.suite import Case
-from benchmarks.truth import Truth, albedos, key_of
+from benchmarks.measuring import operations, timing
+from benchmarks.measuring.accuracy import relative_l2, scale, worst
+from benchmarks.studies.error_vs_time.truth import Truth, albedos, key_of
+from benchmarks.suite.cases import Case
 from layerjax.stack import simplify
 
 Result = TypeVar("Result")

@@ -11,10 +11,12 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks import operations, peers, plain_numpy
-from benchmarks.results import Bar, figure, table
-from benchmarks.scenes import CONDUCTOR, REFLECTION, SCENES, Parameters, Scene, pairs
-from benchmarks.timing import interleaved, once
+from benchmarks.measuring import operations
+from benchmarks.measuring.timing import interleaved, once
+from benchmarks.measuring.writing import Bar, figure, table
+from benchmarks.peers import functions as peers
+from benchmarks.peers import plain_numpy
+from benchmarks.suite.scenes import CONDUCTOR, REFLECTION, SCENES, Parameters, Scene, pairs
 
 BARS = {
     (CONDUCTOR.name, "float32", "value"): Bar(5.0, 2.0),

@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 
 import layerjax as lj
-from benchmarks import side_by_side_picture, suite
-from benchmarks.error_tables import VALUES, amortised
-from benchmarks.error_vs_time import NAME as MEASURED
-from benchmarks.models import MODELS, Model, Row, supports
-from benchmarks.results import DIRECTORY, figure, table
+from benchmarks.measuring.writing import DIRECTORY, figure, table
+from benchmarks.studies.error_vs_time.models import MODELS, Model, Row, supports
+from benchmarks.studies.error_vs_time.run import NAME as MEASURED
+from benchmarks.studies.error_vs_time.tables import VALUES, amortised
+from benchmarks.studies.side_by_side import picture as side_by_side_picture
+from benchmarks.suite import cases as suite
 from fits._files import write_bytes, write_text
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 PAGE, PICTURE = "which_transport.md", "which_transport.png"
 TARGETS = (0.3, 0.1, 0.03, 0.01, 0.001)
 """Relative L2 errors that are asked for."""

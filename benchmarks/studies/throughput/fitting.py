@@ -16,9 +16,9 @@ from scipy.optimize import least_squares
 
 import fits
 import layerjax as lj
-from benchmarks.results import Bar, figure, table
-from benchmarks.scenes import pairs
-from benchmarks.timing import interleaved
+from benchmarks.measuring.timing import interleaved
+from benchmarks.measuring.writing import Bar, figure, table
+from benchmarks.suite.scenes import pairs
 from fits.inference.optimise import fit_many, fit_problem
 
 Floats = NDArray[np.float64]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.scenes import Parameters, Side
+from benchmarks.suite.scenes import Parameters, Side
 
 
 @dataclass(frozen=True)

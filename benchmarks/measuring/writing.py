@@ -8,7 +8,7 @@ from typing import Any
 
 from fits._files import write_text
 
-DIRECTORY = Path(__file__).parent / "results"
+DIRECTORY = Path(__file__).parents[1] / "results"
 
 
 @dataclass(frozen=True)

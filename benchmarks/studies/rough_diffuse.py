@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 import fits
 import layerjax as lj
-from benchmarks import environment, timing
-from benchmarks.results import DIRECTORY, environment_lines, figure, table, write
+from benchmarks.measuring import environment, timing
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from fits.data.geometry import Geometry
 from layerjax.surfaces import Surface
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.stack_file import read_problem
 
-DIRECTORY = Path(__file__).parent / "suite"
+DIRECTORY = Path(__file__).parent
 
 FAMILIES = {
     "plastics_and_paints": "plastics and paints",

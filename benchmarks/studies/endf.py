@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import layerjax as lj
-from benchmarks import endf_truth, environment
-from benchmarks.results import DIRECTORY, environment_lines, table, write
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, table, write
+from benchmarks.peers import endf_walk as endf_truth
 from layerjax.normals.vmf import concentration_of, sphere_density
 from layerjax.transport.endf import warping as warping
 from layerjax.transport.endf.chains import Form
@@ -48,8 +49,9 @@ TEXT = """\
 
 {environment}
 `ENDF(form="paper")`, the corrected paper, and `ENDF(form="reciprocal")` beside {paths:,} paths through von Mises-Fisher
-facets (`benchmarks/endf_truth.py`: plain numpy, Fresnel at every facet, separable masking). *RandomWalk* is the energy
-of the same paths, told apart by their number of events, among as many of the library's own walk (`lj.goniophotometer`).
+facets (`benchmarks/peers/endf_walk.py`: plain numpy, Fresnel at every facet, separable masking). *RandomWalk* is the
+energy of the same paths, told apart by their number of events, among as many of the library's own walk
+(`lj.goniophotometer`).
 *Distance* is the sum of |model - truth| over 41 by 41 cells of the projected lobe by the sum of the truth; *floor* is
 what the noise of the truth alone makes of it. Angles in degrees; kappa = 2 / alpha^2, of the coat and of the base.
 Standard errors of energies are below {error:.1g}.

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks import disort, environment, peers
-from benchmarks.fitting import Row, as_json, markdown
-from benchmarks.mitsuba_volpath import Volpath
-from benchmarks.results import DIRECTORY, Bar, environment_lines, write
-from benchmarks.timing import Work, interleaved, once
+from benchmarks.measuring import environment
+from benchmarks.measuring.timing import Work, interleaved, once
+from benchmarks.measuring.writing import DIRECTORY, Bar, environment_lines, write
+from benchmarks.peers import disort
+from benchmarks.peers import functions as peers
+from benchmarks.peers.mitsuba_volpath import Volpath
+from benchmarks.studies.throughput.fitting import Row, as_json, markdown
 
 Floats = NDArray[np.float64]
 

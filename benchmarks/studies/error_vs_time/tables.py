@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 import layerjax as lj
-from benchmarks import accuracy
-from benchmarks.models import Model, Row, Size
-from benchmarks.results import environment_lines, figure, table
-from benchmarks.suite import FAMILIES
-from benchmarks.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
+from benchmarks.measuring import accuracy
+from benchmarks.measuring.writing import environment_lines, figure, table
+from benchmarks.studies.error_vs_time.models import Model, Row, Size
+from benchmarks.studies.error_vs_time.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
+from benchmarks.suite.cases import FAMILIES
 
 VALUES = 10_000
 """Values of one stack over which the preparation is spread."""
@@ -19,7 +19,7 @@ TEXT = """\
 # Error against run time
 
 {environment}
-{stacks} stacks ({files}); what the pairs of directions are: `benchmarks/suite.py`.
+{stacks} stacks ({files}); what the pairs of directions are: `benchmarks/suite/cases.py`.
 {untold}
 ![Error against time per value, a panel a family](error-vs-time.png)
 

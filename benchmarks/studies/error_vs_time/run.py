@@ -9,11 +9,14 @@ from typing import Any
 
 import jax
 
-from benchmarks import accuracy, environment, error_pictures, error_tables, suite
-from benchmarks.models import MODELS, Model, Programs, Row, Size, row, run, supports
-from benchmarks.results import DIRECTORY, write
-from benchmarks.suite import Case
-from benchmarks.truth import REFERENCES, Judged, References, Truth, judge, pack, unpack
+from benchmarks.measuring import accuracy, environment
+from benchmarks.measuring.writing import DIRECTORY, write
+from benchmarks.studies.error_vs_time import pictures as error_pictures
+from benchmarks.studies.error_vs_time import tables as error_tables
+from benchmarks.studies.error_vs_time.models import MODELS, Model, Programs, Row, Size, row, run, supports
+from benchmarks.studies.error_vs_time.truth import REFERENCES, Judged, References, Truth, judge, pack, unpack
+from benchmarks.suite import cases as suite
+from benchmarks.suite.cases import Case
 from fits._files import write_bytes
 from fits.reporting.plots.data import as_png
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.results import environment_lines, figure, table
+from benchmarks.measuring.writing import environment_lines, figure, table
 
 TEXT = """\
 # SpongeCake with multiple scattering

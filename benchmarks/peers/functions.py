@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.plain_numpy import Functions, model_of
-from benchmarks.scenes import CONDUCTOR, Scene
+from benchmarks.peers.plain_numpy import Functions, model_of
+from benchmarks.suite.scenes import CONDUCTOR, Scene
 
 VARIANT = "llvm_ad_rgb"
 LIBRARIES = ("LLVM-19", "LLVM-18", "LLVM-17", "LLVM-16", "LLVM")

@@ -8,16 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchmarks.error_tables import VALUES, amortised, floored
-from benchmarks.models import Model, Row
-from benchmarks.suite import FAMILIES
-from benchmarks.truth import Judged
-from fits.reporting.plots.data import (
-    CYCLE,
-    GREY,
-    INK,
-    STYLE,
-)
+from benchmarks.studies.error_vs_time.models import Model, Row
+from benchmarks.studies.error_vs_time.tables import VALUES, amortised, floored
+from benchmarks.studies.error_vs_time.truth import Judged
+from benchmarks.suite.cases import FAMILIES
+from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
 
 MARKERS = "osD^v<>P*"
 HIGHEST = 10.0

@@ -9,15 +9,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import layerjax as lj
-from benchmarks.models import Model, supports
-from benchmarks.suite import FAMILIES, Case
-from benchmarks.truth import REFERENCES
-from fits.reporting.plots.data import (
-    CYCLE,
-    INK,
-    STYLE,
-    as_png,
-)
+from benchmarks.studies.error_vs_time.models import Model, supports
+from benchmarks.studies.error_vs_time.truth import REFERENCES
+from benchmarks.suite.cases import FAMILIES, Case
+from fits.reporting.plots.data import CYCLE, INK, STYLE, as_png
 
 SHOWN = {
     "plastics_and_paints": "coated_sand",

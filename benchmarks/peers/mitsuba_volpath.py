@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks.mitsuba_flakes import flakes
-from benchmarks.peers import VARIANT
+from benchmarks.peers.functions import VARIANT
+from benchmarks.peers.mitsuba_flakes import flakes
 
 WIDTH = 1e4
 """Half width of the rectangles, in depths of a medium."""

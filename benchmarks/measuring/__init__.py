@@ -1,0 +1,1 @@
+"""What measurements share: errors, operation counts, times, the machine they ran on, and results as written."""
