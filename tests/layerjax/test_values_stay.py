@@ -1,0 +1,111 @@
+"""Values and gradients of every transport stay what they were: a change of their code that should change none is seen.
+
+``python -m tests.layerjax.test_values_stay`` writes the file anew, where a change is meant.
+"""
+
+import json
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from tests.layerjax.derivatives import STACKS, asked_to_be_known, pairs, vector_and_build
+
+FILE = Path(__file__).parents[1] / "data" / "values.json"
+ROUNDING = {"float64": 1e-9, "float32": 1e-3}
+"""Of the largest value or slope: what another order of the same operations may change."""
+
+MEDIA = ("haze over paint", "flakes over rough paint", "haze over metal", "flakes' transport")
+CASES = {
+    "SingleScattering": (lj.SingleScattering(), (*MEDIA, "fibers", "metal, vmf")),
+    "SpongeCake": (lj.SpongeCake(), (*MEDIA, "fibers")),
+    "WeidlichWilkie": (lj.WeidlichWilkie(), ("varnish", "coated metal", "dyed varnish", "two coats on paint")),
+    "ENDF": (lj.ENDF(), ("face", "coated metal", "coated metal, vmf", "slab, vmf")),
+    "Statistical": (lj.Statistical(), ("haze over metal", "varnish", "coated metal", "hazy varnish", "plate")),
+    "Statistical, single": (lj.Statistical(microfacets="single"), ("varnish",)),
+    "AddingDoubling": (
+        lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6)),
+        ("haze over paint", "flakes over rough paint", "varnish, vmf", "hazy coat on metal", "clear plate"),
+    ),
+    "AddingDoubling, multiple": (lj.AddingDoubling(nodes=6, modes=6, microfacets="multiple"), ("coated metal",)),
+}
+
+
+DRAWN = {
+    "SingleScattering": "haze over metal",
+    "SpongeCake": "fibers",
+    "WeidlichWilkie": "coated metal",
+    "ENDF": "coated metal",
+    "Statistical": "varnish",
+    "AddingDoubling": "haze over paint",
+}
+WALKED = ("haze over metal", "fibers", "varnish, vmf", "plate")
+
+
+def numbers(name, kind, dtype):
+    """Values of the first channel at eight pairs, and the gradient of the sum of v / (1 + v) by all parameters."""
+    stack, transport = STACKS[kind], CASES[name][0]
+    start, build = vector_and_build(stack, asked_to_be_known(name, kind))
+    wi, wo = (w.astype(dtype) for w in pairs(stack))
+
+    @jax.jit
+    def both(vector):
+        def total(vector):
+            values = lj.evaluate(build(vector), wi, wo, transport)[:, 0]
+            return jnp.sum(values / (1.0 + values)), values  # no single one outweighs the others
+
+        (_, values), gradient = jax.value_and_grad(total, has_aux=True)(vector)
+        return values, gradient
+
+    return both(start.astype(dtype))
+
+
+def drawn(name, kind, dtype):
+    """Directions drawn, their densities and weights, and the albedo."""
+    stack, transport = STACKS[kind], CASES[name][0]
+    wi = pairs(stack)[0].astype(dtype)
+    return *lj.sample(stack, wi, jax.random.key(5), transport), *lj.albedo(stack, wi[:1], transport, nodes=8)
+
+
+def walked(kind, dtype):
+    """Values of the random walk, and their errors."""
+    wi, wo = (w.astype(dtype) for w in pairs(STACKS[kind]))
+    walk = lj.RandomWalk(paths=1 << 10)
+    return lj.evaluate_with_error(STACKS[kind], wi, wo, walk, key=jax.random.key(3))
+
+
+ALL = {f"{name}: {kind}": partial(numbers, name, kind) for name, (_, kinds) in CASES.items() for kind in kinds}
+ALL |= {f"{name}, drawn: {kind}": partial(drawn, name, kind) for name, kind in DRAWN.items()}
+ALL |= {f"RandomWalk: {kind}": partial(walked, kind) for kind in WALKED}
+
+
+def parts(name, dtype):
+    return [np.asarray(part, float) for part in ALL[name](dtype)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ROUNDING)
+@pytest.mark.parametrize("name", ALL)
+def test_values_stay(name, dtype):
+    stored = json.loads(FILE.read_text())[f"{name}, {dtype}"]
+    for found, before in zip(parts(name, dtype), stored, strict=True):
+        np.testing.assert_allclose(found, before, rtol=0, atol=ROUNDING[dtype] * np.abs(before).max())
+
+
+def _write() -> None:
+    jax.config.update("jax_enable_x64", True)
+    lines = []
+    for name in ALL:
+        for dtype in ROUNDING:
+            stored = [part.tolist() for part in parts(name, dtype)]
+            lines.append(f"{json.dumps(f'{name}, {dtype}')}: {json.dumps(stored)}")
+            print(name, dtype, flush=True)
+    FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+
+
+if __name__ == "__main__":
+    _write()
