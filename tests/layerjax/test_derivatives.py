@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from tests.layerjax.derivatives import STACKS, agrees, asked_to_be_known, pairs, points_of, vector_and_build
+from tests.helpers.derivatives import STACKS, agrees, asked_to_be_known, pairs, points_of, vector_and_build
 
 SOLVER = lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6))
 TRANSPORTS = {

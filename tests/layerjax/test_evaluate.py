@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.evaluate import CHUNK_BYTES
-from tests.cases import tilt3
+from tests.helpers.cases import tilt3
 
 STACK = lj.Stack(tilt3(), lj.Lambertian([0.2, 0.5, 0.8]))
 OPEN = lj.Stack(tilt3())

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from tests.cases import HEMISPHERES, POINTS, X, fiber_2, flakes
+from tests.helpers.cases import HEMISPHERES, POINTS, X, fiber_2, flakes
 
 
 @pytest.mark.parametrize("name", POINTS)

@@ -9,7 +9,7 @@ import scipy.stats
 import layerjax as lj
 from layerjax.directions import join, split
 from layerjax.normals import sggx as distributions
-from tests.cases import haze, tilt3
+from tests.helpers.cases import haze, tilt3
 
 DRAWS = 200_000
 SIGNIFICANCE = 1e-4  # with 18 cases a correct sampler fails this file once in 500 seeds

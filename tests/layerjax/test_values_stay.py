@@ -5,7 +5,6 @@
 
 import json
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +12,10 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from tests.layerjax.derivatives import STACKS, asked_to_be_known, pairs, vector_and_build
+from tests.helpers.derivatives import STACKS, asked_to_be_known, pairs, vector_and_build
+from tests.helpers.places import STORED
 
-FILE = Path(__file__).parents[1] / "data" / "values.json"
+FILE = STORED / "values.json"
 ROUNDING = {"float64": 1e-9, "float32": 1e-3}
 """Of the largest value or slope: what another order of the same operations may change."""
 

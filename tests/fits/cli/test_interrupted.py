@@ -1,0 +1,349 @@
+"""Disks that fill up, processes that are killed or that meet, and damaged files: what was kept stays, and is seen."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from fits._files import locked
+from fits.cli.parser import main
+from fits.inference import starts
+from fits.inference.chain import FileChain
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.inference.posterior import Posterior, _identity, load, sample
+from fits.inference.starts import start_points
+from fits.inference.starts_file import StartsFile
+from fits.problem.likelihood import Noise
+from fits.problem.problem import Problem
+from fits.reporting.plots.data import data_picture
+from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
+from tests.fits.cli.test_cli import ROOT, contents
+from tests.fits.inference.test_posterior import LINE, line_data, line_fit
+from tests.helpers.models import line
+
+MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
+BOUNDED = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "12", "--solver", "bounded"]
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file can grow beyond this, in bytes: a full disk for those who may not mount a small one."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    setting = "jax_persistent_cache_min_compile_time_secs"
+    usual = jax.config.values[setting]
+    jax.config.update(setting, float("inf"))  # compiled programs that other tests share are not to be cut off
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores the signal, so that `write` fails
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        jax.config.update(setting, usual)
+
+
+@contextmanager
+def mounted(folder: Path, *options: str) -> Iterator[None]:
+    try:
+        done = subprocess.run(["mount", *options, str(folder)], capture_output=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("there is no mount")
+    if done.returncode:
+        pytest.skip("mounting is not permitted")
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    if os.geteuid() == 0:  # whom permissions do not stop
+        with mounted(folder, "--bind", str(folder)):
+            subprocess.run(["mount", "-o", "remount,ro,bind", str(folder)], check=True)
+            yield
+        return
+    folder.chmod(0o555)
+    yield
+    folder.chmod(0o755)
+
+
+def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one error line of a command that must fail, after what it says of its progress."""
+    assert main(words) == 2
+    *progress, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("layerjax: error: ")
+    assert not any("error" in line for line in progress)
+    return error
+
+
+@contextmanager
+def stopped(words: list[str], cache: Path, when: Callable[[], bool]) -> Iterator[subprocess.Popen]:
+    """A `layerjax` command in a process of its own, held where it is once `when` is true, and killed in the end."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)}
+    with subprocess.Popen([sys.executable, "-m", "fits.cli", *words], env=environment, text=True) as process:
+        try:
+            end = time.monotonic() + 100
+            while not when():
+                assert process.poll() is None, "it ended too soon"
+                assert time.monotonic() < end, "it never got there"
+                time.sleep(0.0005)
+            process.send_signal(signal.SIGSTOP)
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture(scope="module")
+def result() -> Fit:
+    return line_fit()
+
+
+@pytest.fixture(scope="module")
+def many(result: Fit) -> Posterior:
+    return sample(result, **MANY)
+
+
+def assert_it_goes_on(result: Fit, path: Path, many: Posterior) -> None:
+    """What was kept is the beginning of the chain of a run that was never interrupted, and grows into all of it."""
+    kept = load(result, path)
+    assert 0 < len(kept.chain) <= len(many.chain)
+    np.testing.assert_array_equal(kept.chain, many.chain[: len(kept.chain)])
+    np.testing.assert_array_equal(sample(result, path=path, **MANY).chain, many.chain)
+
+
+@pytest.mark.parametrize(("limit", "name"), [(1_000_000, "chain.journal"), (1_600_000, "chain.h5")])
+def test_a_chain_survives_a_full_disk(result: Fit, many: Posterior, tmp_path: Path, limit: int, name: str) -> None:
+    """Full in the middle of a step of the journal, and full as the second checkpoint is written."""
+    path = tmp_path / "chain.h5"
+    with largest_file(limit), pytest.raises(OSError, match="too large") as error:
+        sample(result, path=path, **MANY)
+    assert error.value.filename == str(tmp_path / name)
+    assert {entry.name for entry in tmp_path.iterdir()} == {"chain.h5", "chain.journal"}
+    assert_it_goes_on(result, path, many)
+
+
+def test_a_chain_on_a_small_disk_goes_on_with_more_room(result: Fit, many: Posterior, tmp_path: Path) -> None:
+    with mounted(tmp_path, "-t", "tmpfs", "-o", "size=3m", "tmpfs"):
+        with pytest.raises(OSError, match="No space left"):
+            sample(result, path=tmp_path / "chain.h5", **MANY)
+        subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path)], check=True)
+        assert_it_goes_on(result, tmp_path / "chain.h5", many)
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["convert", "data.csv", "out.csv", "--force"], "out.csv"),
+        (["simulate", "--stack", "coat.toml", "--out", "out.csv", "--force"], "out.csv"),
+        (["render", "coat.toml", "--size", "16", "--out", "out.png", "--force"], "out.png"),
+        (["info", "data.csv", "--out", "out.png", "--force"], "out.png"),
+        (["compare", "one", "two", "--out", "out.html", "--force"], "out.html"),
+        (["report", "one"], "one"),
+        (["sample", "one"], "one/chain.h5"),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_a_full_disk_is_one_line_and_changes_nothing(
+    work: Path,
+    capsys: pytest.CaptureFixture[str],
+    coat_fit: Fit,
+    words: list[str],
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # any picture will do, and this one is drawn fast
+    monkeypatch.setattr("fits.reporting.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
+    for directory in ("one", "two"):
+        save_fit(coat_fit, directory)
+    for output in ("out.csv", "out.png", "out.html", "one/report.html"):
+        (work / output).write_text("precious")
+    before = contents(work)
+    with largest_file(6_000):
+        error = refusal(words, capsys)
+    assert error == f"layerjax: error: {name}: file too large"
+    assert contents(work) == before
+
+
+def test_a_full_disk_behind_stdout_is_one_line(
+    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full")
+    with open("/dev/full", "w") as full:  # closing it fails if anything is left to be written
+        monkeypatch.setattr(sys, "stdout", full)
+        assert "No space left on device" in refusal(["convert", "data.csv", "out.csv"], capsys)
+
+
+def test_the_report_of_a_result_that_can_only_be_read_goes_elsewhere(
+    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit
+) -> None:
+    save_fit(coat_fit, "result")
+    with read_only(work / "result"):
+        assert "(--out FILE writes the report elsewhere)" in refusal(["report", "result"], capsys)
+        assert main(["report", "result", "--out", "report.html"]) == 0
+        assert "chain.lock: " in refusal(["sample", "result"], capsys)
+    assert "</html>" in (work / "report.html").read_text()
+    assert "--force" in refusal(["report", "result", "--out", "report.html"], capsys)
+
+
+def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
+    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_fit(coat_fit, "result")
+    before = contents(work)
+    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "3", "--force"]
+    with largest_file(30_000):
+        assert refusal(words, capsys) == "layerjax: error: result: file too large"
+    after = contents(work)
+    assert len(after.pop(str(work / ".result.starts")).splitlines()) == 1 + 3
+    assert after == before
+    monkeypatch.setattr(starts, "least_squares_end", None)  # no start is run again
+    assert main(words) == 0
+    assert not list(work.glob(".*"))
+
+
+def test_beside_a_running_sampler_others_only_read(
+    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    for name in ("result", "other"):
+        save_fit(coat_fit, name)
+    directory = work / "result"
+    words = ["sample", "result", "--walkers", "32", "--seed", "3"]
+
+    def seen() -> dict[str, tuple[int, int, bytes]]:
+        entries = [(path, path.stat()) for path in directory.iterdir()]
+        return {path.name: (stat.st_ino, stat.st_mtime_ns, path.read_bytes()) for path, stat in entries}
+
+    def some_steps() -> bool:
+        return (directory / "chain.journal").is_file() and (directory / "chain.journal").stat().st_size > 20_000
+
+    with stopped(words, tmp_path_factory.getbasetemp() / "cache", some_steps) as process:
+        before = seen()
+        assert {"chain.h5", "chain.journal", "chain.lock"} < set(before)
+        for other in (words, [*words, "--force"], [*BOUNDED, "--force"]):
+            assert f"in use by another process ({process.pid})" in refusal(other, capsys)
+        posterior = load_posterior(directory)
+        assert main(["compare", "result", "other"]) == 0
+        assert main(["report", "result", "--out", "report.html"]) == 0
+        assert seen() == before
+    assert process.returncode == -signal.SIGKILL
+    assert posterior is not None
+    loaded = load_fit(directory)
+    whole = sample(loaded, walkers=32, seed=3, path=directory / "chain.h5")
+    again = sample(loaded, walkers=32, seed=3)
+    assert 2 < len(posterior.chain) < len(again.chain)
+    np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
+    np.testing.assert_array_equal(whole.chain, again.chain)
+    assert not (directory / "chain.lock").exists()
+
+
+def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
+    work: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    done = work / ".result.starts"
+
+    def some_starts() -> bool:
+        return done.is_file() and done.read_bytes().count(b"\n") > 3
+
+    with stopped(BOUNDED, tmp_path_factory.getbasetemp() / "cache", some_starts) as process:
+        before = done.read_bytes()
+        assert f"result is in use by another process ({process.pid})" in refusal(BOUNDED, capsys)
+        assert done.read_bytes() == before
+    kept = before.count(b"\n") - 1
+    assert 2 < kept < 12
+    done.write_bytes(before + b'00000000 {"start": 11, ')  # as if it had been killed in the middle of a line
+    solve, solved = starts._bounded_end, []
+    monkeypatch.setattr(starts, "_bounded_end", lambda *given: solved.append(given) or solve(*given))
+    assert main(BOUNDED) == 0
+    assert len(solved) == 12 - kept
+    assert not list(work.glob(".*"))
+    assert main([*BOUNDED[:-5], "whole", *BOUNDED[-4:]]) == 0
+    for name in ("fit.json", "fitted.toml", "data.csv"):
+        assert (work / "result" / name).read_bytes() == (work / "whole" / name).read_bytes()
+
+
+def test_starts_are_those_of_the_same_fit_only(tmp_path: Path) -> None:
+    def kept(count: int = 4, seed: int = 0, solver: str = "least_squares", **changed: object) -> int:
+        problem = Problem(**{"stack": LINE, "data": line_data(), "transport": line} | changed)
+        path = tmp_path / "starts"
+        path.write_bytes(written)
+        with StartsFile(path, problem, start_points(problem, count, seed), solver) as file:
+            return len(file.ends)
+
+    fit(LINE, line_data(), transport=line, starts=4, checkpoint=tmp_path / "starts")
+    written = (tmp_path / "starts").read_bytes()
+    assert kept() == 4
+    assert kept(count=5) == 0
+    assert kept(seed=1) == 0
+    assert kept(solver="bounded") == 0
+    assert kept(data=line_data(seed=1)) == 0
+    assert kept(noise=Noise(relative=0.01)) == 0
+    assert kept(noise=Noise(tails="student")) == 0
+    assert kept(objective="cosine_l2") == 0
+    assert kept(scale=1.01) == 0
+    assert kept(stack={**LINE, "b": LINE["b"].start}) == 0
+    assert kept(transport=lambda stack, wi, wo: 2.0 * line(stack, wi, wo)) == 0
+
+
+def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
+    save_fit(coat_fit, tmp_path / "result")
+    path = tmp_path / "result" / "chain.h5"
+    FileChain(path, 16, 2, _identity(coat_fit.problem, 16, 0)).close()
+    assert load_posterior(tmp_path / "result") is None
+    with pytest.raises(ValueError, match="no steps yet"):
+        load(coat_fit, path)
+
+
+def test_a_chain_that_begins_again_is_not_allowed_what_the_last_one_was(coat_fit: Fit, tmp_path: Path) -> None:
+    save_fit(coat_fit, tmp_path / "result")
+    options = {"walkers": 16, "path": tmp_path / "result" / "chain.h5"}
+    save_posterior(sample(coat_fit, max_steps=200, allow_short=True, **options), tmp_path / "result")
+    assert load_posterior(tmp_path / "result").allow_short
+    sample(coat_fit, max_steps=100, resume=False, **options)
+    assert not load_posterior(tmp_path / "result").allow_short
+
+
+def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:
+    """By the next one that writes: half of a result or of a chain goes, and a result that was aside comes back."""
+    directory = tmp_path / "result"
+    save_fit(coat_fit, directory)
+    before = contents(directory)
+    directory.rename(tmp_path / ".result.layerjax-old")
+    (tmp_path / ".result.layerjax-new").mkdir()
+    (tmp_path / ".result.lock").write_text("1\n")
+    with pytest.raises(ValueError, match="holds a result already"):
+        save_fit(coat_fit, directory)
+    assert contents(directory) == before
+    (directory / ".chain.h5.abcd1234").write_bytes(b"half")
+    FileChain(directory / "chain.h5", 16, 2, {}).close()
+    assert set(contents(directory)) == {*before, str(directory / "chain.h5")}
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+    with reserved(directory, force=True), pytest.raises(ValueError, match="in use"):
+        save_fit(coat_fit, directory, force=True)
+
+
+def test_a_lock_is_free_again_after_its_process(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    script = (
+        f"import os; from pathlib import Path; from fits._files import locked\n"
+        f"with locked(Path({str(path)!r}), 'it'): os._exit(9)"
+    )
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=False)
+    assert path.exists()
+    with locked(path, "it"):
+        assert path.read_text() == f"{os.getpid()}\n"
+        with pytest.raises(ValueError, match=rf"it is in use by another process \({os.getpid()}\)"), locked(path, "it"):
+            pass
+    assert not path.exists()

@@ -1,0 +1,109 @@
+"""Choosing a reader, and FRED tables."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fits.data.formats import FORMATS, read
+from fits.data.geometry import direction, slices
+from tests.helpers.places import COATINGS as DATA
+
+
+def _file(tmp_path: Path, text: str | bytes, name: str = "table.txt") -> Path:
+    path = tmp_path / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "format"),
+    [
+        ("AnoBlackNiTEonSteel.bsdf", "zemax"),
+        ("AnoBlackNiTEonSteel.txt", "fred"),
+        ("aeroglaze_650nm_inplane.csv", "csv"),
+    ],
+)
+def test_content_decides_and_not_the_name(tmp_path, name, format):
+    disguised = _file(tmp_path, (DATA / name).read_bytes(), "data.xyz")
+    assert read(disguised).source.format == read(DATA / name).source.format == format
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        (b"tensor_file\0\x01\x00", "this is an RGL tensor file"),
+        (b"<?xml version='1.0'?>", "this is an XML file"),
+        (b"\x01\x02\x00\x03rest", "unknown binary file, starts with 01 02 00 03"),
+        (b"BSDF 2.0 of something\n1 2 3\n", "unknown format, the first line is 'BSDF 2.0 of something'"),
+    ],
+)
+def test_unknown_bsdf_files_say_what_was_seen(tmp_path, head, message):
+    with pytest.raises(ValueError, match=message):
+        read(_file(tmp_path, head, "sample.bsdf"))
+
+
+def test_bad_arguments(tmp_path):
+    path = _file(tmp_path, "theta_i,theta_o,brdf\n10,20,0.5\n")
+    with pytest.raises(ValueError, match=f"format is 'xls', must be one of {', '.join(FORMATS)}"):
+        read(path, format="xls")
+    with pytest.raises(ValueError, match="quantity is 'f', must be one of"):
+        read(path, quantity="f")
+    with pytest.raises(ValueError, match="geometry and lookup apply to MERL files only"):
+        read(path, geometry=slices())
+    with pytest.raises(ValueError, match="no such file"):
+        read(tmp_path / "nothing.csv")
+    with pytest.raises(ValueError, match="starts with 'type bsdf_data'"):
+        read(path, format="fred")
+    with pytest.raises(ValueError, match="unknown keyword"):
+        read(path, format="zemax")
+
+
+def test_fred_file_is_the_csv_plus_the_laboratory_floor():
+    """The laboratory shifted its readings by one constant before it wrote this file: f cos theta_o differs by that."""
+    fred, csv = read(DATA / "AnoBlackNiTEonSteel.txt"), read(DATA / "nite_on_blasted_steel1008_650nm_hemisphere.csv")
+    there = {
+        (*np.round(wi, 6), *np.round(wo, 6)): f for wi, wo, f in zip(csv.wi, csv.wo, csv.values[:, 0], strict=True)
+    }
+    pairs = [
+        (f, there[key], wo[2])
+        for wi, wo, f in zip(fred.wi, fred.wo, fred.values[:, 0], strict=True)
+        if (key := (*np.round(wi, 6), *np.round(wo, 6))) in there
+    ]
+    ours, theirs, cosine = np.array(pairs).T
+    assert len(pairs) > 0.95 * len(fred)
+    # at the normal the CSV averages the readings of all azimuths, the FRED file those of one
+    tilted = cosine < 0.9999
+    ours, theirs, cosine = ours[tilted], theirs[tilted], cosine[tilted]
+    floor = np.median((ours - theirs) * cosine)
+    assert 7.5e-5 < floor < 7.6e-5
+    rounding = 5e-7 + 5e-6 * theirs + 2e-8  # six decimals here, six digits there, and the floor as found
+    assert (abs(ours - theirs - floor / cosine) <= rounding).all()
+
+
+def test_fred_by_hand(tmp_path):
+    text = "type bsdf_data\nformat angles=deg bsdf=value scale=2\n15 0\n-30 0 0.1\n30 90 0.2\n0 0\n10 0 0.3\n"
+    data = read(_file(tmp_path, text))
+    np.testing.assert_allclose(data.values[:, 0], [0.2, 0.4, 0.6])
+    np.testing.assert_allclose(data.theta_i, [15, 15, 0])
+    np.testing.assert_allclose(data.wo[:2], [direction(30, 180), direction(30, 90)], atol=1e-15)
+    np.testing.assert_allclose(data.phi_i[:2], 180)  # the file gives the mirror direction
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("type bsdf_data\n", "must be followed by a line 'format"),
+        ("type bsdf_data\nformat angles=sin\n", "line 2: 'angles=sin' is not supported"),
+        ("type bsdf_data\nformat bsdf=log\n", "line 2: 'bsdf=log' is not supported"),
+        ("type bsdf_data\nformat scale=x\n", "line 2, column 'scale': 'x' is not a number"),
+        ("type bsdf_data\nformat scale=1\n", "no samples"),
+        ("type bsdf_data\nformat scale=1\n1 2 3\n", "line 3: a scatter direction before any specular"),
+        ("type bsdf_data\nformat scale=1\n1 2\n3 4 5 6\n", "line 4: 4 numbers, must be 2"),
+        ("type bsdf_data\nformat scale=1\n1 2\n3 4 x\n", "line 4, column 'bsdf': 'x' is not a number"),
+        ("type bsdf_data\nformat scale=1\n1 2\n99 4 1\n", "line 4, column 'theta_scat': 99 is not allowed"),
+    ],
+)
+def test_bad_fred(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        read(_file(tmp_path, text))

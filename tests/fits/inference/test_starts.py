@@ -1,0 +1,96 @@
+"""The lowest end of all starts is the fit, however many steps it took; no stack ends above what it contains."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.data.formats import read
+from fits.inference import starts as starts_module
+from fits.inference.bounded import cost_and_gradient
+from fits.inference.fit_result import ENDED
+from fits.inference.optimise import fit
+from fits.inference.starts import WORTH
+from fits.problem.problem import Problem
+from fits.problem.stack_file import read_problem
+from tests.fits.inference.test_optimise import LOBE_STACK, noisy_lobe
+from tests.helpers.models import LOBE, directions, lobe, measured
+from tests.helpers.places import EXAMPLES
+
+COATINGS = EXAMPLES / "arizona_black_coatings"
+
+# outer stack, the stack it contains, how the parameters of that one are called in it
+NESTED = (
+    ("hazy_coat_over_diffuse", "flake_coat_over_diffuse", {"layers[0]": "layers[1]"}),
+    ("flake_coat_over_vmf_diffuse", "flake_coat_over_diffuse", {}),
+    ("flake_coat_over_conductor", "rough_conductor", {}),
+)
+STEEL = "nite_on_blasted_steel1008_650nm_inplane.csv"
+
+
+def read_incidences(name, degrees):
+    data = read(COATINGS / name)
+    if degrees is None:
+        return data
+    found = np.degrees(np.arccos(data.wi[:, 2]))
+    return data.where(np.any(np.abs(found[:, None] - degrees) < 1.0, axis=1), "other incidences are left out")
+
+
+def fitted(name, data, count):
+    given = read_problem(EXAMPLES / f"{name}.toml")
+    options = {"transport": given.transport, "noise": given.noise, "scale": given.scale}
+    return fit(given.stack, data, starts=count, **options)
+
+
+def cost_at(problem: Problem, values):
+    """Of the stack with these values, and everything else at the end of its range that is nearest to nothing."""
+    vector = np.array([values.get(name, low) for name, low in zip(problem.names, problem.low, strict=True)])
+    return float(problem.call(cost_and_gradient, problem.model.box.to_unit(jnp.asarray(vector)))[0])
+
+
+@pytest.mark.parametrize(
+    ("pair", "name", "degrees", "count"),
+    [
+        (NESTED[0], STEEL, (10.0, 50.0), 8),
+        *(
+            pytest.param(pair, path.name, degrees, 32, marks=pytest.mark.slow)
+            for pair in NESTED
+            for path in sorted(COATINGS.glob("*.csv"))
+            for degrees in ((10.0, 50.0), None)
+        ),
+    ],
+)
+def test_a_stack_never_ends_above_what_it_contains(pair, name, degrees, count):
+    outer, inner, renamed = pair
+    data = read_incidences(name, degrees)
+    whole, part = fitted(outer, data, count), fitted(inner, data, count)
+    values = dict(part.values)
+    for old, new in renamed.items():
+        values = {parameter.replace(old, new): value for parameter, value in values.items()}
+    # to what a start that goes on is worth
+    assert whole.minima[0].cost <= cost_at(whole.problem, values) + WORTH
+
+
+def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
+    """A few steps, and no further round: none has converged, all are counted, and the lowest is told."""
+    monkeypatch.setattr(starts_module, "MOST_STEPS", 4)
+    monkeypatch.setattr(starts_module, "MOST_ROUNDS", 1)
+    calls = []
+    # a stack of its own, so that the program is compiled with this number of steps
+    exact = lobe(LOBE, directions(200, 1), directions(200, 2))
+    data = measured(exact, 0.01 * exact)
+    result = fit(LOBE_STACK, data, transport=lambda *a: lobe(*a), starts=6, progress=lambda *a: calls.append(a))
+    seen = min(float(call[3].split()[-1]) for call in calls)
+    assert result.minima[0].cost <= seen * (1 + 1e-5)
+    assert sum(result.ended.values()) == 6
+    assert set(result.ended) <= set(ENDED)
+
+
+def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
+    """Two steps a round, and as many rounds as it takes: the same minimum."""
+    monkeypatch.setattr(starts_module, "MOST_STEPS", 2)
+    monkeypatch.setattr(starts_module, "MOST_ROUNDS", 200)
+    slowly = fit(LOBE_STACK, noisy_lobe(0), transport=lambda *a: lobe(*a), starts=1)
+    monkeypatch.undo()
+    at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
+    assert slowly.converged
+    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)

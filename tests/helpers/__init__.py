@@ -1,0 +1,1 @@
+"""What tests share: cases with known answers, models, walks and checks. Nothing is imported from a test file."""
