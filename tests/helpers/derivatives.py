@@ -103,7 +103,7 @@ def points_of(stack, fixed=None):
             values = {low, high, inside, *beside, *(number for number in (0.0, 1.0) if low < number < high)}
             for value in sorted(values):
                 sides = (-1.0,) if value == high else (1.0,) if value == low else (1.0, -1.0)
-                kinked = value in beside and value != inside
+                kinked = value in beside and (value == 1.0 or value != inside)
                 end = (key, value) in UNBOUNDED
                 found.append(Point(path, place, value, _length(field, value), sides, kinked, end))
         elif path != fixed:  # an axis
