@@ -1,6 +1,8 @@
 """Colour channels: kept as separate arrays inside, stacked once on the way out."""
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
+from functools import reduce
 
 import jax.numpy as jnp
 from jax import Array
@@ -22,6 +24,30 @@ def pick(values: Sequence[Array], channel: int) -> Array:
 def count(*values: Sequence[Array]) -> int:
     """Number of channels that the values need together."""
     return max((len(value) for value in values), default=1)
+
+
+def each(function: Callable[..., Array], *values: Sequence[Array]) -> Channels:
+    """The function of the values of each channel; computed once where every value serves all channels."""
+    return tuple(function(*(pick(value, c) for value in values)) for c in range(max(1, count(*values))))
+
+
+def times(*factors: Sequence[Array]) -> Channels:
+    """Product, channel by channel."""
+    return each(lambda *values: reduce(operator.mul, values), *factors)
+
+
+def total(parts: Sequence[Sequence[Array]], zero: Array | None = None) -> Channels:
+    """Sum, channel by channel; `zero` if there is nothing to add."""
+    if not parts and zero is not None:
+        return (zero,)
+    return each(lambda *values: reduce(operator.add, values), *parts)
+
+
+def select(chosen: Array, values: Sequence[Array], others: Sequence[Array] | None = None) -> Channels:
+    """`values` where chosen, else `others` (0 without them)."""
+    if others is None:
+        return tuple(jnp.where(chosen, value, 0.0) for value in values)
+    return each(lambda value, other: jnp.where(chosen, value, other), values, others)
 
 
 def mean(values: Sequence[Array]) -> Array:

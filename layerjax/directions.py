@@ -20,7 +20,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from layerjax._numerics import safe_sqrt
+from layerjax._numerics import horizon, safe_sqrt
 from layerjax._parameters import floating
 
 Vector = tuple[Array, Array, Array]
@@ -109,6 +109,19 @@ def horizontal(a: Vector) -> Vector:
     return jnp.where(leans, a[0] * inverse, 1.0), jnp.where(leans, a[1] * inverse, 0.0), jnp.zeros_like(squared)
 
 
+def is_above(w: Vector) -> Array:
+    """Whether w is above the horizon (the tangent plane is not)."""
+    return w[2] > horizon(w[2].dtype)
+
+
+def sanitised(w: Vector, valid: Array | None = None) -> Vector:
+    """w, with an interior stand-in for its cosine where it is not valid (not above the horizon, if not said).
+
+    What is computed of the stand-in is finite, with finite derivatives, and is to be thrown away.
+    """
+    return w[0], w[1], jnp.where(is_above(w) if valid is None else valid, w[2], 0.5)
+
+
 def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vector, Array]:
     """Half vector h of wi and wo, and the cosine |wi . h|.
 
@@ -138,6 +151,14 @@ def reflect(w: Vector, m: Vector) -> Vector:
     return (2 * cosine * m[0] - w[0], 2 * cosine * m[1] - w[1], 2 * cosine * m[2] - w[2])
 
 
+def squared_cosine_of_refraction(cosine: Array, ior: Array) -> Array:
+    """Squared cosine of refraction by Snell's law, below 0 under total reflection; exactly cosine^2 where ior is 1.
+
+    ior: index on the far side over index on the side of incidence.
+    """
+    return ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
+
+
 def refract(w: Vector, m: Vector, ior: Array) -> tuple[Vector, Array]:
     """Direction that w refracts into at a facet with unit normal m, and whether it exists.
 
@@ -146,7 +167,7 @@ def refract(w: Vector, m: Vector, ior: Array) -> tuple[Vector, Array]:
     (it is finite, with finite gradient).
     """
     cosine = dot(w, m)
-    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)  # cosine of refraction, squared
+    squared = squared_cosine_of_refraction(cosine, ior)
     exists = squared > 0
     refracted = jnp.sqrt(jnp.where(exists, squared, 1.0))
     along = cosine / ior - jnp.sign(cosine) * refracted

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import at_least, safe_div, safe_sqrt
+from layerjax.directions import squared_cosine_of_refraction
 
 
 def schlick(cosine: Array, f0: Array | float) -> Array:
@@ -24,7 +25,7 @@ def dielectric(cosine: Array, ior: Array) -> Array:
     The two amplitudes are formed without a difference of squares, so that ior = 1 gives exactly 0 at every angle.
     Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it).
     """
-    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)  # exact at ior = 1
+    squared = squared_cosine_of_refraction(cosine, ior)
     transmits = squared > 0
     refracted = jnp.sqrt(jnp.where(transmits, squared, 0.25))
     c = jnp.where(transmits, cosine, 0.5)

@@ -10,7 +10,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._parameters import Parameter, parameter
-from layerjax.channels import count, per_channel, pick
+from layerjax.channels import each, per_channel
 from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
 from layerjax.normals import facets
 from layerjax.normals.facets import Distribution, check_facets, facet_density
@@ -46,7 +46,7 @@ class Conductor(Surface):
         h, cosine = half_vector(wi, wo, same_side=True)
         lobe = mirror_lobe(h, wi, wo, self.alpha, self.distribution)
         ior, k = per_channel(self.ior), per_channel(self.k)
-        return tuple(lobe * fresnel.conductor(cosine, pick(ior, c), pick(k, c)) for c in range(count(ior, k)))
+        return each(lambda ior, k: lobe * fresnel.conductor(cosine, ior, k), ior, k)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         return reflect(wi, facets.sample(wi, self.alpha, u1, u2, self.distribution))

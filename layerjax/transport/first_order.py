@@ -14,8 +14,8 @@ from jax import Array
 
 from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
-from layerjax.channels import Channels, count, pick
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.channels import Channels, total
+from layerjax.directions import Vector, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import Distribution, facet_density, rule, sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
@@ -100,15 +100,14 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     if side != "reflection" and state.crossing is not None:
         parts.append(_refracted(state, state.crossing, wi, wo))
     zero = jnp.zeros_like(wi[2] * wo[2])
-    return tuple(sum((pick(part, c) for part in parts), zero) for c in range(max(1, count(*parts))))
+    return total(parts, zero)
 
 
 def caught(state: FirstOrder, w: Vector) -> Channels | None:
     """Share of light along w that meets an event at all, per channel; None: all of it. See `share_met`."""
     if state.layered or state.opaque:
         return None
-    edge = horizon(w[2].dtype)
-    return share_met(state.upper.media, (w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)))
+    return share_met(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
 
 
 def share_met(media: Sequence[Medium], w: Vector) -> Channels:
@@ -117,9 +116,8 @@ def share_met(media: Sequence[Medium], w: Vector) -> Channels:
     In media of thickness 0 it is what that is in proportion to: quantities that vanish with it are interpolated as
     quotients by it, and keep their derivatives.
     """
-    depths = optical_depths(media, w)
-    totals = [sum((pick(d, c) for d in depths), jnp.zeros_like(w[2])) for c in range(max(1, count(*depths)))]
-    return tuple(jnp.where(total > 0, one_minus_exp(total), 1.0 / jnp.abs(w[2])) for total in totals)
+    depths = total(optical_depths(media, w), jnp.zeros_like(w[2]))
+    return tuple(jnp.where(depth > 0, one_minus_exp(depth), 1.0 / jnp.abs(w[2])) for depth in depths)
 
 
 def mirror(w: Vector) -> Vector:
@@ -133,16 +131,12 @@ def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channel
     over, under = select(downward, wi, wo), select(downward, wo, wi)
     edge = horizon(wi[2].dtype)
     valid = (over[2] > edge) & (under[2] < -edge)
-    over = (over[0], over[1], jnp.where(valid, over[2], 0.5))
+    over = sanitised(over, valid)
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
     value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
     value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
     depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, mirror(under))
-    through = []
-    for c in range(max(1, count(*depths))):
-        total = sum((pick(depth, c) for depth in depths), jnp.zeros_like(value))
-        through.append(jnp.where(valid, value * jnp.exp(-total), 0.0))
-    return tuple(through)
+    return tuple(jnp.where(valid, value * jnp.exp(-depth), 0.0) for depth in total(depths, jnp.zeros_like(value)))
 
 
 def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:

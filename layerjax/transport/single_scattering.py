@@ -11,19 +11,17 @@ asked for it is evaluated as (exp(-p) - exp(-q)) / (q - p), which is smooth at a
 """
 
 from collections.abc import Sequence
-from functools import reduce
 from itertools import accumulate
-from operator import add
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax import fresnel
+from layerjax import channels, fresnel
 from layerjax._numerics import absorb, at_least, decay_between, horizon, one_minus_exp, safe_div
-from layerjax.channels import Channels, count, largest, mean, per_channel, pick
-from layerjax.directions import Vector, half_vector, select
+from layerjax.channels import Channels, count, each, largest, mean, per_channel, pick, times, total
+from layerjax.directions import Vector, half_vector, is_above, sanitised, select
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths, simplify
@@ -63,7 +61,7 @@ class SingleScattering(Transport):
         return Media(tuple(media_of(slim)), slim.base)
 
     def evaluate(self, state: Media, wi: Vector, wo: Vector, side: Side) -> Channels:
-        return _total(list(layer_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
+        return total(list(layer_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
 
     def sample(self, state: Media, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return draw(choices(state, wi), wi, uniforms)
@@ -80,10 +78,10 @@ class SingleScattering(Transport):
             if state.base is None:
                 far.append(_integral(layer_lobes(state, spread, other_side[0], "all")[index], other_side))
         if state.base is not None:
-            upper = state.base.rule(_lifted(wi), nodes)
+            upper = state.base.rule(sanitised(wi), nodes)
             near.append(_integral(layer_lobes(state, spread, upper[0], "reflection")[BASE], upper))
         zero = jnp.zeros_like(wi[2])
-        return _total(near, zero), _total(far, zero)
+        return total(near, zero), total(far, zero)
 
 
 def _scattering(slab: Media) -> list[int]:
@@ -98,12 +96,12 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
         return {}
     valid = answered(wi, wo, side, opaque)
     if opaque or side == "reflection":
-        lobes = _from_above(slab, _lifted(wi), _lifted(wo))
+        lobes = _from_above(slab, sanitised(wi), sanitised(wo))
     else:
         edge = horizon(wi[2].dtype)
-        inside_i, inside_o = ((w[0], w[1], jnp.where(jnp.abs(w[2]) > edge, w[2], 0.5)) for w in (wi, wo))
+        inside_i, inside_o = (sanitised(w, jnp.abs(w[2]) > edge) for w in (wi, wo))
         lobes = _from_any_side(slab, inside_i, inside_o, side)
-    return {k: tuple(jnp.where(valid, value, 0.0) for value in lobe) for k, lobe in lobes.items()}
+    return {k: channels.select(valid, lobe) for k, lobe in lobes.items()}
 
 
 def answered(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
@@ -131,12 +129,12 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if k in scattering:
             lost = tuple(share / weight for _, share in shares)
-            lobes[k] = _times(_collision(medium, wi, wo, half), lost if through is None else _times(through, lost))
+            lobes[k] = times(_collision(medium, wi, wo, half), lost if through is None else times(through, lost))
         if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
-            through = transmitted if through is None else _times(through, transmitted)
+            through = transmitted if through is None else times(through, transmitted)
     if slab.base is not None and through is not None:
-        lobes[BASE] = _times(through, slab.base.evaluate(wi, wo))
+        lobes[BASE] = times(through, slab.base.evaluate(wi, wo))
     return lobes
 
 
@@ -151,18 +149,19 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
     depths_i, depths_o = optical_depths(slab.media, wi), optical_depths(slab.media, wo)
     paths_i, paths_o = _paths(depths_i, wi), _paths(depths_o, wo)
     same_side = wi[2] * wo[2] > 0
+
+    def gain(thickness: Array, into: Array, out: Array, path_i: Array, path_o: Array) -> Array:
+        if side == "all":
+            into, out = jnp.where(same_side, 0.0, into), jnp.where(same_side, into + out, out)
+        if len(slab.media) > 1:
+            path = path_i + path_o
+            into, out = into + path, out + path
+        return thickness * inverse * decay_between(into, out)
+
     for k in scattering:
         medium = slab.media[k]
-        gains = []
-        for c in range(count(*paths_i, depths_i[k])):
-            into, out = pick(depths_i[k], c), pick(depths_o[k], c)
-            if side == "all":
-                into, out = jnp.where(same_side, 0.0, into), jnp.where(same_side, into + out, out)
-            if len(slab.media) > 1:
-                path = pick(paths_i[k], c) + pick(paths_o[k], c)
-                into, out = into + path, out + path
-            gains.append(pick(per_channel(medium.thickness), c) * inverse * decay_between(into, out))
-        lobes[k] = _times(_collision(medium, wi, wo, half), tuple(gains))
+        gains = each(gain, per_channel(medium.thickness), depths_i[k], depths_o[k], paths_i[k], paths_o[k])
+        lobes[k] = times(_collision(medium, wi, wo, half), gains)
     return lobes
 
 
@@ -191,7 +190,7 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
     if half is not None and medium.f0 is not None:
         levels = (0.0,) if is_known(medium.f0, 0.0) else per_channel(medium.f0)
         strength = tuple(strength[0] * fresnel.schlick(half[1], f0) for f0 in levels)
-    return strength if is_known(medium.albedo, 1.0) else _times(per_channel(medium.albedo), strength)
+    return strength if is_known(medium.albedo, 1.0) else times(per_channel(medium.albedo), strength)
 
 
 def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
@@ -201,13 +200,13 @@ def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """
     edge = horizon(wi[2].dtype)
     valid = wi[2] > edge if slab.base is not None else jnp.abs(wi[2]) > edge
-    wi = (wi[0], wi[1], jnp.where(valid, wi[2], 0.5))
+    wi = sanitised(wi, valid)
     depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
     found: list[tuple[Array, Any]] = []
     for k in _scattering(slab):
         medium = slab.media[k]
-        collides = mean(_times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
+        collides = mean(times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
         found.append((collides * survives, medium.phase))
     if slab.base is not None:
@@ -236,26 +235,11 @@ def density(choices: list[tuple[Array, Any]], wi: Vector, wo: Vector) -> Array:
     total = jnp.zeros_like(wi[2] * wo[2])
     for probability, lobe in choices:
         if isinstance(lobe, Surface):
-            above = jnp.where(wo[2] > horizon(wo[2].dtype), lobe.pdf(_lifted(wi), _lifted(wo)), 0.0)
+            above = jnp.where(is_above(wo), lobe.pdf(sanitised(wi), sanitised(wo)), 0.0)
             total = total + probability * above
         else:
             total = total + probability * lobe.pdf(wi, wo)
     return total
-
-
-def _lifted(w: Vector) -> Vector:
-    """w, with the cosine of one that is not above the horizon replaced by an interior stand-in."""
-    return (w[0], w[1], jnp.where(w[2] > horizon(w[2].dtype), w[2], 0.5))
-
-
-def _times(a: Channels, b: Channels) -> Channels:
-    return tuple(pick(a, c) * pick(b, c) for c in range(count(a, b)))
-
-
-def _total(lobes: Sequence[Channels], zero: Array) -> Channels:
-    if not lobes:
-        return (zero,)
-    return tuple(reduce(add, (pick(lobe, c) for lobe in lobes)) for c in range(count(*lobes)))
 
 
 def _integral(lobe: Channels, nodes: Nodes) -> Channels:

@@ -18,9 +18,17 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import horizon
-from layerjax.channels import Channels, count, mean, per_channel, pick
-from layerjax.directions import Factor, Vector, combine, half_vector, select
+from layerjax.channels import Channels, each, mean, per_channel, times, total
+from layerjax.directions import (
+    Factor,
+    Vector,
+    combine,
+    half_vector,
+    is_above,
+    sanitised,
+    select,
+    squared_cosine_of_refraction,
+)
 from layerjax.normals.sggx import ggx_density, sggx_area
 from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Conductor, Surface
@@ -59,11 +67,11 @@ class WeidlichWilkie(Transport):
         if side == "transmission":
             return (jnp.zeros_like(wi[2] * wo[2]),)
         lobes = _lobes(state, wi, wo)
-        return tuple(sum((pick(lobe, c) for lobe in lobes[1:]), pick(lobes[0], c)) for c in range(count(*lobes)))
+        return total(lobes)
 
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
-        wi = _lifted(wi)
+        wi = sanitised(wi)
         choices = _choices(state, wi)
         wo = choices[-1][1].sample(wi, u1, u2)
         edge = jnp.zeros_like(u)
@@ -74,11 +82,11 @@ class WeidlichWilkie(Transport):
         return wo
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
-        lifted_i, lifted_o = _lifted(wi), _lifted(wo)
+        lifted_i, lifted_o = sanitised(wi), sanitised(wo)
         density = jnp.zeros_like(wi[2] * wo[2])
         for probability, surface in _choices(state, lifted_i):
             density = density + probability * surface.pdf(lifted_i, lifted_o)
-        return jnp.where(_is_above(wi) & _is_above(wo), density, 0.0)
+        return jnp.where(is_above(wi) & is_above(wo), density, 0.0)
 
     def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
         """By quadrature with `nodes` points, every lobe with a rule of its own: 32 give 3e-4, relative.
@@ -87,12 +95,12 @@ class WeidlichWilkie(Transport):
         """
         spread: Vector = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
         energies: list[Channels] = []
-        for index, (_, surface) in enumerate(_choices(state, _lifted(wi))):
-            wo, weight = surface.rule(_lifted(wi), nodes)
+        for index, (_, surface) in enumerate(_choices(state, sanitised(wi))):
+            wo, weight = surface.rule(sanitised(wi), nodes)
             values = _lobes(state, spread, wo)[index]
             energies.append(tuple(jnp.sum(value * wo[2] * weight, axis=-1) for value in values))
         zero = jnp.zeros_like(wi[2])
-        return tuple(sum((pick(energy, c) for energy in energies), zero) for c in range(count(*energies))), (zero,)
+        return total(energies, zero), (zero,)
 
 
 def _only_absorbs(layer: Medium) -> bool:
@@ -102,8 +110,8 @@ def _only_absorbs(layer: Medium) -> bool:
 
 def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:
     """BRDF of every interface, from top to bottom, and of the base, each as seen from outside."""
-    valid = _is_above(wi) & _is_above(wo)
-    wi, wo = _lifted(wi), _lifted(wo)
+    valid = is_above(wi) & is_above(wo)
+    wi, wo = sanitised(wi), sanitised(wo)
     h, cosine = half_vector(wi, wo, same_side=True)
     lobes: list[Channels] = []
     above: Factor = 1.0
@@ -111,18 +119,18 @@ def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:
     for layer in stack.layers:
         if isinstance(layer, Medium):
             into, out = (optical_depths([layer], w)[0] for w in (wi, wo))
-            through = _times(through, tuple(jnp.exp(-(a + b)) for a, b in zip(into, out, strict=True)))  # a
+            through = times(through, tuple(jnp.exp(-(a + b)) for a, b in zip(into, out, strict=True)))  # a
             continue
         ior = layer.ior / above
         level = fresnel.dielectric(cosine, ior)
         lobe, masking = _facets(h, wi, wo, layer.alpha)
-        lobes.append(_times(through, (level * lobe,)))
+        lobes.append(times(through, (level * lobe,)))
         refracted = 1.0 - level  # T12, T21
         wi, wo, cosine, inside = _refracted(wi, wo, h, cosine, ior)
-        through = _times(through, (jnp.where(inside, refracted * (1.0 - masking + refracted * masking), 0.0),))
+        through = times(through, (jnp.where(inside, refracted * (1.0 - masking + refracted * masking), 0.0),))
         above = layer.ior
     assert stack.base is not None
-    lobes.append(_times(through, _reflected(stack.base, wi, wo, h, cosine, above)))
+    lobes.append(times(through, _reflected(stack.base, wi, wo, h, cosine, above)))
     return lobes
 
 
@@ -137,7 +145,7 @@ def _reflected(base: Surface, wi: Vector, wo: Vector, h: Vector, cosine: Array, 
 def _conductor(base: Conductor, cosine: Array, above: Factor) -> Channels:
     """Reflectance of a conductor whose index is counted from what surrounds the stack, under a medium of that index."""
     ior, k = per_channel(base.ior), per_channel(base.k)
-    return tuple(fresnel.conductor(cosine, pick(ior, c) / above, pick(k, c) / above) for c in range(count(ior, k)))
+    return each(lambda ior, k: fresnel.conductor(cosine, ior / above, k / above), ior, k)
 
 
 def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Array]:
@@ -148,12 +156,12 @@ def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Arr
 
 def _refracted(wi: Vector, wo: Vector, h: Vector, cosine: Array, ior: Array) -> tuple[Vector, Vector, Array, Array]:
     """wi' and wo', both upward, their cosine with h, and whether light comes in and leaves along them at all."""
-    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
+    squared = squared_cosine_of_refraction(cosine, ior)
     exists = squared > 0
     turned = jnp.sqrt(jnp.where(exists, squared, 0.25))
     along = turned - cosine / ior
     wi, wo = combine(1.0 / ior, wi, along, h), combine(1.0 / ior, wo, along, h)
-    return _lifted(wi), _lifted(wo), turned, exists & _is_above(wi) & _is_above(wo)
+    return sanitised(wi), sanitised(wo), turned, exists & is_above(wi) & is_above(wo)
 
 
 def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
@@ -183,16 +191,3 @@ def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
     energies.append((reached * level, base))
     total = sum((energy + LEAST_SHARE for energy, _ in energies), jnp.zeros_like(wi[2]))
     return [((energy + LEAST_SHARE) / total, surface) for energy, surface in energies]
-
-
-def _is_above(w: Vector) -> Array:
-    return w[2] > horizon(w[2].dtype)
-
-
-def _lifted(w: Vector) -> Vector:
-    """w, with the cosine of one that is not above the horizon replaced by an interior stand-in."""
-    return (w[0], w[1], jnp.where(_is_above(w), w[2], 0.5))
-
-
-def _times(a: Channels, b: Channels) -> Channels:
-    return tuple(pick(a, c) * pick(b, c) for c in range(count(a, b)))

@@ -16,7 +16,7 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._numerics import at_least, safe_div, safe_sqrt
 from layerjax.channels import per_channel, pick
-from layerjax.directions import Vector, dot, normalize, reflect, refract
+from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.normals import facets
 from layerjax.quadrature import gauss_legendre
@@ -194,7 +194,7 @@ def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -
 def _masking(wo: Vector, normals: Normals) -> Array:
     """Smith masking of the outgoing direction, 0 below the horizon."""
     above = wo[2] > 0
-    return jnp.where(above, facets.masking((wo[0], wo[1], jnp.where(above, wo[2], 0.5)), *normals), 0.0)
+    return jnp.where(above, facets.masking(sanitised(wo, above), *normals), 0.0)
 
 
 def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int) -> Array:

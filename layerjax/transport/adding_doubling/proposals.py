@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax.directions import Vector, select
+from layerjax.directions import Vector, sanitised, select
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.first_order import Face, FirstOrder, mirror
@@ -51,9 +51,9 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
         up, out = select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
         face = state.crossing
         facets_of = (_ratio(face, above), face.alpha, face.distribution)
-        up, out = _upright(up), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
-        reflected = interface_reflection(up, _upright(out), *facets_of)
-        passed = interface_transmission(up, mirror(_upright(mirror(out))), *facets_of)
+        up, out = sanitised(up, up[2] > 0), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
+        reflected = interface_reflection(up, sanitised(out, out[2] > 0), *facets_of)
+        passed = interface_transmission(up, mirror(sanitised(mirror(out), out[2] < 0)), *facets_of)
         density = density + facets * interface_pdf(jnp.where(same, reflected, passed), up, out, *facets_of)
     return density
 
@@ -72,7 +72,3 @@ def _nowhere_unless(leaves: Array, w: Vector) -> Vector:
 
 def _ratio(face: Face, above: Array) -> Array:
     return jnp.where(above, face.ior, 1.0 / face.ior)
-
-
-def _upright(w: Vector) -> Vector:
-    return (w[0], w[1], jnp.where(w[2] > 0, w[2], 0.5))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.channels import Channels, count, pick
+from layerjax.channels import Channels, times, total
 from layerjax.directions import Vector, direction, split
 from layerjax.stack import Stack, simplify
 from layerjax.transport.adding_doubling.interfaces import Microfacets
@@ -123,7 +123,7 @@ class AddingDoubling(Transport):
             parts.append(evaluate_first(state.first, wi, wo, side))
         if state.tables is not None:
             parts.append(read_rest(state.tables, wi, wo, side))
-        return _summed(parts, jnp.zeros_like(wi[2] * wo[2]))
+        return total(parts, jnp.zeros_like(wi[2] * wo[2]))
 
     def sample(self, state: Solved, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return propose(state.first, wi, uniforms)
@@ -139,7 +139,7 @@ class AddingDoubling(Transport):
         if state.tables is not None and self.orders == "all":
             met = caught(state.first, wi)
             near, far = read_energy(state.tables, wi)
-            return (near, far) if met is None else (_times(near, met), _times(far, met))
+            return (near, far) if met is None else (times(near, met), times(far, met))
         if state.first.layered:
             raise ValueError(
                 f'AddingDoubling.orders: {self.orders!r} gives no albedo where there are interfaces, "all" does'
@@ -152,7 +152,7 @@ class AddingDoubling(Transport):
             return (zero,), (zero,)
         whole = dataclasses.replace(self, orders="all").albedo(state, wi, nodes)
         less = [tuple(-value for value in part) for part in first]
-        near, far = (_summed([w, part], zero) for w, part in zip(whole, less, strict=True))
+        near, far = (total([w, part], zero) for w, part in zip(whole, less, strict=True))
         return near, far
 
     def _solved(self, slim: Stack) -> Solved:
@@ -208,11 +208,3 @@ def _probes(opaque: bool) -> tuple[Vector, Vector]:
     polar_o = jnp.concatenate([jnp.abs(side - polar) for side in sides])
     in_, out, phi = (array.ravel() for array in jnp.meshgrid(polar_o, polar_o, azimuth, indexing="ij"))
     return split(direction(in_, jnp.zeros_like(in_))), split(direction(out, phi))
-
-
-def _times(a: Channels, b: Channels) -> Channels:
-    return tuple(pick(a, c) * pick(b, c) for c in range(count(a, b)))
-
-
-def _summed(parts: list[Channels], zero: Array) -> Channels:
-    return tuple(sum((pick(part, c) for part in parts), zero) for c in range(max(1, count(*parts))))

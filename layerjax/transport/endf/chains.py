@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import at_least, at_most, horizon, safe_sqrt
-from layerjax.channels import Channels, count, pick
+from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax.channels import Channels, each, times, total
 from layerjax.directions import Vector, half_vector
 from layerjax.normals import vmf
 from layerjax.stack import Medium, optical_depths
@@ -67,8 +67,7 @@ class Mirror(eqx.Module):
         """Fresnel reflectance, one array a channel."""
         if self.k is None:
             return (fresnel.dielectric(cosine, self.ior[0]),)
-        channels = range(count(self.ior, self.k))
-        return tuple(fresnel.conductor(cosine, pick(self.ior, c), pick(self.k, c)) for c in channels)
+        return each(lambda ior, k: fresnel.conductor(cosine, ior, k), self.ior, self.k)
 
 
 class Coat(eqx.Module):
@@ -191,13 +190,12 @@ def absorbed(coat: Coat, down: Vector, up: Vector, share: float = 1.0) -> Channe
     """
     if not coat.media:
         return (jnp.ones_like(down[2]),)
-    total: Channels = (jnp.zeros_like(down[2]),)
+    depths: list[Channels] = []
     for w in (down, up):
         if coat.turned is not None:
             w = (w[0], w[1], jnp.where(coat.turned, -w[2], w[2]))
-        for depth in optical_depths(coat.media, w):
-            total = tuple(pick(total, c) + pick(depth, c) for c in range(count(total, depth)))
-    return tuple(jnp.exp(-share * depth) for depth in total)
+        depths += optical_depths(coat.media, w)
+    return tuple(jnp.exp(-share * depth) for depth in total(depths))
 
 
 def visible(w: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
@@ -214,18 +212,3 @@ def masked(w: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
 def width(kappa: Array) -> Array:
     """The width alpha of normals of concentration kappa, at most 45."""
     return jnp.sqrt(2.0 / at_least(kappa, 1e-3))
-
-
-def is_above(w: Vector) -> Array:
-    """Whether w is above the horizon (the tangent plane is not)."""
-    return w[2] > horizon(w[2].dtype)
-
-
-def lifted(w: Vector) -> Vector:
-    """w, with the cosine of one that is not above the horizon replaced by an interior stand-in."""
-    return (w[0], w[1], jnp.where(is_above(w), w[2], 0.5))
-
-
-def times(a: Channels, b: Channels) -> Channels:
-    """Product, channel by channel."""
-    return tuple(pick(a, c) * pick(b, c) for c in range(count(a, b)))

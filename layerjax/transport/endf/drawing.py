@@ -12,10 +12,10 @@ from typing import Literal, NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax import fresnel
+from layerjax import channels, fresnel
 from layerjax._numerics import at_most, safe_sqrt
-from layerjax.channels import Channels, count, mean, pick
-from layerjax.directions import Vector, dot, half_vector, reflect, refract, select
+from layerjax.channels import Channels, mean, total
+from layerjax.directions import Vector, dot, half_vector, is_above, reflect, refract, sanitised, select
 from layerjax.normals import facets
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.lambertian import sample_cosine
@@ -28,8 +28,6 @@ from layerjax.transport.endf.chains import (
     chain_concentration,
     entered,
     inner_concentration,
-    is_above,
-    lifted,
     masked,
     reflections,
     visible,
@@ -97,7 +95,7 @@ def _shared(found: list[Proposal]) -> list[Proposal]:
 def draw(coat: Coat, options: Options, wi: Vector, uniforms: tuple[Array, Array, Array], opaque: bool) -> Vector:
     """Outgoing directions for wi above, from three uniform numbers each."""
     u, u1, u2 = uniforms
-    wi = lifted(wi)
+    wi = sanitised(wi)
     x, y, z = sample_cosine(u1, u2)
     by_cosine: Vector = (x, y, z if opaque else jnp.where(u < 1.0 - 0.5 * COSINE, z, -z))
     if _is_interface(coat):
@@ -132,7 +130,7 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
     leaves = is_above(out)
     if below:
         assert coat.top is not None
-        outer, escapes = _left(coat.top, lifted(out))
+        outer, escapes = _left(coat.top, sanitised(out))
         out, leaves = select(inside, outer, out), leaves & (~inside | (enters & escapes))
     return select(through, mirror(out), out), leaves
 
@@ -140,7 +138,7 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
 def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) -> Array:
     """Density of `draw` in solid angle, 1/sr, for wi above."""
     lit, up, down = is_above(wi), is_above(wo), is_above(mirror(wo))
-    wi, over = lifted(wi), lifted(select(down, mirror(wo), wo))
+    wi, over = sanitised(wi), sanitised(select(down, mirror(wo), wo))
     total = COSINE * (1.0 if opaque else 0.5) * over[2] / jnp.pi
     if _is_interface(coat):
         assert coat.top is not None
@@ -171,13 +169,13 @@ def _density(coat: Coat, lobe: Proposal, wi: Vector, wo: Vector) -> Array:
 def energies(coat: Coat, options: Options, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
     """Energy that leaves above and below, for one wi above: every lobe by a rule of its own."""
     lit = is_above(wi)
-    wi = lifted(wi)
+    wi = sanitised(wi)
     near: list[Channels] = [(jnp.zeros_like(wi[2]),)]
     far: list[Channels] = [(jnp.zeros_like(wi[2]),)]
     lobes = _proposals(coat, options, wi, opaque)
     if lobes:
         wo, weight = _rules(coat, lobes, wi, nodes)
-        weight, wo = jnp.where(is_above(wo), weight, 0.0), lifted(wo)
+        weight, wo = jnp.where(is_above(wo), weight, 0.0), sanitised(wo)
         split = sum(not lobe.through for lobe in lobes)
         above, below = ((wo[0][rows], wo[1][rows], wo[2][rows]) for rows in (slice(split), slice(split, None)))
         for j, values in enumerate(reflections(coat, options, wi, above)):
@@ -188,7 +186,7 @@ def energies(coat: Coat, options: Options, wi: Vector, nodes: int, opaque: bool)
     if _is_interface(coat):
         assert coat.top is not None
         far.append((_refracted_energy(coat.top, options, wi, nodes),))
-    return _summed(near, lit), _summed(far, lit)
+    return channels.select(lit, total(near)), channels.select(lit, total(far))
 
 
 def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
@@ -227,14 +225,9 @@ def _refracted_energy(top: Face, options: Options, wi: Vector, nodes: int) -> Ar
     cosine = dot(flat, m)
     wo, exists = refract(flat, m, top.ior)
     passes = exists & is_above(mirror(wo))
-    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(lifted(mirror(wo)), top.kappa, options.masking)
+    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(sanitised(mirror(wo)), top.kappa, options.masking)
     lit = visible(wi, top.kappa, options.masking) / visible(wi, top.kappa, "normal")  # as the weights have it
     return lit * jnp.sum(jnp.where(passes, weight * share, 0.0))
-
-
-def _summed(parts: list[Channels], lit: Array) -> Channels:
-    totals = (sum((pick(part, c) for part in parts[1:]), pick(parts[0], c)) for c in range(count(*parts)))
-    return tuple(jnp.where(lit, total, 0.0) for total in totals)
 
 
 def _is_interface(coat: Coat) -> bool:

@@ -11,7 +11,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._numerics import at_least
-from layerjax.channels import Channels
+from layerjax.channels import Channels, times
 from layerjax.directions import Vector, half_vector
 from layerjax.normals import vmf
 from layerjax.surfaces.microfacet import refraction_lobe
@@ -25,7 +25,6 @@ from layerjax.transport.endf.chains import (
     crossing,
     entered,
     masked,
-    times,
     visible,
     width,
 )

@@ -14,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.channels import Channels, count, per_channel, pick
-from layerjax.directions import Vector, select
+from layerjax import channels
+from layerjax.channels import Channels, per_channel, total
+from layerjax.directions import Vector, is_above, sanitised, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, simplify
 from layerjax.surfaces import Conductor
 from layerjax.transport.contract import Side, Transport
 from layerjax.transport.endf import drawing as drawing
-from layerjax.transport.endf.chains import Coat, Face, Form, Mirror, Options, is_above, lifted, reflections
+from layerjax.transport.endf.chains import Coat, Face, Form, Mirror, Options, reflections
 from layerjax.transport.endf.slab import transmissions
 from layerjax.transport.first_order import mirror
 
@@ -137,15 +138,15 @@ class ENDF(Transport):
             coat, wi, wo = _facing(state, wi, wo)
         lit, up, down = is_above(wi), is_above(wo), is_above(mirror(wo))
         # both kinds of lobe share what depends on how steep wo is, not on its side
-        wi, over = lifted(wi), lifted(wo if side == "reflection" else select(down, mirror(wo), wo))
+        wi, over = sanitised(wi), sanitised(wo if side == "reflection" else select(down, mirror(wo), wo))
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
             lobes = reflections(coat, self._options(), wi, over)
-            parts += [tuple(jnp.where(lit & up, value, 0.0) for value in lobe) for lobe in lobes]
+            parts += [channels.select(lit & up, lobe) for lobe in lobes]
         if side != "reflection" and state.lower is not None:
             lobes = transmissions(coat, self._options(), wi, over)
-            parts += [tuple(jnp.where(lit & down, value, 0.0) for value in lobe) for lobe in lobes]
-        return tuple(sum((pick(part, c) for part in parts[1:]), pick(parts[0], c)) for c in range(count(*parts)))
+            parts += [channels.select(lit & down, lobe) for lobe in lobes]
+        return total(parts)
 
     def sample(self, state: Sides, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         coat, up, _ = _facing(state, wi, wi)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import at_least, safe_sqrt
+from layerjax.directions import squared_cosine_of_refraction
 from layerjax.normals.vmf import concentration_of, convolved, resultant
 
 LEAST_VARIANCE = 1e-12
@@ -32,7 +33,7 @@ class Gains(NamedTuple):
 
 def refracted_cosine(cosine: Array, ior: Array) -> tuple[Array, Array]:
     """Cosine beyond a facet of relative index ior, and whether light passes there at all (else an interior number)."""
-    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
+    squared = squared_cosine_of_refraction(cosine, ior)
     passes = squared > 1e-18
     return jnp.sqrt(jnp.where(passes, squared, 0.25)), passes
 

@@ -16,7 +16,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._numerics import safe_sqrt
-from layerjax.channels import Channels, count, per_channel, pick
+from layerjax.channels import Channels, each, per_channel
 from layerjax.directions import Vector, add, dot, normalize, reflect, refract, scale, select
 from layerjax.normals.sggx import ggx_density, ggx_sample
 from layerjax.surfaces import Conductor
@@ -165,4 +165,4 @@ def _overturned(height: Array) -> Array:
 def _reflectance(base: Conductor, cosine: Array) -> Channels:
     ior, k = per_channel(base.ior), per_channel(base.k)
     cosine = jnp.minimum(cosine, 1.0)
-    return tuple(fresnel.conductor(cosine, pick(ior, c), pick(k, c)) for c in range(count(ior, k)))
+    return each(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)

@@ -15,7 +15,7 @@ from jax import Array
 
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
-from layerjax.directions import Vector, select
+from layerjax.directions import Vector, sanitised, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_seen
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import (
@@ -210,7 +210,7 @@ def _weight(value: Array, density: Array, base: Surface) -> Array:
 def _interface(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution) -> Array:
     """BSDF of an interface, of whichever kind the side of wo asks for."""
     above = wo[2] > 0
-    reflected = interface_reflection(wi, (wo[0], wo[1], jnp.where(above, wo[2], 0.5)), ior, alpha, distribution)
+    reflected = interface_reflection(wi, sanitised(wo, above), ior, alpha, distribution)
     refracted = interface_transmission(wi, (wo[0], wo[1], jnp.where(above, -0.5, wo[2])), ior, alpha, distribution)
     return jnp.where(above, reflected, refracted)
 

@@ -12,7 +12,7 @@ from jax import Array
 
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.directions import Vector, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import facet_density, sample
 from layerjax.stack import Interface, Stack, simplify
 from layerjax.surfaces.lambertian import sample_cosine
@@ -119,7 +119,7 @@ class RandomWalk(Transport):
     def sample(self, state: Stack, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         u, u1, u2 = uniforms
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local = _lifted((wi[0], wi[1], wi[2] * side))
+        local = sanitised((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
         cosine = sample_cosine(u1, u2)
         wo = select(u < near, cosine, (cosine[0], cosine[1], -cosine[2]))
@@ -131,7 +131,7 @@ class RandomWalk(Transport):
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
         side = jnp.where(wi[2] < 0, -1.0, 1.0)
-        local, towards = _lifted((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
+        local, towards = sanitised((wi[0], wi[1], wi[2] * side)), (wo[0], wo[1], wo[2] * side)
         near, far = _diffuse_shares(state)
         density = jnp.where(towards[2] > 0, near, far) * jnp.abs(towards[2]) / jnp.pi
         facets = _facets(state)
@@ -150,8 +150,3 @@ def _diffuse_shares(state: Stack) -> tuple[float, float]:
 
 def _facets(state: Stack) -> Interface | None:
     return next((layer for layer in state.layers if isinstance(layer, Interface)), None)
-
-
-def _lifted(w: Vector) -> Vector:
-    edge = horizon(w[2].dtype)
-    return w[0], w[1], jnp.where(w[2] > edge, w[2], 0.5)

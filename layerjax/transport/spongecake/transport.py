@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax.channels import Channels, count, pick
+from layerjax.channels import Channels, total
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of, simplify
 from layerjax.tables import load
@@ -87,7 +87,7 @@ class SpongeCake(Transport):
         values = SingleScattering().evaluate(state.first, wi, wo, side)
         if state.second is None or (state.opaque and side == "transmission"):
             return values
-        return _sum(values, evaluate_second(state.second, wi, wo, side, state.opaque))
+        return total([values, evaluate_second(state.second, wi, wo, side, state.opaque)])
 
     def sample(self, state: Mapped, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return draw(self._choices(state, wi), wi, uniforms)
@@ -100,7 +100,7 @@ class SpongeCake(Transport):
         if state.second is None:
             return first
         second = second_albedo(state.second, wi, nodes, state.opaque)
-        return _sum(first[0], second[0]), _sum(first[1], second[1])
+        return total([first[0], second[0]]), total([first[1], second[1]])
 
     def _choices(self, state: Mapped, wi: Vector) -> list[tuple[Array, Any]]:
         """Lobes to draw from, with their probabilities."""
@@ -131,7 +131,3 @@ def bends() -> Mapping[int, eqx.nn.MLP]:
 
 
 _second = eqx.filter_jit(second_lobe)
-
-
-def _sum(a: Channels, b: Channels) -> Channels:
-    return tuple(pick(a, c) + pick(b, c) for c in range(count(a, b)))

@@ -23,8 +23,8 @@ import numpy as np
 from jax import Array
 
 from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
-from layerjax.channels import Channels, per_channel, pick
-from layerjax.directions import Vector
+from layerjax.channels import Channels, per_channel, pick, select, times
+from layerjax.directions import Vector, sanitised
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
@@ -150,10 +150,8 @@ def diffuse_value(part: DiffuseBase, wi: Vector, wo: Vector) -> Channels:
     """BRDF of the light that has reached the base, 0 unless both directions are above."""
     edge = horizon(wi[2].dtype)
     valid = (wi[2] > edge) & (wo[2] > edge)
-    there, back = (_arriving(part, (w[0], w[1], jnp.where(valid, w[2], 0.5))) for w in (wi, wo))
-    level = per_channel(part.level)
-    count = max(len(there), len(level))
-    return tuple(jnp.where(valid, pick(there, c) * pick(back, c) * pick(level, c), 0.0) for c in range(count))
+    there, back = (_arriving(part, sanitised(w, valid)) for w in (wi, wo))
+    return select(valid, times(there, back, per_channel(part.level)))
 
 
 def diffuse_albedo(part: DiffuseBase, wi: Vector) -> Channels:

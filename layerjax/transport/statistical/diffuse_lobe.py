@@ -10,7 +10,7 @@ from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick
-from layerjax.directions import Vector
+from layerjax.directions import Vector, sanitised
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
 from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
@@ -69,8 +69,7 @@ def lobe_value(part: DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
     """BRDF of the lobe, 0 unless both directions are above."""
     edge = horizon(wi[2].dtype)
     valid = (wi[2] > edge) & (wo[2] > edge)
-    energies = lobe_albedo(part, (wi[0], wi[1], jnp.where(valid, wi[2], 0.5)))
-    seen = (wo[0], wo[1], jnp.where(valid, wo[2], 0.5))
+    energies, seen = lobe_albedo(part, sanitised(wi, valid)), sanitised(wo, valid)
     return tuple(
         jnp.where(valid, indirect_lobe(seen, alpha, energy), 0.0)
         for alpha, energy in zip(part.alpha, energies, strict=True)

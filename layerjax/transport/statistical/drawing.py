@@ -6,7 +6,7 @@ from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.directions import Vector, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import facet_density
 from layerjax.normals.sggx import ggx_sample
 from layerjax.surfaces import Surface
@@ -25,11 +25,6 @@ DiffusePart = DiffuseBase | DiffuseLobe | Surface
 def planar(w: Vector) -> Array:
     """Sine of the polar angle."""
     return safe_sqrt(w[0] * w[0] + w[1] * w[1])
-
-
-def lifted(w: Vector, valid: Array) -> Vector:
-    """w, with a stand-in for its cosine where it is not to be looked at."""
-    return (w[0], w[1], jnp.where(valid, w[2], 0.5))
 
 
 def take(row: Array, columns: tuple[int, int]) -> Channels:
@@ -69,7 +64,7 @@ def draw(
     """Outgoing directions for light above. entry, exit: indices before and behind over that of the folded medium."""
     u, u1, u2 = uniforms
     valid = wi[2] > horizon(wi[2].dtype)
-    wi = lifted(wi, valid)
+    wi = sanitised(wi, valid)
     shares = _probabilities(table, diffuse, wi)
     reflected, transmitted = widths(table, wi)
     alpha, passes, scatters = jnp.ones_like(u), jnp.zeros(u.shape, bool), jnp.ones(u.shape, bool)
@@ -95,11 +90,11 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
     """Density of `draw` in solid angle, 1/sr."""
     edge = horizon(wi[2].dtype)
     lit = wi[2] > edge
-    wi = lifted(wi, lit)
+    wi = sanitised(wi, lit)
     shares = _probabilities(table, diffuse, wi)
     reflected, transmitted = widths(table, wi)
     above = wo[2] > edge
-    up = lifted(wo, above)
+    up = sanitised(wo, above)
     h, _ = half_vector(wi, up, same_side=True)
     rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
     total = jnp.zeros_like(wi[2] * wo[2])
@@ -110,10 +105,10 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
     total = jnp.where(above, total, 0.0)
     if transmitted:
         below = wo[2] < -edge
-        under = lifted(mirror(wo), below)
+        under = sanitised(mirror(wo), below)
         a, b = folded(wi, entry), folded(under, exit)
         below = below & (a[2] > edge) & (b[2] > edge)
-        a, b = lifted(a, below), lifted(b, below)
+        a, b = sanitised(a, below), sanitised(b, below)
         h, _ = half_vector(a, b, same_side=True)
         stretch = exit * exit * under[2] / b[2]
         for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):

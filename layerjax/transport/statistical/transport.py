@@ -4,17 +4,16 @@ Each group of paths (reflected at the same layer, any number of turns above) is 
 follow from adding. Over a diffuse base the light that has reached it leaves as a product of two transmittances.
 """
 
-import operator
-from functools import reduce
 from typing import Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax import channels
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
-from layerjax.channels import Channels, count, pick
-from layerjax.directions import Vector, add, dot, half_vector, reflect, select
+from layerjax.channels import Channels
+from layerjax.directions import Vector, add, dot, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import facet_density
 from layerjax.normals.sggx import ggx_density, ggx_sample, sggx_area
 from layerjax.phase import SGGX
@@ -32,7 +31,6 @@ from layerjax.transport.statistical.drawing import (
     diffuse_energy,
     diffuse_part,
     draw,
-    lifted,
     planar,
     read_energies,
     take,
@@ -150,7 +148,7 @@ class Statistical(Transport):
                 parts += self._reflections(state.bottom, mirror(wi), mirror(wo))
         if side != "reflection" and state.bottom is not None:
             parts += self._transmissions(state, wi, wo)
-        return _summed(parts)
+        return channels.total(parts)
 
     def sample(self, state: Statistics, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(state.top, state.diffuse, wi, uniforms, 1.0 / state.reference, state.below / state.reference)
@@ -169,20 +167,16 @@ class Statistical(Transport):
     def albedo(self, state: Statistics, wi: Vector, nodes: int) -> Energies:
         """Forward: the energies of the lobes. Symmetric: by quadrature, 2 nodes^2 points a lobe."""
         above = wi[2] > horizon(wi[2].dtype)
-        near, far = self._energies(state, state.top, lifted(wi, above), nodes, upward=False)
+        near, far = self._energies(state, state.top, sanitised(wi, above), nodes, upward=False)
         if state.diffuse is not None:
-            near = _summed([near, diffuse_energy(state.diffuse, lifted(wi, above), nodes)])
+            near = channels.total([near, diffuse_energy(state.diffuse, sanitised(wi, above), nodes)])
         if state.bottom is None:
-            return tuple(jnp.where(above, e, 0.0) for e in near), (jnp.zeros_like(wi[2]),)
+            return channels.select(above, near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
-        other = self._energies(state, state.bottom, lifted(mirror(wi), below), nodes, upward=True)
+        other = self._energies(state, state.bottom, sanitised(mirror(wi), below), nodes, upward=True)
         sides = []
         for down, up in zip((near, far), other, strict=True):
-            sides.append(
-                tuple(
-                    jnp.where(above, pick(down, c), jnp.where(below, pick(up, c), 0.0)) for c in range(count(down, up))
-                )
-            )
+            sides.append(channels.select(above, down, channels.select(below, up)))
         return sides[0], sides[1]
 
     def _energies(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
@@ -196,7 +190,7 @@ class Statistical(Transport):
             return []
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        wi, wo = lifted(wi, valid), lifted(wo, valid)
+        wi, wo = sanitised(wi, valid), sanitised(wo, valid)
         h, cosine = half_vector(wi, wo, same_side=True)
         row = look_up(table.rows, *(_halves(wi, wo, cosine) if self.symmetric else (wi[2], planar(wi))))
         lobes = []
@@ -216,11 +210,11 @@ class Statistical(Transport):
         downward = wi[2] > 0
         over, under = select(downward, wi, wo), mirror(select(downward, wo, wi))
         valid = (over[2] > edge) & (under[2] > edge)
-        over, under = lifted(over, valid), lifted(under, valid)
+        over, under = sanitised(over, valid), sanitised(under, valid)
         ratio_over, ratio_under = 1.0 / state.reference, state.below / state.reference
         a, b = folded(over, ratio_over), folded(under, ratio_under)
         valid = valid & (a[2] > edge) & (b[2] > edge)
-        a, b = lifted(a, valid), lifted(b, valid)
+        a, b = sanitised(a, valid), sanitised(b, valid)
         h, cosine = half_vector(a, b, same_side=True)
         if self.symmetric:
             _, sine = _halves(a, b, cosine)
@@ -235,8 +229,8 @@ class Statistical(Transport):
         for above, below in zip(tables[0].transmitted, tables[1].transmitted, strict=True):
             assert above.alpha is not None
             assert below.alpha is not None
-            scales = _either(downward, take(rows[0], above.scale), take(rows[1], below.scale))
-            alphas = _either(downward, take(rows[0], above.alpha), take(rows[1], below.alpha))
+            scales = channels.select(downward, take(rows[0], above.scale), take(rows[1], below.scale))
+            alphas = channels.select(downward, take(rows[0], above.alpha), take(rows[1], below.alpha))
             shape = tuple(leaving * leaving * _lobe(h, a, b, alpha) for alpha in alphas)  # per solid angle outside
             lobes.append(_product(scales, shape, valid))
         return lobes
@@ -270,7 +264,7 @@ class Statistical(Transport):
             share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * facet_density(m, a, alpha))
             lobe = self._transmissions(state, turned(wi), turned(unfolded(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
-        return _summed(near), _summed(far)
+        return channels.total(near), channels.total(far)
 
 
 def _is_diffuse(base: Surface | None) -> bool:
@@ -279,14 +273,6 @@ def _is_diffuse(base: Surface | None) -> bool:
 
 def _same(w: Vector) -> Vector:
     return w
-
-
-def _either(chosen: Array, a: Channels, b: Channels) -> Channels:
-    return tuple(jnp.where(chosen, pick(a, c), pick(b, c)) for c in range(count(a, b)))
-
-
-def _summed(lobes: list[Channels]) -> Channels:
-    return tuple(reduce(operator.add, (pick(lobe, c) for lobe in lobes)) for c in range(count(*lobes)))
 
 
 def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
@@ -314,4 +300,4 @@ def _facet(table: Table, wi: Vector, wo: Vector) -> Channels:
 def _product(scale: Channels, shape: Channels, valid: Array) -> Channels:
     # a cubic may fall below its points
     scale = tuple(at_least(value, 0.0) for value in scale)
-    return tuple(jnp.where(valid, pick(scale, c) * pick(shape, c), 0.0) for c in range(count(scale, shape)))
+    return channels.select(valid, channels.times(scale, shape))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax.directions import squared_cosine_of_refraction
 
 EXPONENT = 1.1
 """Of the map between roughness and variance (Eq. 6)."""
@@ -59,6 +60,6 @@ def refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tuple[Array,
     Where ior < 1 `steepest` is the largest sine, which stands in beyond the critical angle; elsewhere every cosine has
     its own, grazing ones too.
     """
-    squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
+    squared = squared_cosine_of_refraction(cosine, ior)
     floor = jnp.where(ior < 1.0, 1.0 - steepest * steepest, 0.0)
     return jnp.sqrt(at_least(squared, floor)), squared > 0
