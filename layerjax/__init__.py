@@ -13,6 +13,8 @@ from layerjax.evaluate import sample as sample
 from layerjax.evaluate import unscattered as unscattered
 from layerjax.phase import SGGX as SGGX
 from layerjax.phase import HenyeyGreenstein as HenyeyGreenstein
+from layerjax.phase import PhaseFunction as PhaseFunction
+from layerjax.phase import Rayleigh as Rayleigh
 from layerjax.stack import Interface as Interface
 from layerjax.stack import Medium as Medium
 from layerjax.stack import Stack as Stack

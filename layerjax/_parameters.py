@@ -55,12 +55,22 @@ def is_placeholder(value: object) -> bool:
     return getattr(value, "__layerjax_placeholder__", False) is True
 
 
-def parameter(name: str, *, default: Any = dataclasses.MISSING, optional: bool = False, ranged: bool = True) -> Any:
+def parameter(
+    name: str,
+    *,
+    default: Any = dataclasses.MISSING,
+    optional: bool = False,
+    ranged: bool = True,
+    between: tuple[float, float] | None = None,
+) -> Any:
     """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
 
     Traced values are not checked (they have no value yet), placeholders pass as they are. Not `ranged`: the range
-    depends on other fields, and is checked by the class.
+    depends on other fields, and is checked by the class. `between`: the range of a class that is not in `RANGES`, such
+    as one's own; it joins them.
     """
+    if between is not None:
+        RANGES[name] = between
 
     def convert(value: Any) -> Any:
         if (optional and value is None) or is_placeholder(value):

@@ -2,33 +2,24 @@
 
 Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``,
 ``vmap`` and ``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so
-that a gradient holds no more than one chunk in memory and accumulates as it goes.
+that a gradient holds no more than one chunk in memory and accumulates as it goes (`layerjax._batching`).
 """
 
-import math
-from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from layerjax._numerics import horizon, safe_div
+from layerjax._batching import in_chunks
+from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
-from layerjax.channels import Channels, pick
-from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, read_directions, select, split
-from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify
+from layerjax.channels import pick
+from layerjax.directions import Vector, read_directions, split
+from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify, simplify_and_name
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
-
-CHUNK_BYTES = 20_000
-"""Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
-
-BLOCK_CHUNKS = 4
-"""Chunks that are transposed together."""
 
 
 class Prepared(eqx.Module):
@@ -54,11 +45,12 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
     require_numbers(stack)
-    chosen = automatic(stack) if transport == "auto" else transport
+    simplified, names = simplify_and_name(stack)
+    chosen = automatic(stack, simplified) if transport == "auto" else transport
     if not isinstance(chosen, Transport):
         raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
-    chosen.check(stack)
-    return Prepared(chosen.prepare(stack), chosen, channel_count(stack))
+    chosen.check(simplified, names)
+    return Prepared(chosen.prepare(simplified), chosen, channel_count(stack))
 
 
 def evaluate(
@@ -91,9 +83,7 @@ def evaluate(
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
     prepared = _prepared(stack, transport, wi.dtype)
-    if prepared.transport.random:
-        return _estimate(prepared, wi, wo, side, _needed(key, "evaluate"))[0]
-    return _evaluate(prepared, wi, wo, side)
+    return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
 def evaluate_with_error(
@@ -116,18 +106,11 @@ def evaluate_with_error(
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
     prepared = _prepared(stack, transport, wi.dtype)
-    if prepared.transport.random:
-        return _estimate(prepared, wi, wo, side, _needed(key, "evaluate_with_error"))
-    coarser = prepared.transport.coarser()
-    name = type(prepared.transport).__name__
-    if coarser is None:
-        raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
-    if isinstance(stack, Prepared):
-        raise ValueError(
-            f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
-        )
-    values = _evaluate(prepared, wi, wo, side)
-    return values, jnp.abs(values - _evaluate(_prepared(stack, coarser, wi.dtype), wi, wo, side))
+    values, errors = _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate_with_error"))
+    if errors is None:
+        coarser = _coarser(stack, prepared.transport)
+        errors = jnp.abs(values - evaluate(coarser, wi, wo, side=side))
+    return values, errors
 
 
 def sample(
@@ -168,9 +151,7 @@ def albedo(
     """
     (wi,) = read_directions(wi=wi)
     prepared = _prepared(stack, transport, wi.dtype)
-    if prepared.transport.random:
-        return _estimate_albedo(prepared, wi, _needed(key, "albedo"))
-    return _albedo(prepared, wi, nodes)
+    return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
 
 def unscattered(stack: Stack, wi: ArrayLike) -> Array:
@@ -184,57 +165,13 @@ def unscattered(stack: Stack, wi: ArrayLike) -> Array:
 
 
 @eqx.filter_jit
-def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side) -> Array:
-    def values(wi: Vector, wo: Vector) -> Channels:
-        channels = prepared.transport.evaluate(prepared.state, wi, wo, side)
-        return tuple(pick(channels, c) for c in range(prepared.channels))
-
-    return _in_chunks(values, wi, wo)
-
-
-@eqx.filter_jit
-def _estimate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array) -> tuple[Array, Array]:
-    batch = jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]
-    if 0 in batch:
-        return (jnp.zeros((*batch, prepared.channels), wi.dtype),) * 2
-    pairs = (jnp.broadcast_to(w, (*batch, 3)).reshape(-1, 3) for w in (wi, wo))
-    i, o = map(split, pairs)
-    values, errors = prepared.transport.estimate(prepared.state, i, o, side, prepared.channels, key)
-    return values.reshape(*batch, -1), errors.reshape(*batch, -1)
-
-
-@eqx.filter_jit
-def _estimate_albedo(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array]:
-    if 0 in wi.shape:
-        return (jnp.zeros((*wi.shape[:-1], prepared.channels), wi.dtype),) * 2
-    values, _ = prepared.transport.estimate_albedo(prepared.state, split(wi.reshape(-1, 3)), prepared.channels, key)
-    near, far = jnp.split(values, 2, axis=-1)
-    return near.reshape(*wi.shape[:-1], -1), far.reshape(*wi.shape[:-1], -1)
+def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array | None) -> tuple[Array, Array | None]:
+    return prepared.transport.measured(prepared.state, wi, wo, side, prepared.channels, key)
 
 
 @eqx.filter_jit
 def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Array]:
-    transport, state = prepared.transport, prepared.state
-
-    def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
-        drawn = transport.sample(state, wi, uniforms)
-        # what leaves nowhere may be no unit vector: it becomes a direction in the tangent plane, where the BSDF is 0
-        left = jnp.abs(dot(drawn, drawn) - 1.0) < UNIT_SLACK
-        wo = select(left, drawn, horizontal(drawn))
-        density = jnp.where(left, transport.pdf(state, wi, wo), 0.0)
-        if transport.random:
-            return (*wo, density)
-        values = transport.evaluate(state, wi, wo, "all")
-        weights = [safe_div(pick(values, c) * jnp.abs(wo[2]), density) for c in range(prepared.channels)]
-        return (*wo, density, *weights)
-
-    uniforms = jax.random.uniform(key, wi.shape, dtype=wi.dtype)
-    drawn = _in_chunks(draw, wi, uniforms)
-    wo, density, weights = drawn[..., :3], drawn[..., 3], drawn[..., 4:]
-    if transport.random:
-        values, _ = _estimate(prepared, wi, wo, "all", jax.random.fold_in(key, 1))
-        weights = safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
-    return wo, density, weights
+    return prepared.transport.drawn(prepared.state, wi, prepared.channels, key)
 
 
 @eqx.filter_jit
@@ -242,21 +179,12 @@ def _pdf(prepared: Prepared, wi: Array, wo: Array) -> Array:
     def density(wi: Vector, wo: Vector) -> tuple[Array, ...]:
         return (prepared.transport.pdf(prepared.state, wi, wo),)
 
-    return _in_chunks(density, wi, wo)[..., 0]
+    return in_chunks(density, wi, wo)[..., 0]
 
 
 @eqx.filter_jit
-def _albedo(prepared: Prepared, wi: Array, nodes: int) -> tuple[Array, Array]:
-    def one(wi: Array) -> tuple[Array, Array]:
-        energies = prepared.transport.albedo(prepared.state, split(wi), nodes)
-        near, far = (jnp.stack([pick(e, c) for c in range(prepared.channels)], axis=-1) for e in energies)
-        return near, far
-
-    batch = wi.shape[:-1]
-    if 0 in batch:
-        return (jnp.zeros((*batch, prepared.channels), wi.dtype),) * 2
-    near, far = jax.lax.map(one, wi.reshape(-1, 3))
-    return near.reshape(*batch, -1), far.reshape(*batch, -1)
+def _albedo(prepared: Prepared, wi: Array, nodes: int, key: Array | None) -> tuple[Array, Array]:
+    return prepared.transport.energies(prepared.state, wi, prepared.channels, nodes, key)
 
 
 @eqx.filter_jit
@@ -271,56 +199,21 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
-def _in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:
-    """function over arrays of shape ``(..., 3)`` as components, its results along a new last axis.
-
-    Many pairs run in blocks, which are transposed to components and back (a loop that reads every third number takes
-    several times as long as the arithmetic), and these in chunks that stay in the cache. A gradient keeps the
-    directions alone and computes each block, and each chunk of it, again on the way back.
-    """
-    batch = jnp.broadcast_shapes(*(array.shape for array in inputs))[:-1]
-    pairs = math.prod(batch)
-    chunk = CHUNK_BYTES // inputs[0].dtype.itemsize
-    if pairs <= 2 * chunk:
-        return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
-    flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]
-    size = BLOCK_CHUNKS * chunk
-    whole = pairs // size * size
-    run = partial(_block, function, chunk)
-    parts = []
-    if whole:
-        blocks = [array[:whole].reshape(-1, size, 3) for array in flat]
-        step = jax.checkpoint(lambda _, rows: (None, run(*rows)))
-        _, results = jax.lax.scan(step, None, blocks)
-        parts.append(results.reshape(whole, -1))
-    if whole < pairs:
-        left = pairs - whole
-        number = -(-left // chunk)
-        even = -(-left // number)
-        # a vector of zeros is no direction: it gives 0
-        rest = [jnp.pad(array[whole:], ((0, number * even - left), (0, 0))) for array in flat]
-        parts.append(_block(function, even, *rest)[:left])
-    return jnp.concatenate(parts).reshape(*batch, -1)
-
-
-def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:
-    """function over a whole number of chunks, (n, 3) each."""
-    vectors = [tuple(array.T.reshape(3, -1, chunk)) for array in jax.lax.optimization_barrier(rows)]
-    step = jax.checkpoint(lambda _, vectors: (None, function(*vectors)))
-    _, results = jax.lax.scan(step, None, jax.lax.optimization_barrier(vectors))
-    together = jax.lax.optimization_barrier(jnp.stack([result.reshape(-1) for result in results]))
-    return together.T
-
-
 def _check_side(side: Side) -> None:
     if side not in get_args(Side):
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
-def _needed(key: Array | None, function: str) -> Array:
-    if key is None:
-        raise ValueError(f"key: RandomWalk draws random numbers: {function}(..., key=jax.random.key(seed))")
-    return key
+def _coarser(stack: Stack | Prepared, transport: Transport) -> Prepared:
+    """The stack prepared for the next coarser resolution."""
+    name, coarser = type(transport).__name__, transport.coarser()
+    if coarser is None:
+        raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
+    if isinstance(stack, Prepared):
+        raise ValueError(
+            f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
+        )
+    return prepare(stack, coarser)
 
 
 def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:

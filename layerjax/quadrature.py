@@ -57,6 +57,13 @@ def hemisphere_rule(wi: Vector, nodes: int) -> Nodes:
     return _flatten(wo, sine * w_theta * w_psi[:, None])
 
 
+def sphere_rule(wi: Vector, nodes: int) -> Rule:
+    """Nodes over both hemispheres for lobes that are not narrow: `hemisphere_rule` on either side."""
+    (x, y, z), weight = hemisphere_rule(wi, nodes)
+    side = jnp.where(wi[2] < 0, -1.0, 1.0)[..., None]
+    return ((x, y, side * z), weight), ((x, y, -side * z), weight)
+
+
 def flake_rule(wi: Vector, radial: Array, axial: Array, axis: Vector | None, nodes: int) -> Rule:
     """Nodes for mirrors whose normals m follow an ellipsoid, S = radial^2 (I - a a') + axial^2 a a'.
 

@@ -17,7 +17,7 @@ from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
-from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces import Surface
 
 
 class Interface(eqx.Module):
@@ -50,8 +50,8 @@ class Medium(eqx.Module):
     thickness tau    [0, 1e4]                            optical depth T rho, per channel; extinction along w is
                                                          thickness * sigma(w)
     albedo    gamma  [0, 1]             1                share that survives a collision, per channel; 0 absorbs only
-    phase            HenyeyGreenstein   HenyeyGreenstein where a collision sends the light
-                     or SGGX            (g=0)
+    phase            HenyeyGreenstein,  HenyeyGreenstein where a collision sends the light; any `PhaseFunction`
+                     SGGX, Rayleigh     (g=0)
     f0        F0     [0, 1]             None             Schlick reflectance of a flake, per channel; every collision
                                                          keeps albedo * schlick(f0). None or 1: no Fresnel term
     ========= ====== ================== ================ ==========================================================
@@ -64,7 +64,9 @@ class Medium(eqx.Module):
 
     def __check_init__(self) -> None:
         if not isinstance(self.phase, PhaseFunction):
-            raise ValueError(f"Medium.phase: {self.phase!r} is not a HenyeyGreenstein or an SGGX")
+            raise ValueError(
+                f"Medium.phase: {self.phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
+            )
 
 
 class Stack(eqx.Module):
@@ -103,8 +105,8 @@ def channel_count(stack: Stack) -> int:
     """Number of channels, 1 if every parameter is a scalar."""
     seen: dict[int, str] = {}
     for name, leaf in leaves_with_names(stack):
-        if isinstance(leaf, float) or is_placeholder(leaf) or name.endswith("axis"):
-            continue
+        if isinstance(leaf, float) or is_placeholder(leaf) or ".phase." in name:
+            continue  # phase functions are the same for all channels
         if leaf.ndim == 1 and leaf.shape[0] > 1:
             seen.setdefault(leaf.shape[0], name)
     if len(seen) > 1:
@@ -129,9 +131,14 @@ def simplify(stack: Stack) -> Stack:
     f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing. Traced values are kept as
     they are, so derivatives with respect to them are exact.
     """
-    layers = []
+    return simplify_and_name(stack)[0]
+
+
+def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
+    """See `simplify`; and the names that the layers left have in the stack as it was given, such as ``layers[2]``."""
+    layers, names = [], []
     above: Any = 1.0
-    for layer in stack.layers:
+    for index, layer in enumerate(stack.layers):
         if isinstance(layer, Interface):
             if _are_equal(layer.ior, above):
                 continue
@@ -143,16 +150,8 @@ def simplify(stack: Stack) -> Stack:
             if is_known(layer.f0, 1.0):
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)
-    return eqx.tree_at(lambda s: s.layers, stack, tuple(layers))
-
-
-def place_of_vmf(stack: Stack) -> str | None:
-    """Where the first von Mises-Fisher facets of a stack are, such as ``layers[0].distribution``; None: nowhere."""
-    parts = [(f"layers[{index}]", layer) for index, layer in enumerate(stack.layers)]
-    for name, part in [*parts, ("base", stack.base)]:
-        if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
-            return f"{name}.distribution"
-    return None
+        names.append(f"layers[{index}]")
+    return eqx.tree_at(lambda s: s.layers, stack, tuple(layers)), tuple(names)
 
 
 def with_known(stack: Stack) -> Stack:

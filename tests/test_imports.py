@@ -18,6 +18,7 @@ PACKAGES = [
     "layerjax._parameters",
     "layerjax.channels",
     "layerjax.directions",
+    "layerjax._batching",
     "layerjax.quadrature",
     "layerjax.fresnel",
     "layerjax.tables",

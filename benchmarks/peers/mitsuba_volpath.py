@@ -171,9 +171,11 @@ def _medium(mi: Any, medium: lj.Medium, index: int) -> dict[str, Any]:
     }
 
 
-def _phase(mi: Any, phase: lj.HenyeyGreenstein | lj.SGGX) -> dict[str, Any]:
+def _phase(mi: Any, phase: lj.PhaseFunction) -> dict[str, Any]:
     if isinstance(phase, lj.HenyeyGreenstein):
         return {"type": "hg", "g": float(phase.g)}
+    if not isinstance(phase, lj.SGGX):
+        raise ValueError(f"phase: {type(phase).__name__} has no counterpart here")
     axis = np.array([0.0, 0.0, 1.0]) if phase.axis is None else np.asarray(phase.axis, float)
     along = np.outer(axis, axis) / (axis @ axis)
     alpha2 = float(phase.alpha) ** 2

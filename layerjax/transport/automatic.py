@@ -1,7 +1,6 @@
 """Which transport a stack gets when none is named."""
 
-from layerjax.phase import HenyeyGreenstein
-from layerjax.stack import Interface, Medium, Stack, is_known, media_of, place_of_vmf, simplify
+from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Lambertian
 from layerjax.transport.adding_doubling.transport import AddingDoubling
 from layerjax.transport.contract import Transport
@@ -9,16 +8,21 @@ from layerjax.transport.single_scattering import SingleScattering
 from layerjax.transport.statistical.transport import Statistical
 
 
-def automatic(stack: Stack) -> Transport:
-    """The rule of ``transport="auto"``, see `layerjax.prepare`. What is traced counts as not known."""
-    interfaces = sum(isinstance(layer, Interface) for layer in stack.layers)
-    if not interfaces:
+def automatic(given: Stack, simplified: Stack) -> Transport:
+    """The rule of ``transport="auto"``, see `layerjax.prepare`. What is traced counts as not known.
+
+    An interface counts where it was given, though its index may be known to be that of what lies above it: a fit that
+    passes through that index stays with one transport.
+    """
+    faces = [layer for layer in given.layers if isinstance(layer, Interface)]
+    if not faces:
         return SingleScattering()
-    closed = interfaces == 1 and isinstance(stack.base, Lambertian) and place_of_vmf(stack) is None
-    if closed and all(map(_only_absorbs, media_of(simplify(stack)))):
+    closed = len(faces) == 1 and faces[0].distribution == "ggx" and isinstance(given.base, Lambertian)
+    if closed and all(map(_only_absorbs, media_of(simplified))):
         return Statistical(microfacets="single")
     return AddingDoubling()
 
 
 def _only_absorbs(medium: Medium) -> bool:
-    return is_known(medium.albedo, 0.0) and isinstance(medium.phase, HenyeyGreenstein) and medium.f0 is None
+    """In a way that `Statistical` carries."""
+    return is_known(medium.albedo, 0.0) and medium.phase.forward_lobe is not None and medium.f0 is None

@@ -1,16 +1,30 @@
-"""The contract that every transport keeps."""
+"""The contract that every transport keeps, and its two halves: deterministic transports and random ones.
+
+`Transport` is what the public calls of `layerjax.evaluate` go by. A transport derives from one of the halves, which
+turn batches of directions into what its own functions take: `DeterministicTransport` asks for values in closed form,
+`RandomTransport` for means of draws with their standard errors.
+"""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from jax import Array
 
-from layerjax.directions import Vector
-from layerjax.stack import Stack, place_of_vmf
+from layerjax._batching import in_chunks
+from layerjax._numerics import safe_div
+from layerjax.channels import Channels, pick
+from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
+from layerjax.stack import Interface, Stack
+from layerjax.surfaces import Conductor
 
 Side = Literal["all", "reflection", "transmission"]
 """Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
+
+Uniforms = tuple[Array, Array, Array]
 
 
 class Transport(eqx.Module):
@@ -19,26 +33,26 @@ class Transport(eqx.Module):
     Directions come as components, already broadcast against each other; results are one array a channel. `state` is
     what `prepare` returned: a pytree of arrays that holds all that no direction is needed for.
 
-    A transport that draws random numbers says so in `random` and offers `estimate` and `estimate_albedo`, which take a
-    key and return standard errors too, in place of `evaluate` and `albedo`.
+    Three functions take whole batches instead, arrays ``(..., 3)``, and a `key` that is what `needed` made of the
+    user's: `measured`, `drawn` and `energies` are what the two halves of the contract differ in.
     """
 
-    random: ClassVar[bool] = False
+    random: ClassVar[bool]
+    """Whether values are drawn at random, with a key."""
 
     @abc.abstractmethod
-    def check(self, stack: Stack) -> None:
-        """Raise a ValueError that names the first layer or base which this transport cannot carry."""
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.
+
+        names: what the user calls the layers, such as ``layers[2]`` (see `layerjax.stack.simplify_and_name`).
+        """
 
     @abc.abstractmethod
     def prepare(self, stack: Stack) -> Any:
-        """All the work that no direction is needed for."""
+        """All the work that no direction is needed for, of a simplified stack."""
 
     @abc.abstractmethod
-    def evaluate(self, state: Any, wi: Vector, wo: Vector, side: Side) -> tuple[Array, ...]:
-        """BSDF values in 1/sr, without the cosine."""
-
-    @abc.abstractmethod
-    def sample(self, state: Any, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: Any, wi: Vector, uniforms: Uniforms) -> Vector:
         """Outgoing directions from three uniform numbers each."""
 
     @abc.abstractmethod
@@ -46,29 +60,143 @@ class Transport(eqx.Module):
         """Density of `sample` in solid angle, 1/sr."""
 
     @abc.abstractmethod
-    def albedo(self, state: Any, wi: Vector, nodes: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""
+    def needed(self, key: Array | None, function: str) -> Array | None:
+        """The key; None, if it draws nothing. If one is missing, a ValueError for the public function of that name."""
 
-    def estimate(
-        self, state: Any, wi: Vector, wo: Vector, side: Side, channels: int, key: Array
-    ) -> tuple[Array, Array]:
-        """Values of n pairs and their standard errors, shape (n, channels) each; of a random transport."""
-        raise NotImplementedError
+    @abc.abstractmethod
+    def measured(
+        self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+    ) -> tuple[Array, Array | None]:
+        """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors; None: it knows of none."""
 
-    def estimate_albedo(self, state: Any, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
-        """Shares scattered to wi's side, then to the other, and standard errors: (n, 2 channels) each; if random."""
-        raise NotImplementedError
+    @abc.abstractmethod
+    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+        """Outgoing directions ``(..., 3)``, their densities ``(...)`` and weights ``(..., C)``."""
+
+    @abc.abstractmethod
+    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+        """Scattered energy ``(..., C)`` that leaves on wi's side and on the other, for unit irradiance."""
 
     def coarser(self) -> "Transport | None":
         """The same transport at a lower resolution, to estimate the error from the difference; None if it has none."""
         return None
 
+    def _leaving(self, state: Any, wi: Vector, uniforms: Uniforms) -> tuple[Vector, Array]:
+        """Directions drawn, and their densities.
 
-def refuse_vmf(stack: Stack, transport: str) -> None:
+        What leaves nowhere may be no unit vector: it becomes a direction in the tangent plane, where the BSDF is 0.
+        """
+        drawn = self.sample(state, wi, uniforms)
+        left = jnp.abs(dot(drawn, drawn) - 1.0) < UNIT_SLACK
+        wo = select(left, drawn, horizontal(drawn))
+        return wo, jnp.where(left, self.pdf(state, wi, wo), 0.0)
+
+
+class DeterministicTransport(Transport):
+    """A transport whose values are in closed form, or read off what `prepare` has solved."""
+
+    random: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def evaluate(self, state: Any, wi: Vector, wo: Vector, side: Side) -> Channels:
+        """BSDF values in 1/sr, without the cosine."""
+
+    @abc.abstractmethod
+    def albedo(self, state: Any, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+        """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""
+
+    def needed(self, key: Array | None, function: str) -> None:
+        return None
+
+    def measured(
+        self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+    ) -> tuple[Array, None]:
+        def values(wi: Vector, wo: Vector) -> Channels:
+            found = self.evaluate(state, wi, wo, side)
+            return tuple(pick(found, c) for c in range(channels))
+
+        return in_chunks(values, wi, wo), None
+
+    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+        def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
+            wo, density = self._leaving(state, wi, uniforms)
+            values = self.evaluate(state, wi, wo, "all")
+            weights = [safe_div(pick(values, c) * jnp.abs(wo[2]), density) for c in range(channels)]
+            return (*wo, density, *weights)
+
+        found = in_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
+        return found[..., :3], found[..., 3], found[..., 4:]
+
+    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+        def one(wi: Array) -> tuple[Array, Array]:
+            sides = self.albedo(state, split(wi), nodes)
+            near, far = (jnp.stack([pick(side, c) for c in range(channels)], axis=-1) for side in sides)
+            return near, far
+
+        batch = wi.shape[:-1]
+        if 0 in batch:
+            return (jnp.zeros((*batch, channels), wi.dtype),) * 2
+        near, far = jax.lax.map(one, wi.reshape(-1, 3))
+        return near.reshape(*batch, -1), far.reshape(*batch, -1)
+
+
+class RandomTransport(Transport):
+    """A transport that follows light at random: it takes a key, and gives standard errors too."""
+
+    random: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def estimate(
+        self, state: Any, wi: Vector, wo: Vector, side: Side, channels: int, key: Array
+    ) -> tuple[Array, Array]:
+        """Values of n pairs and their standard errors, shape (n, channels) each."""
+
+    @abc.abstractmethod
+    def estimate_albedo(self, state: Any, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
+        """Shares scattered to wi's side, then to the other, and standard errors: (n, 2 channels) each."""
+
+    def needed(self, key: Array | None, function: str) -> Array:
+        if key is None:
+            name = type(self).__name__
+            raise ValueError(f"key: {name} draws random numbers: {function}(..., key=jax.random.key(seed))")
+        return key
+
+    def measured(
+        self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+    ) -> tuple[Array, Array]:
+        batch = jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]
+        if 0 in batch:
+            return (jnp.zeros((*batch, channels), wi.dtype),) * 2
+        i, o = (split(jnp.broadcast_to(w, (*batch, 3)).reshape(-1, 3)) for w in (wi, wo))
+        assert key is not None
+        values, errors = self.estimate(state, i, o, side, channels, key)
+        return values.reshape(*batch, -1), errors.reshape(*batch, -1)
+
+    def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
+        def draw(wi: Vector, uniforms: Vector) -> tuple[Array, ...]:
+            wo, density = self._leaving(state, wi, uniforms)
+            return (*wo, density)
+
+        found = in_chunks(draw, wi, jax.random.uniform(key, wi.shape, dtype=wi.dtype))
+        wo, density = found[..., :3], found[..., 3]
+        values, _ = self.measured(state, wi, wo, "all", channels, jax.random.fold_in(key, 1))
+        return wo, density, safe_div(values * jnp.abs(wo[..., 2:]), density[..., None])
+
+    def energies(self, state: Any, wi: Array, channels: int, nodes: int, key: Array | None) -> tuple[Array, Array]:
+        batch = wi.shape[:-1]
+        if 0 in batch:
+            return (jnp.zeros((*batch, channels), wi.dtype),) * 2
+        assert key is not None
+        found, _ = self.estimate_albedo(state, split(wi.reshape(-1, 3)), channels, key)
+        near, far = jnp.split(found, 2, axis=-1)
+        return near.reshape(*batch, -1), far.reshape(*batch, -1)
+
+
+def refuse_vmf(stack: Stack, names: Sequence[str], transport: str) -> None:
     """Raise a ValueError that names the first von Mises-Fisher facets, on behalf of a transport without them."""
-    place = place_of_vmf(stack)
-    if place is not None:
-        raise ValueError(
-            f'{place}: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with microfacets="single" '
-            "do, and ENDF for metals, coated metals and slabs"
-        )
+    for name, part in [*zip(names, stack.layers, strict=True), ("base", stack.base)]:
+        if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
+            raise ValueError(
+                f'{name}.distribution: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with '
+                'microfacets="single" do, and ENDF for metals, coated metals and slabs'
+            )

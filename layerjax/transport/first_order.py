@@ -17,7 +17,6 @@ from layerjax._parameters import Parameter
 from layerjax.channels import Channels, total
 from layerjax.directions import Vector, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import Distribution, facet_density, rule, sample
-from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
@@ -144,7 +143,5 @@ def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:
 
 
 def _mirrored(medium: Medium) -> Medium:
-    if isinstance(medium.phase, SGGX) and medium.phase.axis is not None:
-        flip = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(medium.phase.axis).dtype)
-        return eqx.tree_at(lambda m: m.phase.axis, medium, medium.phase.axis * flip)
-    return medium
+    phase = medium.phase.mirrored()
+    return medium if phase is medium.phase else eqx.tree_at(lambda m: m.phase, medium, phase)

@@ -22,11 +22,10 @@ from layerjax import channels, fresnel
 from layerjax._numerics import absorb, at_least, decay_between, horizon, one_minus_exp, safe_div
 from layerjax.channels import Channels, count, each, largest, mean, per_channel, pick, times, total
 from layerjax.directions import Vector, half_vector, is_above, sanitised, select
-from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
-from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths, simplify
+from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.transport.contract import Side, Transport
+from layerjax.transport.contract import DeterministicTransport, Side
 
 BASE = -1
 """Stands for the base among the indices of layers."""
@@ -42,23 +41,22 @@ class Media(eqx.Module):
     base: Surface | None
 
 
-class SingleScattering(Transport):
+class SingleScattering(DeterministicTransport):
     """Every path with one collision: reflection and transmission, light from above and from below, any number of media.
 
     Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
     """
 
-    def check(self, stack: Stack) -> None:
-        for index, layer in enumerate(stack.layers):
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Interface):
                 raise ValueError(
-                    f"layers[{index}]: SingleScattering carries no Interface (media over a base only); "
+                    f"{name}: SingleScattering carries no Interface (media over a base only); "
                     "AddingDoubling and RandomWalk do"
                 )
 
     def prepare(self, stack: Stack) -> Media:
-        slim = simplify(stack)
-        return Media(tuple(media_of(slim)), slim.base)
+        return Media(tuple(media_of(stack)), stack.base)
 
     def evaluate(self, state: Media, wi: Vector, wo: Vector, side: Side) -> Channels:
         return total(list(layer_lobes(state, wi, wo, side).values()), jnp.zeros_like(wi[2] * wo[2]))
@@ -179,9 +177,9 @@ def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
 
 
 def _uses_half_vector(slab: Media) -> bool:
-    """Whether any collision needs one: flakes do, and so does a Fresnel term."""
+    """Whether any collision needs one: a phase function of flakes does, and so does a Fresnel term."""
     scattering = (slab.media[k] for k in _scattering(slab))
-    return any(isinstance(medium.phase, SGGX) or medium.f0 is not None for medium in scattering)
+    return any(medium.phase.uses_half_vector or medium.f0 is not None for medium in scattering)
 
 
 def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array] | None) -> Channels:

@@ -14,6 +14,8 @@ outer side. There is no inter-reflection, no roughness is carried from one inter
 angles over a mirror, returns too much from a diffuse base, and can gain energy where the index below is under 1.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jax import Array
 
@@ -30,16 +32,16 @@ from layerjax.directions import (
     squared_cosine_of_refraction,
 )
 from layerjax.normals.sggx import ggx_density, sggx_area
-from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
+from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport.contract import Side, Transport, refuse_vmf
+from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import Face
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
 
 
-class WeidlichWilkie(Transport):
+class WeidlichWilkie(DeterministicTransport):
     """One refracted half vector, no inter-reflection (Weidlich & Wilkie 2007).
 
     Carries any number of `Interface` layers, and `Medium` layers that only absorb, over any surface; there is no
@@ -47,12 +49,12 @@ class WeidlichWilkie(Transport):
     `jit` (make it outside, and put traced numbers in with `equinox.tree_at`). Reciprocal; lit from below it gives 0.
     """
 
-    def check(self, stack: Stack) -> None:
-        refuse_vmf(stack, "WeidlichWilkie")
-        for index, layer in enumerate(stack.layers):
-            if isinstance(layer, Medium) and not _only_absorbs(layer):
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        refuse_vmf(stack, names, "WeidlichWilkie")
+        for name, layer in zip(names, stack.layers, strict=True):
+            if isinstance(layer, Medium) and not is_known(layer.albedo, 0.0):
                 raise ValueError(
-                    f"layers[{index}]: WeidlichWilkie carries no Medium that scatters (its albedo must be known to be "
+                    f"{name}: WeidlichWilkie carries no Medium that scatters (its albedo must be known to be "
                     "0, not traced); AddingDoubling and RandomWalk do"
                 )
         if stack.base is None:
@@ -61,7 +63,7 @@ class WeidlichWilkie(Transport):
             )
 
     def prepare(self, stack: Stack) -> Stack:
-        return simplify(stack)
+        return stack
 
     def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
         if side == "transmission":
@@ -101,11 +103,6 @@ class WeidlichWilkie(Transport):
             energies.append(tuple(jnp.sum(value * wo[2] * weight, axis=-1) for value in values))
         zero = jnp.zeros_like(wi[2])
         return total(energies, zero), (zero,)
-
-
-def _only_absorbs(layer: Medium) -> bool:
-    """Whether nothing is known to be scattered (or no medium is known to be there)."""
-    return all(is_known(medium.albedo, 0.0) for medium in media_of(simplify(Stack([layer]))))
 
 
 def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.evaluate import CHUNK_BYTES
+from layerjax._batching import CHUNK_BYTES
 from tests.helpers.cases import tilt3
 
 STACK = lj.Stack(tilt3(), lj.Lambertian([0.2, 0.5, 0.8]))

@@ -20,6 +20,7 @@ STACKS = {
     "surface, tilted": lj.Stack([lj.Medium(2.0, phase=lj.SGGX("surface", 0.4, (0.4, 0.2, 0.9)))]),
     "fiber, in the plane": lj.Stack([lj.Medium(1.0, phase=lj.SGGX("fiber", 0.3, (1.0, 0.0, 0.0)))]),
     "fiber, upright": lj.Stack([lj.Medium(1.0, phase=lj.SGGX("fiber", 0.5))]),
+    "rayleigh": lj.Stack([lj.Medium(1.0, phase=lj.Rayleigh())]),
     "haze": lj.Stack([haze(0.6, 1.0)]),
     "haze, backward": lj.Stack([haze(-0.4, 1.0)]),
     "three layers": lj.Stack(tilt3()),

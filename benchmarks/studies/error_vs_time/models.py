@@ -16,7 +16,7 @@ from benchmarks.measuring import operations, timing
 from benchmarks.measuring.accuracy import relative_l2, scale, worst
 from benchmarks.studies.error_vs_time.truth import Truth, albedos, key_of
 from benchmarks.suite.cases import Case
-from layerjax.stack import simplify
+from layerjax.stack import simplify, simplify_and_name
 
 Result = TypeVar("Result")
 
@@ -133,7 +133,7 @@ class Programs:
 def supports(transport: lj.Transport, stack: lj.Stack) -> bool:
     """Whether the transport carries this stack."""
     try:
-        transport.check(stack)
+        transport.check(*simplify_and_name(stack))
     except ValueError:
         return False
     return True

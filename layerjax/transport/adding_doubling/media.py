@@ -17,7 +17,7 @@ from layerjax import fresnel
 from layerjax._numerics import decay_between, exprel
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
-from layerjax.phase import HenyeyGreenstein, PhaseFunction
+from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
@@ -104,13 +104,13 @@ def _both_sides(medium: Medium, wi: Vector, wo: Vector) -> list[Array]:
 def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
     """The kernel with a collision scattering exactly sigma.
 
-    Flakes are scaled. What is left goes straight on, as does all that Henyey-Greenstein's peak has too little or too
-    much of: there it changes nothing.
+    That of mirrors is scaled. What is left goes straight on, as does all that a forward peak has too little or too much
+    of: there it changes nothing.
     """
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
     area = kernel.area * jnp.ones_like(weight)
-    if isinstance(phase, HenyeyGreenstein):
+    if phase.peaks_forward:
         scale, missing = jnp.ones_like(weight), area - weight @ (reflect + transmit)
     else:
         scale, missing = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.phase import SGGX
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.adding_doubling.grid import Grid, make_grid
@@ -43,10 +42,7 @@ def make_plan(stack: Stack, nodes: int, modes: int, ordinates: tuple[int, int], 
 
 def is_tilted(layer: Any) -> bool:
     """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
-    if not isinstance(layer, Medium) or not isinstance(layer.phase, SGGX) or layer.phase.axis is None:
-        return False
-    axis = layer.phase.axis
-    return isinstance(axis, jax.core.Tracer) or bool(np.any(np.asarray(axis)[:2] != 0.0))
+    return isinstance(layer, Medium) and not layer.phase.is_upright
 
 
 def solve(stack: Stack, plan: Plan) -> tuple[Grid, Layer]:

@@ -7,6 +7,7 @@ in closed form at the very directions asked for; only the smooth rest is read of
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Literal, get_args
 
@@ -18,12 +19,12 @@ from jax import Array
 
 from layerjax.channels import Channels, times, total
 from layerjax.directions import Vector, direction, split
-from layerjax.stack import Stack, simplify
+from layerjax.stack import Stack
 from layerjax.transport.adding_doubling.interfaces import Microfacets
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
-from layerjax.transport.contract import Side, Transport, refuse_vmf
+from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, caught, evaluate_first, first_order
 from layerjax.transport.single_scattering import SingleScattering
 
@@ -47,7 +48,7 @@ class Solved(eqx.Module):
     tables: Tables | None
 
 
-class AddingDoubling(Transport):
+class AddingDoubling(DeterministicTransport):
     """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
 
     Carries everything that a `Stack` holds; von Mises-Fisher normals with ``microfacets="single"`` only. The work per
@@ -96,15 +97,14 @@ class AddingDoubling(Transport):
                 allowed = ", ".join(map(repr, get_args(choices)))
                 raise ValueError(f"AddingDoubling.{name}: {choice!r} is not one of {allowed}")
 
-    def check(self, stack: Stack) -> None:
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
         if self.microfacets == "multiple":
-            refuse_vmf(stack, 'AddingDoubling(microfacets="multiple")')
+            refuse_vmf(stack, names, 'AddingDoubling(microfacets="multiple")')
 
     def prepare(self, stack: Stack) -> Solved:
-        slim = simplify(stack)
         if self.tolerance is not None:
-            return self._climb(slim)
-        return self._solved(slim)
+            return self._climb(stack)
+        return self._solved(stack)
 
     def coarser(self) -> "AddingDoubling":
         """The same at about two thirds of the resolution, for an estimate of the error."""
@@ -155,28 +155,28 @@ class AddingDoubling(Transport):
         near, far = (total([w, part], zero) for w, part in zip(whole, less, strict=True))
         return near, far
 
-    def _solved(self, slim: Stack) -> Solved:
-        first = first_order(slim)
-        if self.orders == "first" or not slim.layers:
+    def _solved(self, stack: Stack) -> Solved:
+        first = first_order(stack)
+        if self.orders == "first" or not stack.layers:
             return Solved(first, None)
-        plan = make_plan(slim, self.nodes, self.modes, self.ordinates, self.microfacets)
-        return Solved(first, _solve(slim, first, plan))
+        plan = make_plan(stack, self.nodes, self.modes, self.ordinates, self.microfacets)
+        return Solved(first, _solve(stack, first, plan))
 
-    def _climb(self, slim: Stack) -> Solved:
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(slim)):
+    def _climb(self, stack: Stack) -> Solved:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(stack)):
             raise ValueError(
                 f"AddingDoubling.tolerance: {self.tolerance:g} needs concrete parameters: "
                 "prepare the stack outside jit, grad and vmap, or give nodes and modes"
             )
         assert self.tolerance is not None
-        wi, wo = _probes(slim.base is not None)
+        wi, wo = _probes(stack.base is not None)
         before: Array | None = None
-        tilted = make_plan(slim, 2, 1, (2, 4), self.microfacets).azimuths is not None
+        tilted = make_plan(stack, 2, 1, (2, 4), self.microfacets).azimuths is not None
         change = np.inf
         for rung in ORDINATES_LADDER if tilted else LADDER:
             finer = {"ordinates": rung} if tilted else {"nodes": rung[0], "modes": rung[1]}
             options = dataclasses.replace(self, tolerance=None, **finer)
-            state = options._solved(slim)
+            state = options._solved(stack)
             values = _read(options, state, wi, wo)
             if before is not None:
                 change = float(jnp.max(jnp.abs(values - before) / (jnp.abs(values) + 0.1 * jnp.mean(values))))

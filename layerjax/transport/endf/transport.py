@@ -5,7 +5,7 @@ normals, which follow from the roughnesses in closed form: see `layerjax.transpo
 `endf_chains` for the coat, `endf_slab` for light that passes, and `endf_drawing` for the sampler.
 """
 
-import itertools
+from collections.abc import Sequence
 from typing import Any, get_args
 
 import equinox as eqx
@@ -18,9 +18,9 @@ from layerjax import channels
 from layerjax.channels import Channels, per_channel, total
 from layerjax.directions import Vector, is_above, sanitised, select
 from layerjax.normals.vmf import Masking, concentration
-from layerjax.stack import Interface, Medium, Stack, is_known, media_of, simplify
+from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
-from layerjax.transport.contract import Side, Transport
+from layerjax.transport.contract import DeterministicTransport, Side
 from layerjax.transport.endf import drawing as drawing
 from layerjax.transport.endf.chains import Coat, Face, Form, Mirror, Options, reflections
 from layerjax.transport.endf.slab import transmissions
@@ -37,7 +37,7 @@ class Sides(eqx.Module):
     lower: Coat | None
 
 
-class ENDF(Transport):
+class ENDF(DeterministicTransport):
     """Extended normal distributions: one microfacet lobe a bounce, for a coat on metal or a slab (Guo et al. 2015).
 
     Carries one `Interface` over a `Conductor`; a slab, two `Interface` layers of which the second leads back into what
@@ -83,29 +83,29 @@ class ENDF(Transport):
                 allowed = ", ".join(map(repr, get_args(choices)))
                 raise ValueError(f"ENDF.{name}: {value!r} is not one of {allowed}")
 
-    def check(self, stack: Stack) -> None:
-        sides = [index for index, layer in _kept(stack) if isinstance(layer, Interface)]
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        sides = [index for index, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
         most = 2 if stack.base is None else 1
-        for index, layer in _kept(stack):
+        for index, (name, layer) in enumerate(zip(names, stack.layers, strict=True)):
             if isinstance(layer, Medium):
                 if not is_known(layer.albedo, 0.0):
                     raise ValueError(
-                        f"layers[{index}]: ENDF carries no Medium that scatters (its albedo must be known to be 0, not "
+                        f"{name}: ENDF carries no Medium that scatters (its albedo must be known to be 0, not "
                         "traced); AddingDoubling and RandomWalk do"
                     )
                 if sides and not (sides[0] < index and (stack.base is not None or index < sides[-1])):
                     raise ValueError(
-                        f"layers[{index}]: ENDF carries a Medium only between the two sides of a coat or slab; "
+                        f"{name}: ENDF carries a Medium only between the two sides of a coat or slab; "
                         "Statistical, AddingDoubling and RandomWalk carry others"
                     )
             elif index in sides[most:]:
                 raise ValueError(
-                    f"layers[{index}]: ENDF carries one Interface over a base, and two without; Statistical, "
+                    f"{name}: ENDF carries one Interface over a base, and two without; Statistical, "
                     "AddingDoubling and RandomWalk carry more"
                 )
             elif index in sides[1:] and not _is_one(layer.ior):
                 raise ValueError(
-                    f"layers[{index}].ior: ENDF carries a slab only in one surrounding (this must be known to be 1, "
+                    f"{name}.ior: ENDF carries a slab only in one surrounding (this must be known to be 1, "
                     "not traced); Statistical, AddingDoubling and RandomWalk do"
                 )
         if not (stack.base is None or isinstance(stack.base, Conductor)):
@@ -115,14 +115,13 @@ class ENDF(Transport):
             )
 
     def prepare(self, stack: Stack) -> Sides:
-        slim = simplify(stack)
-        faces = [layer for layer in slim.layers if isinstance(layer, Interface)]
-        media = tuple(media_of(slim))
+        faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+        media = tuple(media_of(stack))
         if not faces:
-            return Sides(Coat(None, media, _metal(slim.base, 1.0)), None)
+            return Sides(Coat(None, media, _metal(stack.base, 1.0)), None)
         top = Face(faces[0].ior, concentration(faces[0].alpha))
-        if slim.base is not None:
-            return Sides(Coat(top, media, _metal(slim.base, top.ior)), None)
+        if stack.base is not None:
+            return Sides(Coat(top, media, _metal(stack.base, top.ior)), None)
         inverse = 1.0 / top.ior
         if len(faces) == 1:
             return Sides(Coat(top, (), None), Coat(Face(inverse, top.kappa), (), None))
@@ -183,13 +182,6 @@ def _metal(base: Any, above: Any) -> Mirror | None:
         return None
     ior, k = (tuple(value / above for value in per_channel(part)) for part in (base.ior, base.k))
     return Mirror(concentration(base.alpha), ior, k)
-
-
-def _kept(stack: Stack) -> list[tuple[int, Interface | Medium]]:
-    """The layers that `simplify` leaves, with their places in the list that the user gave."""
-    sizes = [len(simplify(Stack(stack.layers[:count])).layers) for count in range(len(stack.layers) + 1)]
-    places = [index for index, (before, after) in enumerate(itertools.pairwise(sizes)) if after > before]
-    return list(zip(places, simplify(stack).layers, strict=True))
 
 
 def _is_one(index: Any) -> bool:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -17,8 +16,7 @@ from jax import Array
 from layerjax import fresnel
 from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, add, combine, dot, frame, half_vector, scale, select
-from layerjax.phase import SGGX, HenyeyGreenstein, PhaseFunction
-from layerjax.quadrature import henyey_greenstein_inverse
+from layerjax.phase import PhaseFunction
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.transport.random_walk.random_numbers import circle
 
@@ -98,12 +96,10 @@ class Scene:
     def collide(self, medium: Array | None, wi: Vector, wo: Vector, areas: Array) -> tuple[Array, Channels]:
         """Phase function p(wi, wo), 1/sr, and the share that a collision from wi to wo keeps."""
         density = jnp.zeros_like(wi[2])
-        half = half_vector(wi, wo) if any(isinstance(phase, SGGX) for _, phase in self._merged(medium)) else None
-        if half is None and self._fresnel():
-            half = half_vector(wi, wo)
+        shared = any(medium.phase.uses_half_vector for medium in self.media)
+        half = half_vector(wi, wo) if shared or self._fresnel() else None
         for members, phase in self._merged(medium):
-            if isinstance(phase, SGGX):
-                assert half is not None
+            if phase.uses_half_vector and half is not None:
                 value = phase.kernel(wi, wo, half[0]) / areas
             else:
                 value = phase.pdf(wi, wo)
@@ -114,7 +110,8 @@ class Scene:
         """A direction drawn from the phase function, and the share that is kept."""
         wo: Vector = wi
         for members, phase in self._merged(medium):
-            drawn = phase.sample(wi, u1, u2) if isinstance(phase, SGGX) else _deflect_haze(phase.g, wi, u1, u2)
+            deflection = phase.deflection(u1)
+            drawn = phase.sample(wi, u1, u2) if deflection is None else _deflected(wi, *deflection, u2)
             wo = drawn if len(self.groups) == 1 else select(_is_in(medium, members), drawn, wo)
         if not self._fresnel():
             return wo, self._kept(medium, None)
@@ -153,9 +150,8 @@ class Scene:
         return jnp.where(from_above, below, above) / jnp.where(from_above, above, below)
 
 
-def _deflect_haze(g: Array, wi: Vector, u1: Array, u2: Array) -> Vector:
-    """`HenyeyGreenstein.sample`, with the azimuth from a polynomial; this is the innermost work of most walks."""
-    cosine, sine = henyey_greenstein_inverse(g, 2.0 * u1 - 1.0)
+def _deflected(wi: Vector, cosine: Array, sine: Array, u2: Array) -> Vector:
+    """`layerjax.phase.contract.deflected`, with the azimuth from a polynomial: the innermost work of most walks."""
     axis = scale(-1.0, wi)
     tangent, bitangent = frame(axis)
     c, s = circle(u2)
@@ -164,11 +160,11 @@ def _deflect_haze(g: Array, wi: Vector, u1: Array, u2: Array) -> Vector:
 
 
 def _groups(phases: Sequence[PhaseFunction]) -> list[list[int]]:
-    """Media by kind of phase function: the members of a group share their arithmetic."""
+    """Media by kind of phase function: the members of a group differ in numbers alone and share their arithmetic."""
     groups: dict[Any, list[int]] = {}
     for j, phase in enumerate(phases):
-        kind = (phase.kind, phase.axis is None) if isinstance(phase, SGGX) else HenyeyGreenstein
-        groups.setdefault(kind, []).append(j)
+        leaves, structure = jax.tree.flatten(phase)
+        groups.setdefault((structure, *map(jnp.shape, leaves)), []).append(j)
     return list(groups.values())
 
 
@@ -182,12 +178,11 @@ def _merge(medium: Array | None, members: Sequence[int], media: Sequence[Any]) -
     def pick_leaf(*leaves: Array) -> Array:
         result = leaves[0]
         for j, leaf in zip(members[1:], leaves[1:], strict=True):
-            chosen = (medium == j)[:, None] if leaf.ndim else medium == j
+            chosen = jnp.reshape(medium == j, (-1, *(1,) * jnp.ndim(leaf))) if jnp.ndim(leaf) else medium == j
             result = jnp.where(chosen, leaf, result)
         return result
 
-    leaves = [eqx.partition(phase, eqx.is_array) for phase in phases]
-    return eqx.combine(jax.tree.map(pick_leaf, *(arrays for arrays, _ in leaves)), leaves[0][1])
+    return jax.tree.map(pick_leaf, *phases)
 
 
 def _is_in(medium: Array | None, members: Sequence[int]) -> Array:

@@ -4,7 +4,7 @@ See `layerjax.transport.random_walk.walk` for the estimator, `layerjax.transport
 the lanes, and `layerjax.transport.random_walk.random_numbers` for the random numbers.
 """
 
-from typing import ClassVar
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,16 +14,16 @@ from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import facet_density, sample
-from layerjax.stack import Interface, Stack, simplify
+from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.contract import Side, Transport, refuse_vmf
+from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
 from layerjax.transport.random_walk.lanes import average, upright
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Microfacets, Orders, Walk
 
 
-class RandomWalk(Transport):
+class RandomWalk(RandomTransport):
     """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
 
     Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. The same
@@ -37,8 +37,6 @@ class RandomWalk(Transport):
             reflection or refraction at an interface, or a reflection at the base.
         lanes: number of paths that are under way at a time.
     """
-
-    random: ClassVar[bool] = True
 
     paths: int = eqx.field(static=True, default=16384)
     microfacets: Microfacets = eqx.field(static=True, default="single")
@@ -57,18 +55,12 @@ class RandomWalk(Transport):
             if value not in allowed:
                 raise ValueError(f"RandomWalk.{name}: {value!r} is not one of {', '.join(map(repr, allowed))}")
 
-    def check(self, stack: Stack) -> None:
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
         if self.microfacets == "multiple":
-            refuse_vmf(stack, 'RandomWalk(microfacets="multiple")')
+            refuse_vmf(stack, names, 'RandomWalk(microfacets="multiple")')
 
     def prepare(self, stack: Stack) -> Stack:
-        return simplify(stack)
-
-    def evaluate(self, state: Stack, wi: Vector, wo: Vector, side: Side) -> Channels:
-        raise ValueError("RandomWalk: evaluation draws random numbers and needs a key: evaluate(..., key=...)")
-
-    def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
-        raise ValueError("RandomWalk: the albedo is drawn at random and needs a key: albedo(..., key=...)")
+        return stack
 
     def estimate(
         self, state: Stack, wi: Vector, wo: Vector, side: Side, channels: int, key: Array

@@ -23,7 +23,7 @@ from layerjax._numerics import safe_sqrt
 from layerjax.channels import Channels, count, mean, per_channel, pick
 from layerjax.directions import Vector, add, dot, half_vector, normalize, split
 from layerjax.normals.sggx import radii, squared_lengths
-from layerjax.phase import SGGX, HenyeyGreenstein
+from layerjax.phase import SGGX, HenyeyGreenstein, PhaseFunction
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium
 from layerjax.transport.contract import Side
@@ -85,9 +85,10 @@ def second_lobe(
         taus = [shape.thickness[k] for shape in shapes]
         # of a medium of one thickness the mean: as exact as one for each channel, and costs less
         thickness = jnp.stack(taus) if jnp.ndim(medium.thickness) else mean(taus)
-        phase: SGGX | HenyeyGreenstein = HenyeyGreenstein(alpha[k])
-        if isinstance(medium.phase, SGGX):
-            phase = BlurredSGGX(medium.phase.kind, alpha[k], medium.phase.axis, blur[k])
+        flakes = medium.phase.flakes
+        phase: PhaseFunction = HenyeyGreenstein(alpha[k])
+        if flakes is not None:
+            phase = BlurredSGGX(flakes.kind, alpha[k], flakes.axis, blur[k])
         plain = Medium(thickness, 1.0, phase)
         slab.append(eqx.tree_at(lambda m: m.albedo, plain, 1.0))  # known: nothing to multiply by
     weights = [weights_of(net, number, albedo, f0) for number in numbers]
@@ -99,9 +100,15 @@ def second_lobe(
     return SecondLobe(Media(tuple(slab), None), jax.tree.map(lambda *each: jnp.stack(each), *weights), bend)
 
 
+def has_learned(phase: PhaseFunction) -> bool:
+    """Whether media of this phase function are among those that the networks know."""
+    return phase.flakes is not None or phase.forward_lobe is not None
+
+
 def has_axes(media: tuple[Medium, ...]) -> bool:
     """Whether anything may depend on the azimuth."""
-    return any(isinstance(medium.phase, SGGX) and medium.phase.axis is not None for medium in media)
+    flakes = [medium.phase.flakes for medium in media]
+    return any(each is not None and each.axis is not None for each in flakes)
 
 
 def _of_type(net: eqx.nn.MLP, dtype: Any) -> eqx.nn.MLP:
@@ -205,7 +212,7 @@ def flux(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> list[tuple
         peaked: Vector = (x, y, z)
         solid_angle = jnp.concatenate([solid_angle for _, solid_angle in rule], axis=-1)
         share = jnp.ones_like(solid_angle)  # a Henyey-Greenstein lobe is followed whole
-        if not isinstance(phase, HenyeyGreenstein):
+        if isinstance(phase, BlurredSGGX):
             share, rest = _peaked(phase, spread, peaked), 1.0 - _peaked(phase, spread, wo)
             terms.append(tuple(rest * value for value in lobe))
         there = _lobes(second, spread, peaked, "all", opaque)[k]
@@ -214,9 +221,8 @@ def flux(second: SecondLobe, wi: Vector, nodes: int, opaque: bool) -> list[tuple
     return [*parts, (wo, tuple(value * weight for value in even))]
 
 
-def _peaked(phase: SGGX, wi: Vector, wo: Vector) -> Array:
+def _peaked(phase: BlurredSGGX, wi: Vector, wo: Vector) -> Array:
     """Share of the kernel that nodes which follow its peak account for."""
-    assert isinstance(phase, BlurredSGGX)
     sharp = phase.sharp(wi, wo)
     return sharp / (sharp + 1.0 / jnp.pi)
 
@@ -259,14 +265,14 @@ def _numbers(media: tuple[Medium, ...], c: int, dtype: Any) -> Numbers:
     rows = []
     for medium in media:
         thickness, albedo, f0 = (pick(per_channel(jnp.asarray(value, dtype)), c) for value in _optics(medium))
-        phase = medium.phase
+        flakes = medium.phase.flakes
         one, zero = jnp.ones_like(thickness), jnp.zeros_like(thickness)
         axis = jnp.stack([zero, zero, one])
-        if isinstance(phase, HenyeyGreenstein):
-            rows.append((jnp.stack([zero, zero, one]), one, phase.g, thickness, albedo, f0, axis))
+        if flakes is None:
+            rows.append((jnp.stack([zero, zero, one]), one, medium.phase.forward_lobe, thickness, albedo, f0, axis))
             continue
-        kind = jnp.stack([one, zero, zero] if phase.kind == "surface" else [zero, one, zero])
-        if phase.axis is not None:
-            axis = jnp.stack(normalize(split(phase.axis)))
-        rows.append((kind, phase.alpha, zero, thickness, albedo, f0, axis))
+        kind = jnp.stack([one, zero, zero] if flakes.kind == "surface" else [zero, one, zero])
+        if flakes.axis is not None:
+            axis = jnp.stack(normalize(split(flakes.axis)))
+        rows.append((kind, flakes.alpha, zero, thickness, albedo, f0, axis))
     return Numbers(*(jnp.stack([jnp.asarray(row[n], dtype) for row in rows]) for n in range(len(Numbers._fields))))

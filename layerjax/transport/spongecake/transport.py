@@ -1,6 +1,6 @@
 """SpongeCake with multiple scattering (Wang et al. 2022, Sec. 5): single scattering, a second lobe, and a constant."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
@@ -10,13 +10,20 @@ from jax import Array
 
 from layerjax.channels import Channels, total
 from layerjax.directions import Vector
-from layerjax.stack import Interface, Stack, is_known, media_of, simplify
+from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
-from layerjax.transport.contract import Side, Transport
+from layerjax.transport.contract import DeterministicTransport, Side
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.bending import bend_network
 from layerjax.transport.spongecake.layers import MOST, is_traced, pair_of
-from layerjax.transport.spongecake.lobes import Hemisphere, SecondLobe, evaluate_second, second_albedo, second_lobe
+from layerjax.transport.spongecake.lobes import (
+    Hemisphere,
+    SecondLobe,
+    evaluate_second,
+    has_learned,
+    second_albedo,
+    second_lobe,
+)
 from layerjax.transport.spongecake.mapping import network, unpack
 
 Proposal = Literal["first", "both"]
@@ -34,7 +41,7 @@ class Mapped(eqx.Module):
     opaque: bool = eqx.field(static=True)
 
 
-class SpongeCake(Transport):
+class SpongeCake(DeterministicTransport):
     """Single scattering exactly, and multiple scattering as a second lobe and a constant (Wang et al. 2022).
 
     Carries `Medium` layers over any surface or none. The second lobe's parameters come from a network that has learned
@@ -63,14 +70,19 @@ class SpongeCake(Transport):
             allowed = ", ".join(map(repr, get_args(Proposal)))
             raise ValueError(f"SpongeCake.proposal: {self.proposal!r} is not one of {allowed}")
 
-    def check(self, stack: Stack) -> None:
-        for index, layer in enumerate(stack.layers):
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Interface):
                 raise ValueError(
-                    f"layers[{index}]: SpongeCake carries no Interface (media over a base only); "
+                    f"{name}: SpongeCake carries no Interface (media over a base only); "
                     "AddingDoubling and RandomWalk do"
                 )
-        media = tuple(media_of(simplify(stack)))
+            if not has_learned(layer.phase):
+                raise ValueError(
+                    f"{name}: SpongeCake has learned no {type(layer.phase).__name__} medium (HenyeyGreenstein and SGGX "
+                    "only); SingleScattering, AddingDoubling and RandomWalk carry it"
+                )
+        media = tuple(media_of(stack))
         if len(media) > MOST and is_traced(media):
             raise ValueError(
                 f"layers: SpongeCake puts {len(media)} media together to {MOST} by their numbers, which are traced "

@@ -3,6 +3,8 @@
 The paper's form, from its tables; `layerjax.transport.statistical.diffuse_base` has the closed form beside it.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -25,15 +27,15 @@ class DiffuseLobe(eqx.Module):
     alpha: Array
 
 
-def why_no_lobe(stack: Stack) -> str | None:
-    """What keeps a simplified stack from having this lobe, by name; None if nothing does."""
+def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:
+    """What keeps a simplified stack with layers of these names from having this lobe; None if nothing does."""
     if not isinstance(stack.base, Lambertian):
         return "base: the lobe of a diffuse base is that of a Lambertian"
     if not stack.layers or not isinstance(stack.layers[0], Interface):
         return "layers: the lobe of a diffuse base needs an Interface on top"
-    for index, layer in enumerate(stack.layers):
+    for name, layer in zip(names, stack.layers, strict=True):
         if isinstance(layer, Medium) and not is_known(layer.albedo, 0.0):
-            return f"layers[{index}]: the lobe of a diffuse base needs media that only absorb (albedo known to be 0)"
+            return f"{name}: the lobe of a diffuse base needs media that only absorb (albedo known to be 0)"
     return None
 
 

@@ -17,7 +17,6 @@ from layerjax import fresnel
 from layerjax._numerics import at_least, at_most
 from layerjax.channels import per_channel
 from layerjax.microsurface.directional_albedo import conductor_energy, interface_energies, is_smooth, retained
-from layerjax.phase import HenyeyGreenstein
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
 from layerjax.transport.statistical.adding import Element, Lobe, add_element, nothing, retain
@@ -194,14 +193,13 @@ def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, t
     """Element of a medium; and the optical depth that scatters with the variance of a collision, None if none does."""
     depth = jnp.stack(per_channel(medium.thickness))[:, None] / cosine
     zero = jnp.zeros_like(cosine)[None]
-    scatters = not is_known(medium.albedo, 0.0) and isinstance(medium.phase, HenyeyGreenstein)
-    if not scatters:
+    g = medium.phase.forward_lobe
+    if g is None or is_known(medium.albedo, 0.0):
         t = jnp.exp(-depth)[None]
         return Element(zero[None], t, zero[None], t, zero, zero, zero, jnp.ones_like(zero)), None
     albedo = jnp.asarray(medium.albedo)
     scattered = (albedo[:, None] if albedo.ndim else albedo) * depth
-    assert isinstance(medium.phase, HenyeyGreenstein)
-    width = phase_variance(jnp.asarray(medium.phase.g))
+    width = phase_variance(jnp.asarray(g))
     if options.scattering == "single":
         t = jnp.exp(jnp.log1p(scattered) - depth)[None]  # (1 + t) exp(-t)
         added = scattered / (1.0 + scattered) * width

@@ -4,6 +4,7 @@ Each group of paths (reflected at the same layer, any number of turns above) is 
 follow from adding. Over a diffuse base the light that has reached it leaves as a product of two transmittances.
 """
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -16,12 +17,11 @@ from layerjax.channels import Channels
 from layerjax.directions import Vector, add, dot, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import facet_density
 from layerjax.normals.sggx import ggx_density, ggx_sample, sggx_area
-from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
-from layerjax.stack import Interface, Medium, Stack, simplify
+from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.microfacet import interface_reflection
-from layerjax.transport.contract import Side, Transport, refuse_vmf
+from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import mirror
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
@@ -62,7 +62,7 @@ class Statistics(eqx.Module):
     reference: Array
 
 
-class Statistical(Transport):
+class Statistical(DeterministicTransport):
     """Layered statistics: any number of dielectric interfaces and media over a conductor, a diffuse base, or none.
 
     Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
@@ -100,42 +100,39 @@ class Statistical(Transport):
                 allowed = ", ".join(map(repr, get_args(choices)))
                 raise ValueError(f"Statistical.{name}: {value!r} is not one of {allowed}")
 
-    def check(self, stack: Stack) -> None:
-        refuse_vmf(stack, "Statistical")
-        for index, layer in enumerate(stack.layers):
-            if isinstance(layer, Medium) and isinstance(layer.phase, SGGX):
+    def check(self, stack: Stack, names: Sequence[str]) -> None:
+        refuse_vmf(stack, names, "Statistical")
+        for name, layer in zip(names, stack.layers, strict=True):
+            if isinstance(layer, Medium) and layer.phase.forward_lobe is None:
                 raise ValueError(
-                    f"layers[{index}]: Statistical carries no SGGX medium (HenyeyGreenstein only); "
+                    f"{name}: Statistical carries no {type(layer.phase).__name__} medium (HenyeyGreenstein only); "
                     "AddingDoubling and RandomWalk do"
                 )
             if isinstance(layer, Medium) and layer.f0 is not None:
                 raise ValueError(
-                    f"layers[{index}].f0: Statistical carries no Fresnel term of a medium; "
-                    "AddingDoubling and RandomWalk do"
+                    f"{name}.f0: Statistical carries no Fresnel term of a medium; AddingDoubling and RandomWalk do"
                 )
-
         if self.diffuse == "lobe" and _is_diffuse(stack.base):
-            reason = why_no_lobe(simplify(stack))
+            reason = why_no_lobe(stack, names)
             if reason is not None:
                 raise ValueError(f'{reason}; Statistical(diffuse="exact") takes any')
 
     def prepare(self, stack: Stack) -> Statistics:
-        slim = simplify(stack)
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side)
         diffuse: DiffusePart | None = None
-        if slim.base is not None and _is_diffuse(slim.base):
-            if not slim.layers:
-                diffuse = slim.base
+        if stack.base is not None and _is_diffuse(stack.base):
+            if not stack.layers:
+                diffuse = stack.base
             elif self.diffuse == "exact":
-                diffuse = make_diffuse(slim, slim.base, self.microfacets)
+                diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
-                diffuse = make_diffuse_lobe(slim)
+                diffuse = make_diffuse_lobe(stack)
         return Statistics(
-            top=make_table(slim, options, upward=False),
-            bottom=None if slim.base is not None else make_table(slim, options, upward=True),
+            top=make_table(stack, options, upward=False),
+            bottom=None if stack.base is not None else make_table(stack, options, upward=True),
             diffuse=diffuse,
-            below=index_below(slim),
-            reference=reference_index(slim),
+            below=index_below(stack),
+            reference=reference_index(stack),
         )
 
     def evaluate(self, state: Statistics, wi: Vector, wo: Vector, side: Side) -> Channels:

@@ -235,8 +235,9 @@ def test_widths_have_the_range_of_their_distribution():
 
 
 def test_automatic_takes_a_transport_that_carries_them():
-    assert type(automatic(lj.Stack([face(1.5, 50.0)], lj.Lambertian(0.5)))) is lj.AddingDoubling
-    assert type(automatic(lj.Stack([], metal(50.0)))) is lj.SingleScattering
+    coated, bare = lj.Stack([face(1.5, 50.0)], lj.Lambertian(0.5)), lj.Stack([], metal(50.0))
+    assert type(automatic(coated, coated)) is lj.AddingDoubling
+    assert type(automatic(bare, bare)) is lj.SingleScattering
 
 
 def test_files_say_which():

@@ -1,14 +1,6 @@
-"""Phase functions of media: Henyey-Greenstein, and SGGX flakes of any orientation.
+"""Flakes and fibers of any orientation, as small mirrors (Heitz et al. 2015; Wang et al. 2022)."""
 
-Each offers the same few functions of directions as components (see `layerjax.directions`):
-
-- ``cross_section(w)``: extinction along w per unit of thickness, sigma(w);
-- ``kernel(wi, wo, h)``: sigma(wi) p(wi, wo), symmetric, 1/sr, before albedo and Fresnel; h is the half vector if known;
-- ``sample(wi, u1, u2)`` and ``pdf(wi, wo)``: exact sampling of p, and p itself;
-- ``rule(wi, nodes)``: quadrature nodes that resolve the lobe (see `layerjax.quadrature`).
-"""
-
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,51 +10,13 @@ from jax import Array
 
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, floating, is_placeholder, parameter
-from layerjax.directions import Vector, add, combine, dot, frame, half_vector, normalize, reflect, scale, split
+from layerjax.directions import Vector, half_vector, normalize, reflect, split
 from layerjax.normals.sggx import Kind, radii, sggx_area, sggx_density, sggx_sample
-from layerjax.quadrature import Rule, flake_rule, henyey_greenstein_inverse, henyey_greenstein_rule
+from layerjax.phase.contract import Flakes, PhaseFunction
+from layerjax.quadrature import Rule, flake_rule
 
 
-class HenyeyGreenstein(eqx.Module):
-    """Henyey-Greenstein phase function (Henyey & Greenstein 1941).
-
-    ========= ====== ================ ======= ============================================
-    parameter symbol range            default meaning
-    ========= ====== ================ ======= ============================================
-    g         g      [-0.999, 0.999]          mean cosine of deflection; > 0 scatters onward
-    ========= ====== ================ ======= ============================================
-    """
-
-    g: Parameter = parameter("HenyeyGreenstein.g")
-
-    def cross_section(self, w: Vector) -> Array:
-        return jnp.ones_like(w[2])
-
-    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
-        return self.pdf(wi, wo)
-
-    def pdf(self, wi: Vector, wo: Vector) -> Array:
-        g = self.g
-        # 1 + g^2 + 2 g wi.wo with both vectors outward, as a sum of positive terms
-        total = add(wi, wo)
-        difference = combine(1.0, wi, -1.0, wo)
-        forward = (1.0 - g) ** 2 + g * dot(total, total)
-        backward = (1.0 + g) ** 2 - g * dot(difference, difference)
-        denominator = jnp.where(g > 0, forward, backward)
-        return (1.0 - g * g) / (4.0 * jnp.pi * denominator * jnp.sqrt(denominator))
-
-    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        cosine, sine = henyey_greenstein_inverse(self.g, 2.0 * u1 - 1.0)
-        axis = scale(-1.0, wi)
-        tangent, bitangent = frame(axis)
-        phi = 2.0 * jnp.pi * u2
-        return add(combine(sine * jnp.cos(phi), tangent, sine * jnp.sin(phi), bitangent), scale(cosine, axis))
-
-    def rule(self, wi: Vector, nodes: int) -> Rule:
-        return henyey_greenstein_rule(wi, self.g, nodes)
-
-
-class SGGX(eqx.Module):
+class SGGX(PhaseFunction):
     """Flakes with an SGGX distribution of normals (Heitz et al. 2015; Wang 2022, Sec. 4), as small mirrors.
 
     ========= ====== ===================== ======== ===========================================================
@@ -74,6 +28,9 @@ class SGGX(eqx.Module):
                                                     and costs less than a given axis
     ========= ====== ===================== ======== ===========================================================
     """
+
+    uses_half_vector: ClassVar[bool] = True
+    peaks_forward: ClassVar[bool] = False
 
     kind: Kind = eqx.field(static=True)
     alpha: Parameter = parameter("SGGX.alpha")
@@ -100,15 +57,28 @@ class SGGX(eqx.Module):
     def rule(self, wi: Vector, nodes: int) -> Rule:
         return flake_rule(wi, *radii(self.kind, self.alpha), self._axis(), nodes)
 
+    @property
+    def is_upright(self) -> bool:
+        if self.axis is None:
+            return True
+        return not isinstance(self.axis, jax.core.Tracer) and not np.any(np.asarray(self.axis)[:2] != 0.0)
+
+    def mirrored(self) -> "SGGX":
+        if self.axis is None:
+            return self
+        flip = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(self.axis).dtype)
+        return eqx.tree_at(lambda phase: phase.axis, self, self.axis * flip)
+
+    @property
+    def flakes(self) -> Flakes:
+        return Flakes(self.kind, self.alpha, self.axis)
+
     def _axis(self) -> Vector | None:
         if self.axis is None:
             return None
         # its square must neither overflow nor vanish
         longest = jax.lax.stop_gradient(jnp.max(jnp.abs(self.axis)))
         return normalize(split(safe_div(self.axis, longest)))
-
-
-PhaseFunction = HenyeyGreenstein | SGGX
 
 
 def _axis(axis: Any) -> Any:

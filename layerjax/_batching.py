@@ -1,0 +1,58 @@
+"""Large batches of directions in chunks that fit the cache, on the way there and back."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax.directions import split
+
+CHUNK_BYTES = 20_000
+"""Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
+
+BLOCK_CHUNKS = 4
+"""Chunks that are transposed together."""
+
+
+def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:
+    """function over arrays of shape ``(..., 3)`` as components, its results along a new last axis.
+
+    Many pairs run in blocks, which are transposed to components and back (a loop that reads every third number takes
+    several times as long as the arithmetic), and these in chunks that stay in the cache. A gradient keeps the
+    directions alone and computes each block, and each chunk of it, again on the way back.
+    """
+    batch = jnp.broadcast_shapes(*(array.shape for array in inputs))[:-1]
+    pairs = math.prod(batch)
+    chunk = CHUNK_BYTES // inputs[0].dtype.itemsize
+    if pairs <= 2 * chunk:
+        return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
+    flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]
+    size = BLOCK_CHUNKS * chunk
+    whole = pairs // size * size
+    run = partial(_block, function, chunk)
+    parts = []
+    if whole:
+        blocks = [array[:whole].reshape(-1, size, 3) for array in flat]
+        step = jax.checkpoint(lambda _, rows: (None, run(*rows)))
+        _, results = jax.lax.scan(step, None, blocks)
+        parts.append(results.reshape(whole, -1))
+    if whole < pairs:
+        left = pairs - whole
+        number = -(-left // chunk)
+        even = -(-left // number)
+        # a vector of zeros is no direction: it gives 0
+        rest = [jnp.pad(array[whole:], ((0, number * even - left), (0, 0))) for array in flat]
+        parts.append(_block(function, even, *rest)[:left])
+    return jnp.concatenate(parts).reshape(*batch, -1)
+
+
+def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:
+    """function over a whole number of chunks, (n, 3) each."""
+    vectors = [tuple(array.T.reshape(3, -1, chunk)) for array in jax.lax.optimization_barrier(rows)]
+    step = jax.checkpoint(lambda _, vectors: (None, function(*vectors)))
+    _, results = jax.lax.scan(step, None, jax.lax.optimization_barrier(vectors))
+    together = jax.lax.optimization_barrier(jnp.stack([result.reshape(-1) for result in results]))
+    return together.T

@@ -1,0 +1,99 @@
+"""What every phase function offers, and what it may say of itself so that transports can make use of it."""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._parameters import Parameter
+from layerjax.directions import Vector, add, combine, frame, scale
+from layerjax.normals.sggx import Kind
+from layerjax.quadrature import Rule, sphere_rule
+
+
+class Flakes(NamedTuple):
+    """An SGGX distribution of normals, see `layerjax.phase.sggx.SGGX` for what its parts are."""
+
+    kind: Kind
+    alpha: Parameter
+    axis: Parameter
+
+
+class PhaseFunction(eqx.Module):
+    """Where a collision sends the light: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
+
+    Directions come as components that point away from the collision (see `layerjax.directions`): light that goes
+    straight on has wo = -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and
+    -wo. `pdf` and `sample` are all that a class must add; where sigma is not 1, `cross_section` too, and where p is not
+    the same for all azimuths, `is_upright` and `mirrored`. All else is for speed, accuracy or further transports.
+
+    Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `between`.
+    """
+
+    uses_half_vector: ClassVar[bool] = False
+    """Whether `kernel` is faster if it is given the half vector."""
+
+    peaks_forward: ClassVar[bool] = True
+    """What becomes of a peak too narrow for a grid of directions: what the grid misses of it goes straight on, as of
+    narrow forward lobes; or else (False) the kernel is scaled to its energy, as of mirrors."""
+
+    @abc.abstractmethod
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        """p(wi, wo), 1/sr, which is also the density of `sample`."""
+
+    @abc.abstractmethod
+    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        """A direction wo drawn from p exactly, from two uniform numbers."""
+
+    def cross_section(self, w: Vector) -> Array:
+        """Extinction sigma(w) along w for a unit of thickness."""
+        return jnp.ones_like(w[2])
+
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
+        """sigma(wi) p(wi, wo), 1/sr, before albedo and Fresnel term; h is the half vector, if it is known."""
+        return self.cross_section(wi) * self.pdf(wi, wo)
+
+    def deflection(self, u: Array) -> tuple[Array, Array] | None:
+        """Cosine and sine of the angle by which a collision turns light, drawn from a uniform number.
+
+        None: p depends on more than that angle.
+        """
+        return None
+
+    def rule(self, wi: Vector, nodes: int) -> Rule:
+        """Quadrature over both hemispheres (see `layerjax.quadrature`) that resolves p however narrow it is.
+
+        Unless overridden, one for lobes that are not narrow.
+        """
+        return sphere_rule(wi, nodes)
+
+    @property
+    def is_upright(self) -> bool:
+        """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
+        return True
+
+    def mirrored(self) -> "PhaseFunction":
+        """The same upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
+        return self
+
+    @property
+    def forward_lobe(self) -> Parameter | None:
+        """g of the Henyey-Greenstein lobe that may stand for p, where light is followed forward alone and sigma is 1.
+
+        None: no such lobe may.
+        """
+        return None
+
+    @property
+    def flakes(self) -> Flakes | None:
+        """The normals, if light meets small mirrors; None: it does not."""
+        return None
+
+
+def deflected(wi: Vector, cosine: Array, sine: Array, phi: Array) -> Vector:
+    """Light along wi, turned by an angle with that cosine and sine at the azimuth phi about where it was going."""
+    axis = scale(-1.0, wi)
+    tangent, bitangent = frame(axis)
+    return add(combine(sine * jnp.cos(phi), tangent, sine * jnp.sin(phi), bitangent), scale(cosine, axis))

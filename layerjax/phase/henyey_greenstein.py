@@ -1,0 +1,48 @@
+"""The phase function of Henyey & Greenstein (1941): haze, pigment and tissue."""
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._parameters import Parameter, parameter
+from layerjax.directions import Vector, add, combine, dot
+from layerjax.phase.contract import PhaseFunction, deflected
+from layerjax.quadrature import Rule, henyey_greenstein_inverse, henyey_greenstein_rule
+
+
+class HenyeyGreenstein(PhaseFunction):
+    """Henyey-Greenstein phase function (Henyey & Greenstein 1941).
+
+    ========= ====== ================ ======= ============================================
+    parameter symbol range            default meaning
+    ========= ====== ================ ======= ============================================
+    g         g      [-0.999, 0.999]          mean cosine of deflection; > 0 scatters onward
+    ========= ====== ================ ======= ============================================
+    """
+
+    g: Parameter = parameter("HenyeyGreenstein.g")
+
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
+        return self.pdf(wi, wo)
+
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        g = self.g
+        # 1 + g^2 + 2 g wi.wo with both vectors outward, as a sum of positive terms
+        total = add(wi, wo)
+        difference = combine(1.0, wi, -1.0, wo)
+        forward = (1.0 - g) ** 2 + g * dot(total, total)
+        backward = (1.0 + g) ** 2 - g * dot(difference, difference)
+        denominator = jnp.where(g > 0, forward, backward)
+        return (1.0 - g * g) / (4.0 * jnp.pi * denominator * jnp.sqrt(denominator))
+
+    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        return deflected(wi, *self.deflection(u1), 2.0 * jnp.pi * u2)
+
+    def deflection(self, u: Array) -> tuple[Array, Array]:
+        return henyey_greenstein_inverse(self.g, 2.0 * u - 1.0)
+
+    def rule(self, wi: Vector, nodes: int) -> Rule:
+        return henyey_greenstein_rule(wi, self.g, nodes)
+
+    @property
+    def forward_lobe(self) -> Parameter:
+        return self.g
