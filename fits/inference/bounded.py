@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.problem.problem import Model, Problem, half_squares
+from fits.problem.model import Model, half_squares
+from fits.problem.problem import Problem
 
 TOLERANCE = 1e-12
 MOST_STEPS = 500

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.inference.identifiability import Combination
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 

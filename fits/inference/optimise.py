@@ -19,8 +19,9 @@ from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.starts import End, Solver, polished, run_starts, solve_start, start_points
 from fits.inference.uncertainty import Uncertainty, uncertainty
 from fits.problem.likelihood import Noise, Objective
+from fits.problem.model import Model, Transport
 from fits.problem.parameters import Free
-from fits.problem.problem import Model, Problem, Transport
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 Floats = NDArray[np.float64]

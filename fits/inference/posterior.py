@@ -23,7 +23,8 @@ from fits.inference.chain import FileChain, MemoryChain, stored_chain
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.mixture import Mixture
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 if TYPE_CHECKING:

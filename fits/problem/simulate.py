@@ -1,7 +1,6 @@
 """Simulated goniometer data: a stack seen along slices, with noise of known size."""
 
 import math
-from typing import Literal
 
 import numpy as np
 
@@ -9,13 +8,13 @@ import layerjax as lj
 from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import Measurements, Source, channel_names
-from fits.problem.problem import forward
+from fits.problem.model import Transport, forward
 
 
 def simulate(
     stack: lj.Stack,
     geometry: Geometry,
-    transport: lj.Transport | Literal["auto"] = "auto",
+    transport: Transport = "auto",
     noise: float = 0.0,
     floor: float = 0.0,
     seed: int = 0,
