@@ -20,12 +20,12 @@ MOST_STEPS = 500
 
 
 def cost(model: Model, s: Any) -> Any:
-    """Half the sum of squared residuals at `s` in the unit box."""
+    """Half the sum of squared residuals at `s` (P,) in the unit box."""
     return half_squares(model.residuals(model.box.from_unit(s)))
 
 
 def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:
-    """That and its gradient."""
+    """Half the sum of squared residuals at `s` (P,) in the unit box, and its gradient (P,) by `s`."""
     return jax.value_and_grad(cost, argnums=1)(model, s)
 
 

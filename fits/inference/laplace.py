@@ -129,6 +129,6 @@ def student(centre: Floats, root: Floats, positions: Floats) -> Floats:
 
 
 def student_draws(generator: np.random.RandomState, count: int, dimension: int) -> Floats:
-    """Draws (count, dimension) from the same about 0, of unit width."""
+    """Draws (count, dimension) from a Student-t about 0 of unit width."""
     normal = generator.standard_normal((count, dimension))
     return normal * np.sqrt(DEGREES_OF_FREEDOM / generator.chisquare(DEGREES_OF_FREEDOM, (count, 1)))

@@ -68,7 +68,7 @@ class Mixture:
         return cls(points, root, log_weight - logsumexp(log_weight), held)
 
     def refined(self, positions: Floats) -> "Mixture":
-        """It, fitted to samples (count, P) of the posterior, with a share of what it was.
+        """The mixture fitted to samples (count, P) of the posterior, with a share of what it was.
 
         By expectation and maximisation; every component counts as samples of its own, so that it keeps its full rank.
         """

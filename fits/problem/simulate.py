@@ -21,8 +21,21 @@ def simulate(
 ) -> Measurements:
     """The BSDF of a stack along `geometry`, with Gaussian noise of standard deviation sqrt((noise f)^2 + floor^2).
 
-    noise: relative, >= 0. floor: in 1/sr, >= 0. The deviation that was used becomes `sigma`, None if both are 0.
-    Samples where the stack gives 0 and floor is 0 carry no noise, which no measurement does: they are masked.
+    Args:
+        stack: holds numbers, nothing `Free`.
+        geometry: N pairs of directions, from `slices` say.
+        transport: as in `Problem`: a layerjax transport that is not random, "auto", or any callable
+            (stack, wi, wo) -> values.
+        noise: relative, unitless, >= 0.
+        floor: in 1/sr, >= 0.
+        seed: of the noise.
+
+    Returns:
+        (N, C) values, and the deviation that was used as `sigma`, None if `noise` and `floor` are 0. Samples where the
+        stack gives 0 and `floor` is 0 carry no noise, which no measurement does: they are masked.
+
+    Raises:
+        ValueError: a negative `noise` or `floor`, or a transport that is random or cannot carry the stack.
     """
     for name, level in (("noise", noise), ("floor", floor)):
         if not (math.isfinite(level) and level >= 0):

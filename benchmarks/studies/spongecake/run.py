@@ -161,7 +161,7 @@ def groups(samples: materials.Samples, media: int) -> dict[str, NDArray[np.bool_
 
 
 def held_out(samples: materials.Samples, media: int) -> list[Errors]:
-    """Errors of all kinds of materials."""
+    """Errors of the held-out materials, by kind."""
     lobes, cake = (_values(samples, ready) for ready in WAYS)
     first = _values(samples, partial(lj.prepare, transport=FIRST))
     truth = first + samples.values
@@ -203,7 +203,7 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
 
 
 def furnace(samples: materials.Samples, media: int) -> list[Furnace]:
-    """Energy of the same materials without absorption."""
+    """Energy of the held-out materials with their absorption taken away, by kind."""
     wi = jnp.asarray(lj.direction(jnp.deg2rad(jnp.asarray(ANGLES)), 0.4), jnp.float32)
     found = np.zeros((len(WAYS), len(samples.values), len(ANGLES)))
     for rows, make, numbers in _structures(samples):

@@ -138,8 +138,11 @@ class Cost:
 
 @dataclass(frozen=True)
 class Settings:
-    """How much was measured: slabs of one and two media, furnace angles in degrees, paths of the walk, rounds of
-    timing, and materials and epochs of the training that says what each step is worth."""
+    """How much was measured.
+
+    counts: slabs of one medium and of two. angles: of light in the furnace, degrees. paths: of the walk. rounds: of
+    timing. gain_materials, gain_epochs: of the training that says what each step is worth.
+    """
 
     counts: tuple[int, int]
     angles: tuple[float, ...]

@@ -112,6 +112,11 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
     Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees. The file appears whole or not at
     all.
 
+    Args:
+        measurements: what is written.
+        path: the file.
+        force: replace a file that is there.
+
     Raises:
         ValueError: the file exists and `force` is False, or the name of a channel would not come back: "cos" (the
             column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one.
