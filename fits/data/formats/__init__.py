@@ -1,4 +1,7 @@
-"""Readers of measured BSDFs, one file format a module; `read` looks at the content first and at the name last."""
+"""Readers and writers of measured BSDFs, one file format a module.
+
+`read` takes any of them, looks at the content first and at the name last, and gives `fits.Measurements`.
+"""
 
 from pathlib import Path
 
