@@ -39,7 +39,7 @@ Side = Literal["all", "reflection"]
 
 
 class Parts(NamedTuple):
-    """What a vector of parameters stands for."""
+    """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model."""
 
     stack: Any
     scale: Array
@@ -50,8 +50,20 @@ class Parts(NamedTuple):
 class Model(eqx.Module):
     """Pure functions of the physical vector (P,): predictions, residuals and log-densities over the used samples.
 
-    N samples, C channels. Arrays are traced by `jax.jit`, the rest is static. variance: the measurement's own, (N, C);
-    lowest: what sigma cannot fall below, (N, C); varying: whether sigma depends on the parameters.
+    Arrays are traced by `jax.jit`, the rest is static.
+
+    Attributes:
+        template: the stack, scale and noise levels without their free parameters.
+        box: bounds and priors of the P parameters.
+        wi, wo: directions of the N samples, (N, 3).
+        values: BSDF in C channels, (N, C), in 1/sr.
+        variance: the measurement's own, (N, C), in 1/sr^2.
+        lowest: what sigma cannot fall below, (N, C), in 1/sr.
+        degrees_of_freedom: of Student-t tails.
+        transport: how the values are computed.
+        side: "reflection" if all directions lie above.
+        objective, tails: see `Problem` and `Noise`.
+        varying: whether sigma depends on the parameters.
     """
 
     template: Template
@@ -120,7 +132,7 @@ class Model(eqx.Module):
         return log_density((self.values - predicted) / sigma, sigma, self.tails, self.degrees_of_freedom)
 
     def log_likelihood(self, vector: Array) -> Array:
-        """Sum over the data."""
+        """Normalised log-likelihood: the sum of the log-densities of all data."""
         return jnp.sum(self.log_likelihood_per_datum(vector))
 
     def log_prior(self, vector: Array) -> Array:

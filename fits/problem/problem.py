@@ -105,15 +105,15 @@ class Problem:
         return self.call(Model.predict, vector)
 
     def residuals(self, vector: ArrayLike) -> Array:
-        """All residuals of the least-squares problem, one after the other."""
+        """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
         return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
 
     def log_likelihood(self, vector: ArrayLike) -> Array:
-        """Normalised log-likelihood."""
+        """Normalised log-likelihood of the used samples with the physical vector (P,)."""
         return self.call(Model.log_likelihood, vector)
 
     def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum, (N, C)."""
+        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
         return self.call(Model.log_likelihood_per_datum, vector)
 
     def log_prior(self, vector: ArrayLike) -> Array:
