@@ -3,8 +3,9 @@
 Names are imported when they are first used: `import fits` loads neither arviz, matplotlib nor a solver.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from fits._lazy import names_from
 
 if TYPE_CHECKING:
     from fits.data.formats import read as read
@@ -64,9 +65,4 @@ _HOMES = {
 }
 
 __all__ = list(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'fits' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"fits.{_HOMES[name]}"), name)
+__getattr__ = names_from(__name__, _HOMES)

@@ -76,7 +76,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def text_checksum(path: Path) -> str:
-    """Of a text file, whatever its line ends: version control and editors may change those."""
+    """Checksum of a text file, whatever its line ends: version control and editors may change those."""
     text = path.read_bytes().replace(b"\r\n", b"\n")
     return f"{zlib.crc32(text):08x}"
 

@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 import fits
+import fits.inference
+import fits.problem
+import fits.reporting
 
 ROOT = Path(__file__).parents[1]
 
@@ -42,6 +45,7 @@ PACKAGES = [
     "layerjax",
     "layerjax.precompute",
     "fits._files",
+    "fits._lazy",
     "fits.progress",
     "fits.data",
     "fits.problem",
@@ -125,6 +129,11 @@ def test_importing_fits_pays_for_nothing_unused():
     assert not loaded_by("import fits") & {"arviz", "matplotlib", "jaxopt", "h5py", "rich", "emcee", "optimistix"}
 
 
-def test_public_names_are_no_modules():
+@pytest.mark.parametrize("room", [fits, fits.problem, fits.inference, fits.reporting], ids=lambda room: room.__name__)
+def test_public_names_are_there_and_no_modules(room):
     """Importing a module binds its name in its package: none may hide a function."""
-    assert not {f"fits.{name}" for name in fits.__all__} & MODULES.keys()
+    assert not {f"{room.__name__}.{name}" for name in room.__all__} & MODULES.keys()
+    for name in room.__all__:
+        assert getattr(room, name) is getattr(fits, name)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = room.nothing

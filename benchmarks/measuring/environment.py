@@ -2,7 +2,6 @@
 
 import os
 import platform
-import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -12,9 +11,8 @@ PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy", "optimistix", "emcee",
 
 
 def describe() -> dict[str, str | int]:
-    """Processor, cores, load, date and versions (only of what is installed)."""
+    """Processor, cores, load and versions (only of what is installed). No date: a rerun changes what differs."""
     found: dict[str, str | int] = {
-        "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "load average at the start": f"{os.getloadavg()[0]:.1f}",

@@ -1,7 +1,8 @@
 """Results as JSON and as a markdown table that lines up, each file written whole or not at all; and the bar."""
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from typing import Any
 from fits._files import write_text
 
 DIRECTORY = Path(__file__).parents[1] / "results"
+
+DIGITS = 6
+"""Significant digits of the numbers in a JSON file: what lies beyond differs between machines."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,60 @@ def environment_lines(environment: Mapping[str, Any]) -> str:
     return "; ".join(f"{name} {value}" for name, value in environment.items()) + ".\n"
 
 
+def as_json(content: Mapping[str, Any]) -> str:
+    """JSON text in which every record has a line, so that a rerun changes the lines of what came out differently.
+
+    Args:
+        content: entries that are single values, lists of records, or records by name. Floats are rounded to `DIGITS`
+            significant digits.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    return _braced("{}", _entries(rounded(content), _records), "") + "\n"
+
+
+def rounded(content: Any) -> Any:
+    """Nested lists and mappings with their floats rounded to `DIGITS` significant digits; tuples become lists."""
+    if isinstance(content, Mapping):
+        return {name: rounded(value) for name, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [rounded(value) for value in content]
+    if isinstance(content, float) and math.isfinite(content):
+        return float(f"{content:.{DIGITS}g}")
+    return content
+
+
 def write(name: str, content: Mapping[str, Any], markdown: str, directory: Path = DIRECTORY) -> tuple[Path, Path]:
-    """Write ``NAME.json`` and ``NAME.md`` into `directory`, made if it is not there."""
+    """Write ``NAME.json`` (see `as_json`) and ``NAME.md`` into `directory`, made if it is not there.
+
+    Raises:
+        ValueError: a number is not finite; then neither file is written.
+    """
     directory.mkdir(parents=True, exist_ok=True)
     paths = directory / f"{name}.json", directory / f"{name}.md"
-    write_text(paths[0], json.dumps(content, indent=2, allow_nan=False) + "\n", force=True)
+    write_text(paths[0], as_json(content), force=True)
     write_text(paths[1], markdown, force=True)
     return paths
+
+
+def _records(value: Any) -> str:
+    """A list of records or records by name with a line for each; all else on one line."""
+    if isinstance(value, dict) and value:
+        return _braced("{}", _entries(value, _line), "  ")
+    if isinstance(value, list) and any(isinstance(entry, dict | list) for entry in value):
+        return _braced("[]", [_line(entry) for entry in value], "  ")
+    return _line(value)
+
+
+def _entries(mapping: Mapping[str, Any], write_value: Callable[[Any], str]) -> list[str]:
+    return [f"{_line(name)}: {write_value(value)}" for name, value in mapping.items()]
+
+
+def _braced(braces: str, lines: list[str], indent: str) -> str:
+    separator = f"\n{indent}  "
+    return braces[0] + separator + f",{separator}".join(lines) + f"\n{indent}{braces[1]}"
+
+
+def _line(value: Any) -> str:
+    return json.dumps(value, allow_nan=False)

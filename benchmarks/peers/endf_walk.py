@@ -158,7 +158,8 @@ def warped(kind: str, cosine: float, beam: float, facets: float, ior: float, pat
 
 
 def peak(kind: str, cosine: float, beam: float, facets: float, ior: float, nodes: int = 200) -> float:
-    """Density, 1/sr, of that beam in its mean direction, by quadrature over the incoming light (Eqs. 16 and 20)."""
+    """Density, 1/sr, in its mean direction of a vMF beam that vMF facets reflect or refract, by quadrature over the
+    incoming light (Guo 2015, Eqs. 16 and 20)."""
     x, w = np.polynomial.legendre.leggauss(nodes)
     drop, phi = 20.0 / beam * (x + 1.0), np.pi * (x + 1.0)  # 1 - cos from the mean of the beam
     sine = np.sqrt(drop * (2.0 - drop))[:, None]

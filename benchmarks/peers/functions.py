@@ -87,7 +87,7 @@ class DrJit:
         return self._differentiate(loss, self.parameters)
 
     def tuned_gradient(self) -> tuple[Any, list[Any]]:
-        """The same in one kernel."""
+        """Loss and derivatives, in the order of the scene's parameters, in a single kernel."""
 
         def loss(parameters: list[Any]) -> Any:
             spread = [self.dr.gather(self.float, parameter, self.lanes) for parameter in parameters]

@@ -3,7 +3,7 @@
 The exact values come from `layerjax.evaluate`: this is a study of the inference. The noise comes from numpy.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import fits
 import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
-from fits.inference.optimise import fit_many, fit_problem
+from fits.inference.optimise import Repeats, fit_many, fit_problem
 
 Floats = NDArray[np.float64]
 
@@ -107,18 +107,44 @@ def study(
         results.append((fit, fits.sample(fit, walkers=WALKERS, seed=index, allow_short=True)))
     rows = _rows(results, many, size)
     limits = stats.binom.interval(0.95, size.repeats, LEVEL)
-    counts = {
+    counts = _counts(results, many)
+    surroundings = environment.describe()
+    content = {
+        "environment": surroundings,
+        "repeats": size.repeats,
+        "many": size.many,
+        "noise": NOISE,
+        "incidence_degrees": INCIDENCE,
+        "coverage_limits_95": [float(limit) for limit in limits],
+        **counts,
+        "parameters": [asdict(row) for row in rows],
+    }
+    text = _markdown(surroundings, size, exact.size, counts, limits, rows)
+    return text, write("recovery", content, text, directory)
+
+
+def _counts(results: list[tuple[fits.Fit, fits.Posterior]], many: Repeats) -> dict[str, int | float]:
+    return {
         "fits_converged": sum(fit.converged for fit, _ in results),
         "fits_with_a_parameter_at_a_bound": sum(bool(fit.at_bound) for fit, _ in results),
         "many_converged": int(many.converged.sum()),
         "chains_converged": sum(posterior.converged for _, posterior in results),
         "median_steps": float(np.median([len(posterior.chain) for _, posterior in results])),
     }
-    surroundings = environment.describe()
-    text = TEXT.format(
+
+
+def _markdown(
+    surroundings: Mapping[str, Any],
+    size: Size,
+    samples: int,
+    counts: Mapping[str, float],
+    limits: tuple[float, float],
+    rows: list[Row],
+) -> str:
+    return TEXT.format(
         environment=environment_lines(surroundings),
         incidence=", ".join(f"{angle:g}" for angle in INCIDENCE),
-        samples=exact.size,
+        samples=samples,
         noise=NOISE,
         starts=STARTS,
         repeats=size.repeats,
@@ -137,17 +163,6 @@ def study(
         fitted=_fitted_table(rows),
         covered=_covered_table(rows),
     )
-    content = {
-        "environment": surroundings,
-        "repeats": size.repeats,
-        "many": size.many,
-        "noise": NOISE,
-        "incidence_degrees": INCIDENCE,
-        "coverage_limits_95": [float(limit) for limit in limits],
-        **counts,
-        "parameters": [asdict(row) for row in rows],
-    }
-    return text, write("recovery", content, text, directory)
 
 
 TRUTH = {
@@ -179,7 +194,7 @@ def problem_of(geometry: fits.Geometry, values: Floats) -> fits.Problem:
     return fits.Problem(stack_of(free), data, noise=fits.Noise(relative=NOISE))
 
 
-def _rows(results: list[tuple[fits.Fit, fits.Posterior]], many: Any, size: Size) -> list[Row]:
+def _rows(results: list[tuple[fits.Fit, fits.Posterior]], many: Repeats, size: Size) -> list[Row]:
     names = results[0][0].problem.names
     truth = np.array([TRUTH[name] for name in names])
     vectors = np.array([fit.vector for fit, _ in results])

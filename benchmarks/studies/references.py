@@ -272,7 +272,7 @@ def _solver(stack: lj.Stack, wi: Any, wo: Any, resolution: tuple[int, int], side
 
 
 def _compiled(stack: lj.Stack, wi: Any, wo: Any, resolution: tuple[int, int], side: Any) -> Callable[[], Floats]:
-    """The same as one program of the stack's numbers."""
+    """The work of `AddingDoubling`, from the stack's numbers to the values, as one compiled program."""
     transport = lj.AddingDoubling(nodes=resolution[0], modes=resolution[1])
     program = jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, side=side))
     return lambda: np.asarray(program(stack, wi, wo))
@@ -285,7 +285,7 @@ def _walk(prepared: lj.Prepared, wi: Any, wo: Any) -> Callable[[], tuple[Any, An
 
 
 def _discrete_ordinates(streams: int, modes: int, corrected: bool) -> Callable[[], Floats]:
-    """The same of PythonicDISORT, (incidence, view, azimuth): a run for each incidence."""
+    """The BSDF of the slab by PythonicDISORT, (incidence, view, azimuth): a run for each incidence."""
     cosines = None if streams == 2 * len(VIEW) else VIEW
     slab = SLAB["thickness"], SLAB["g"], SLAB["albedo"]
 
@@ -335,7 +335,7 @@ def _row(
     note: str,
     reached: bool = True,
 ) -> Row:
-    """`reached`: whether ours has the error that the row is about; if not, no bar is met."""
+    """One row of the table. `reached`: whether ours has the error that it is about; if not, no bar is met."""
     ratio = float(np.median(seconds["ours"] / seconds["theirs"]))
     ours, theirs = (scale * float(np.median(seconds[way])) for way in ("ours", "theirs"))
     words, verdict = (bar.words(), bar.verdict(ratio)) if bar else ("", "")

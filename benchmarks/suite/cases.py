@@ -78,7 +78,7 @@ class Directions:
         return np.unique(turn % groups * GROUP + (GROUP - 2 + 7 * turn) % GROUP)
 
     def take(self, indices: NDArray[np.intp]) -> "Directions":
-        """These pairs alone."""
+        """The pairs with these indices alone."""
         return Directions(self.wi[indices], self.wo[indices], self.lights, self.light[indices])
 
 

@@ -194,22 +194,14 @@ def info(arguments: Namespace) -> int:
 
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
-    from fits.data.formats.csv import write_csv
-
-    _require_ending(arguments.out, ".csv", "measurements")
-    _refuse_existing(arguments.out, arguments.force)
-    data = _measurements(arguments)
-    write_csv(data, arguments.out, force=arguments.force)
-    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
-    return DONE
+    _require_free_place(arguments, ".csv", "measurements")
+    return _write_measurements(_measurements(arguments), arguments)
 
 
 def simulate(arguments: Namespace) -> int:
     """Write what a goniometer would measure of a stack."""
-    _require_ending(arguments.out, ".csv", "measurements")
-    _refuse_existing(arguments.out, arguments.force)
+    _require_free_place(arguments, ".csv", "measurements")
     _use_jax()
-    from fits.data.formats.csv import write_csv
     from fits.data.geometry import slices
     from fits.problem.simulate import simulate as run_simulation
     from fits.problem.stack_file import read_problem
@@ -224,6 +216,12 @@ def simulate(arguments: Namespace) -> int:
         floor=arguments.floor,
         seed=arguments.seed,
     )
+    return _write_measurements(data, arguments)
+
+
+def _write_measurements(data: Measurements, arguments: Namespace) -> int:
+    from fits.data.formats.csv import write_csv
+
     write_csv(data, arguments.out, force=arguments.force)
     print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
     return DONE
@@ -231,8 +229,7 @@ def simulate(arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file."""
-    _require_ending(arguments.out, ".png", "pictures")
-    _refuse_existing(arguments.out, arguments.force)
+    _require_free_place(arguments, ".png", "pictures")
     _use_jax()
     from fits.problem.stack_file import read_problem
     from fits.reporting.plots.data import as_png
@@ -323,9 +320,11 @@ def _at_start(stack: "Stack") -> "Stack":
     return jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free)
 
 
-def _require_ending(path: str, ending: str, what: str) -> None:
-    if Path(path).suffix.lower() != ending:
-        raise ValueError(f"{path}: {what} can be written as {ending} only")
+def _require_free_place(arguments: Namespace, ending: str, what: str) -> None:
+    """Before any work: the file of --out can be written, and holds nothing that must stay."""
+    if Path(arguments.out).suffix.lower() != ending:
+        raise ValueError(f"{arguments.out}: {what} can be written as {ending} only")
+    _refuse_existing(arguments.out, arguments.force)
 
 
 def _refuse_existing(path: str | None, force: bool) -> None:

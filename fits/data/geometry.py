@@ -53,11 +53,19 @@ def slices(
 ) -> Geometry:
     """Goniometer slices, all angles in degrees.
 
-    incidence: polar angles of the light, in [0, 180] (above 90 lights from below).
-    outgoing: signed polar angles of the detector in each plane, in [-180, 180]; positive is the side at `azimuth`.
-        Default -85 to 85 in steps of 5. Beyond +-90 looks at transmitted light.
-    azimuth: one or more planes through the normal, as the azimuth of their positive side; 0 is the plane of incidence,
-        with the mirror direction on the positive side. The normal itself is taken once for each incidence.
+    Args:
+        incidence: polar angles of the light, in [0, 180] (above 90 lights from below).
+        outgoing: signed polar angles of the detector in each plane, in [-180, 180]; positive is the side at `azimuth`.
+            Default -85 to 85 in steps of 5. Beyond +-90 looks at transmitted light.
+        azimuth: one or more planes through the normal, as the azimuth of their positive side, in [-360, 360]; 0 is the
+            plane of incidence, with the mirror direction on the positive side. The normal itself is taken once for
+            each incidence.
+
+    Returns:
+        All pairs of an incidence with a detector position, the incidences one after the other.
+
+    Raises:
+        ValueError: an angle out of its range, or none at all.
     """
     incident = _angles("incidence", incidence, 0.0, 180.0)
     signed = _angles("outgoing", np.arange(-85.0, 86.0, 5.0) if outgoing is None else outgoing, -180.0, 180.0)

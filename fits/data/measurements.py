@@ -20,8 +20,12 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 class Source:
     """Where samples came from and in which convention.
 
-    quantity: what the file held. "brdf": f in 1/sr; "brdf_cos": f |cos theta_o|; "reflectance_factor": pi f.
-    notes: what a reader decided or left out, one sentence each.
+    Args:
+        path: the file; empty for what was never in one.
+        format: of the file, or "memory", "simulated".
+        quantity: what the file held. "brdf": f in 1/sr; "brdf_cos": f |cos theta_o|; "reflectance_factor": pi f.
+        notes: what a reader decided or left out, one sentence each.
+        attribution: whose data they are, and under which licence.
     """
 
     path: str
@@ -35,11 +39,18 @@ class Source:
 class Measurements:
     """N samples of a BSDF in C channels.
 
-    wi, wo: (N, 3) unit vectors towards the light and the viewer, pointing away from the surface.
-    values: (N, C) BSDF in 1/sr. sigma: (N, C) standard deviations in 1/sr, or None where nothing is known.
-    mask: (N,) bool, True where a sample takes part in fits. channels: C names.
-    Raises ValueError for shapes that do not fit together, numbers that are not finite, directions that are not unit
-    vectors, and a sigma that is negative, or zero in a sample that is used.
+    Args:
+        wi: (N, 3) unit vectors towards the light, pointing away from the surface.
+        wo: (N, 3) unit vectors towards the viewer, pointing away from the surface.
+        values: (N, C), BSDF in 1/sr without the cosine.
+        sigma: (N, C), standard deviations in 1/sr, above 0 in used samples; None where nothing is known.
+        mask: (N,) bool, True where a sample takes part in fits.
+        channels: C names.
+        source: where the samples came from.
+
+    Raises:
+        ValueError: shapes do not fit together, a number is not finite, a direction is no unit vector, or sigma is
+            negative, or zero in a sample that is used.
     """
 
     wi: Floats
@@ -105,7 +116,15 @@ class Measurements:
         )
 
     def where(self, keep: ArrayLike, note: str | None = None) -> "Measurements":
-        """The same samples, used only where `keep` (bool, shape (N,)) holds as well; `note` is added to the source."""
+        """The same samples, used only where `keep` holds as well.
+
+        Args:
+            keep: (N,) bool.
+            note: a sentence that is added to the source.
+
+        Raises:
+            ValueError: `keep` has another shape or type.
+        """
         keep = np.asarray(keep)
         if keep.dtype != bool or keep.shape != self.mask.shape:
             raise ValueError(f"keep has shape {keep.shape} and type {keep.dtype}, must be {self.mask.shape} bool")
@@ -113,13 +132,19 @@ class Measurements:
         return changed if note is None else changed.noted(note)
 
     def without_retro(self, degrees: float) -> "Measurements":
-        """Mask samples closer than `degrees` to retro-reflection, where a detector head shades the beam."""
+        """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
+
+        A detector head shades the beam there. Raises ValueError for an angle out of range.
+        """
         _check_angle(degrees, 180.0)
         angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))
         return self.where(angle >= degrees, f"masked: within {degrees:g} degrees of retro-reflection")
 
     def without_grazing(self, degrees: float) -> "Measurements":
-        """Mask samples whose light or viewer is more than `degrees` away from the normal line (0 to 90)."""
+        """The same samples, masked where light or viewer is more than `degrees` (0 to 90) from the normal line.
+
+        Raises ValueError for an angle out of range.
+        """
         _check_angle(degrees, 90.0)
         tilt = np.maximum(np.minimum(self.theta_i, 180 - self.theta_i), np.minimum(self.theta_o, 180 - self.theta_o))
         return self.where(tilt <= degrees, f"masked: more than {degrees:g} degrees from the normal")

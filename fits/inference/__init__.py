@@ -1,1 +1,29 @@
-"""Answers to a `fits.Problem`: the best fit and its uncertainty, samples of the posterior, comparisons of fits."""
+"""Answers to a `fits.Problem`: the best fit and its uncertainty, samples of the posterior, comparisons of fits.
+
+A problem goes in; a `fits.Fit` comes out, of that a `fits.Posterior`, and of several a `fits.Comparison`.
+"""
+
+from typing import TYPE_CHECKING
+
+from fits._lazy import names_from
+
+if TYPE_CHECKING:
+    from fits.inference.compare import Comparison as Comparison
+    from fits.inference.fit_result import Fit as Fit
+    from fits.inference.identifiability import Combination as Combination
+    from fits.inference.optimise import fit as fit
+    from fits.inference.posterior import Posterior as Posterior
+    from fits.inference.posterior import sample as sample
+
+_HOMES = {
+    "Fit": "fit_result",
+    "fit": "optimise",
+    "Posterior": "posterior",
+    "sample": "posterior",
+    "Comparison": "compare",
+    "Combination": "identifiability",
+}
+
+__all__ = list(_HOMES)
+
+__getattr__ = names_from(__name__, _HOMES)

@@ -12,19 +12,20 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.problem.problem import Model, Problem, half_squares
+from fits.problem.model import Model, half_squares
+from fits.problem.problem import Problem
 
 TOLERANCE = 1e-12
 MOST_STEPS = 500
 
 
 def cost(model: Model, s: Any) -> Any:
-    """Half the sum of squared residuals at `s` in the unit box."""
+    """Half the sum of squared residuals at `s` (P,) in the unit box."""
     return half_squares(model.residuals(model.box.from_unit(s)))
 
 
 def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:
-    """That and its gradient."""
+    """Half the sum of squared residuals at `s` (P,) in the unit box, and its gradient (P,) by `s`."""
     return jax.value_and_grad(cost, argnums=1)(model, s)
 
 

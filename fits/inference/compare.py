@@ -48,8 +48,11 @@ class Row:
 class Comparison:
     """Fits of the same data, side by side.
 
-    rows: best first. sorted_by: "loo", "aic" or "chi_square". verdict: a sentence for each fit behind the best, that
-    says whether the data prefer the best to it. notes: what to mind in reading them.
+    Attributes:
+        rows: best first.
+        sorted_by: "loo", "aic" or "chi_square".
+        verdict: a sentence for each fit behind the best, that says whether the data prefer the best to it.
+        notes: what to mind in reading the rows.
     """
 
     rows: tuple[Row, ...]
@@ -61,7 +64,11 @@ class Comparison:
 def compare(candidates: Mapping[str, Fit | Posterior]) -> Comparison:
     """Compare fits of the same data under the same objective; leave-one-out enters if every candidate is a `Posterior`.
 
-    Raises ValueError for fewer than two candidates, different data, or different objectives.
+    Args:
+        candidates: at least two fits or their posteriors, by name.
+
+    Raises:
+        ValueError: fewer than two candidates, different data, or different objectives.
     """
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")

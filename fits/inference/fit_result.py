@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.inference.identifiability import Combination
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 
@@ -36,15 +37,24 @@ class Minimum:
 class Fit:
     """The best minimum of a `Problem` with P parameters, N used samples and C channels.
 
-    vector: (P,) values in the problem's order. errors: (P,) standard errors, NaN for a parameter at a bound, infinite
-    where the data leave it open; those of the others hold with the parameters in `at_bound` kept there.
-    covariance: (P, P). cost: half the sum of squared residuals. iterations: steps of the solver to this minimum.
-    condition_number: of the information about the parameters, each scaled to unit length.
-    unresolved: the combinations of parameters that the data alone do not separate, worst first.
-    minima: best first. alternatives: those among them, other than the best, that explain the data equally well.
-    without_influence: parameters that the data say nothing about.
-    settings: starts, seed and solver. ended: how many starts ended where ("this minimum", "other minima", "out of
-    steps", "failed").
+    Attributes:
+        problem: what was fitted to what.
+        vector: (P,), best values in the problem's order, in physical units.
+        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data leave it open; those of
+            the others hold with the parameters in `at_bound` kept there.
+        covariance: (P, P), of the parameters.
+        cost: half the sum of squared residuals.
+        at_bound: names of the parameters that ended on a bound.
+        converged: whether the best start did.
+        status: how the fit ended, in words.
+        iterations: steps of the solver to this minimum.
+        condition_number: of the information about the parameters, each scaled to unit length.
+        unresolved: the combinations of parameters that the data alone do not separate, worst first.
+        minima: the minima that starts reached, best first.
+        alternatives: those among `minima`, other than the best, that explain the data equally well.
+        without_influence: names of the parameters that the data say nothing about.
+        settings: starts, seed and solver.
+        ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
     """
 
     problem: Problem

@@ -26,9 +26,10 @@ Floats = NDArray[np.float64]
 class Combination:
     """A direction in the space of parameters that the data do not resolve: only its members' other combinations are.
 
-    error: standard error along it from the data alone, in boxes; infinite where they say nothing. weights: of its
-    members, in units of their boxes, largest first; their squares add up to about 1. alone: standard error that the
-    data would give each member, were all other parameters known, in physical units.
+    Attributes:
+        error: standard error along the direction from the data alone, in boxes; infinite where they say nothing.
+        weights: of its members by name, in units of their boxes, largest first; their squares add up to about 1.
+        alone: standard error that the data would give each member, were all other parameters known, in physical units.
     """
 
     error: float

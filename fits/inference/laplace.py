@@ -43,7 +43,7 @@ class Approximation:
 
     @classmethod
     def of(cls, fit: Fit) -> "Approximation":
-        """From a fit's optimum, its covariance, and the slope of the posterior at the bounds it lies on."""
+        """The approximation by a fit's optimum, its covariance, and the posterior's slope at the bounds it lies on."""
         box = fit.problem.model.box
         vector = jnp.asarray(fit.vector)
         unit = np.clip(np.asarray(box.to_unit(vector), float), INSIDE, 1.0 - INSIDE)
@@ -58,7 +58,7 @@ class Approximation:
 
     @classmethod
     def learned(cls, positions: Floats) -> "Approximation":
-        """From samples (count, P) of the posterior: their mean and covariance."""
+        """The approximation with the mean and covariance of samples (count, P) of the posterior."""
         count = positions.shape[1]
         values, directions = np.linalg.eigh(np.atleast_2d(np.cov(positions.T)))
         spread = np.sqrt(np.maximum(values, NARROWEST**2))
@@ -66,7 +66,7 @@ class Approximation:
         return cls(positions.mean(axis=0), directions * spread, nowhere, nowhere, np.ones(count))
 
     def mean_log_density(self, positions: Floats) -> float:
-        """Over samples of the posterior: the higher, the closer the approximation is to it."""
+        """Mean log-density over samples of the posterior: the higher, the closer the approximation is to it."""
         return float(np.mean(self.log_density(positions)))
 
     def draw(self, generator: np.random.RandomState, count: int, shrink: float = 1.0) -> Floats:
@@ -129,6 +129,6 @@ def student(centre: Floats, root: Floats, positions: Floats) -> Floats:
 
 
 def student_draws(generator: np.random.RandomState, count: int, dimension: int) -> Floats:
-    """Draws (count, dimension) from the same about 0, of unit width."""
+    """Draws (count, dimension) from a Student-t about 0 of unit width."""
     normal = generator.standard_normal((count, dimension))
     return normal * np.sqrt(DEGREES_OF_FREEDOM / generator.chisquare(DEGREES_OF_FREEDOM, (count, 1)))

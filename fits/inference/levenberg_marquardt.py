@@ -121,7 +121,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def postprocess(
         self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
     ) -> tuple[Array, Any, dict[str, Any]]:
-        """The cost at the solution goes with it."""
+        """The solution, and the cost there among the statistics that go with it."""
         return y, aux, {"cost": state.cost}
 
 

@@ -43,7 +43,7 @@ class Mixture:
 
     @classmethod
     def of(cls, fit: Fit) -> "Mixture | None":
-        """From the points of a fit's ridge and the information there; None if it has none."""
+        """The mixture about the points of a fit's ridge, as wide as the information there; None without a ridge."""
         problem = fit.problem
         optimum = np.asarray(problem.model.box.to_unit(jnp.asarray(fit.vector)), float)
         slope = np.abs(np.asarray(problem.call(cost_and_gradient, optimum)[1], float))
@@ -68,7 +68,7 @@ class Mixture:
         return cls(points, root, log_weight - logsumexp(log_weight), held)
 
     def refined(self, positions: Floats) -> "Mixture":
-        """It, fitted to samples (count, P) of the posterior, with a share of what it was.
+        """The mixture fitted to samples (count, P) of the posterior, with a share of what it was.
 
         By expectation and maximisation; every component counts as samples of its own, so that it keeps its full rank.
         """
@@ -94,7 +94,7 @@ class Mixture:
         return Mixture(centres, roots, weights, self.held)
 
     def mean_log_density(self, positions: Floats) -> float:
-        """Over samples of the posterior: the higher, the closer the mixture is to it."""
+        """Mean log-density over samples of the posterior: the higher, the closer the mixture is to it."""
         return float(np.mean(self.log_density(positions)))
 
     def log_density(self, positions: Floats) -> Floats:

@@ -19,8 +19,9 @@ from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.starts import End, Solver, polished, run_starts, solve_start, start_points
 from fits.inference.uncertainty import Uncertainty, uncertainty
 from fits.problem.likelihood import Noise, Objective
+from fits.problem.model import Model, Transport
 from fits.problem.parameters import Free
-from fits.problem.problem import Model, Problem, Transport
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 Floats = NDArray[np.float64]
@@ -89,26 +90,22 @@ def fit_problem(
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
 ) -> Fit:
-    """`fit` for a problem that is already put together."""
+    """Find the best parameters of a problem that is already put together, as `fit` does.
+
+    Args:
+        problem: what is fitted to what.
+        starts, seed, solver, progress, checkpoint: see `fit`.
+
+    Raises:
+        ValueError: starts < 1; an unknown solver.
+    """
     if starts < 1:
         raise ValueError(f"starts is {starts}; it must be at least 1")
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    points = start_points(problem, starts, seed)
-    if checkpoint is None:
-        ends = run_starts(problem, points, solver, progress or _silent)
-    else:
-        from fits.inference.starts_file import StartsFile
-
-        with StartsFile(checkpoint, problem, points, solver) as kept:
-            ends = run_starts(problem, points, solver, progress or _silent, kept)
+    ends = _ends(problem, start_points(problem, starts, seed), solver, progress or _silent, checkpoint)
     best = int(np.argmin([end.cost for end in ends]))
-    lowest, improved = ends[best], False
-    found = uncertainty(problem, lowest.vector, lowest.cost)
-    if solver == "least_squares" and (found.at_bound.any() or not lowest.converged):
-        lowest, improved = polished(problem, lowest)
-        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
-    lowest = lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound))
+    lowest, found, improved = _improved(problem, ends[best], solver)
     ends[best] = lowest
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     result = Fit(
@@ -138,11 +135,42 @@ def fit_problem(
     return replace(result, status="; ".join((*_status(result), *notes)))
 
 
+def _ends(
+    problem: Problem, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
+) -> list[End]:
+    """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
+    if checkpoint is None:
+        return run_starts(problem, points, solver, progress)
+    from fits.inference.starts_file import StartsFile
+
+    with StartsFile(checkpoint, problem, points, solver) as kept:
+        return run_starts(problem, points, solver, progress, kept)
+
+
+def _improved(problem: Problem, lowest: End, solver: Solver) -> tuple[End, Uncertainty, bool]:
+    """The lowest end on its bounds, the errors there, and whether L-BFGS-B improved on it."""
+    found, improved = uncertainty(problem, lowest.vector, lowest.cost), False
+    if solver == "least_squares" and (found.at_bound.any() or not lowest.converged):
+        lowest, improved = polished(problem, lowest)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
+    return lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound)), found, improved
+
+
 def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int = 0) -> Repeats:
     """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
 
-    Each is the lowest end of `starts` starts, converged or not. Standard errors are those of the unbounded optimum:
-    they mean nothing for parameters that end on a bound.
+    Args:
+        problem: gives the stack, the directions and the noise.
+        values: BSDF in 1/sr, (K, N, C).
+        starts: of each fit; the lowest end is kept, converged or not.
+        seed: of the starts.
+
+    Returns:
+        Vectors and standard errors (K, P), costs and convergence (K,). The errors are those of the unbounded optimum:
+        they mean nothing for parameters that end on a bound.
+
+    Raises:
+        ValueError: values of another shape.
     """
     values = np.asarray(values, float)
     expected = problem.model.values.shape

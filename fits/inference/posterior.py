@@ -1,8 +1,8 @@
 """Sampling the posterior about a fit with emcee, until the chain is long enough to be believed.
 
 Half the steps are emcee's stretch moves, half are independent proposals from an approximation, the fit's own or one
-learned from the chain (`laplace`).
-The ensemble moves in unconstrained coordinates, where the box has no walls; everything that is reported is physical.
+learned from the chain (`laplace`). The ensemble moves in unconstrained coordinates, where the box has no walls;
+everything that is reported is physical.
 """
 
 import math
@@ -23,7 +23,8 @@ from fits.inference.chain import FileChain, MemoryChain, stored_chain
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.mixture import Mixture
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 if TYPE_CHECKING:
@@ -44,11 +45,14 @@ Proposals = Approximation | Mixture
 class Posterior:
     """An ensemble chain of P parameters and what it says.
 
-    chain: (steps, walkers, P), physical values, from the start on. log_probability: (steps, walkers), of the
-    unconstrained coordinates, not normalised. autocorrelation_time: (P,), in steps, of the chain without its first
-    tenth. acceptance: mean share of proposals taken. converged: whether that chain is longer than 50 autocorrelation
-    times of every parameter and these changed by less than 5 % since the last check. allow_short: estimates may be had
-    from a chain that is not.
+    Attributes:
+        chain: (steps, walkers, P), physical values, from the start on.
+        log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
+        autocorrelation_time: (P,), in steps, of the chain without its first tenth.
+        acceptance: mean share of proposals taken.
+        converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
+            changed by less than 5 % since the last check.
+        allow_short: estimates may be had from a chain that has not converged.
     """
 
     fit: Fit
@@ -319,9 +323,8 @@ def _note(chain: MemoryChain) -> str:
 
 def _identity(problem: Problem, walkers: int, seed: int) -> dict[str, Any]:
     """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points."""
-    points = qmc.Sobol(len(problem.names), scramble=False).random_base2(2)
-    unit = 0.01 + 0.98 * points
-    posteriors = problem.call(_log_posteriors, logit(unit))
+    points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
+    posteriors = problem.call(_log_posteriors, logit(points))
     return {
         "names": "\n".join(problem.names),
         "bounds": np.stack([problem.low, problem.high]),

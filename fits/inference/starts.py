@@ -17,7 +17,8 @@ from fits.inference.bounded import minimise_in_box
 from fits.inference.levenberg_marquardt import BoxLevenbergMarquardt
 from fits.inference.starts_file import End, Floats, Solver, StartsFile
 from fits.problem.likelihood import total_sigma
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 MOST_STEPS = 200

@@ -20,7 +20,8 @@ from fits.inference.identifiability import (
     unresolved_combinations,
     without_influence,
 )
-from fits.problem.problem import Model, Problem
+from fits.problem.model import Model
+from fits.problem.problem import Problem
 
 ON_BOUND = 1e-6  # of the box
 LEAST_PULL = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push

@@ -1,7 +1,6 @@
 """Simulated goniometer data: a stack seen along slices, with noise of known size."""
 
 import math
-from typing import Literal
 
 import numpy as np
 
@@ -9,21 +8,34 @@ import layerjax as lj
 from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import Measurements, Source, channel_names
-from fits.problem.problem import forward
+from fits.problem.model import Transport, forward
 
 
 def simulate(
     stack: lj.Stack,
     geometry: Geometry,
-    transport: lj.Transport | Literal["auto"] = "auto",
+    transport: Transport = "auto",
     noise: float = 0.0,
     floor: float = 0.0,
     seed: int = 0,
 ) -> Measurements:
     """The BSDF of a stack along `geometry`, with Gaussian noise of standard deviation sqrt((noise f)^2 + floor^2).
 
-    noise: relative, >= 0. floor: in 1/sr, >= 0. The deviation that was used becomes `sigma`, None if both are 0.
-    Samples where the stack gives 0 and floor is 0 carry no noise, which no measurement does: they are masked.
+    Args:
+        stack: holds numbers, nothing `Free`.
+        geometry: N pairs of directions, from `slices` say.
+        transport: as in `Problem`: a layerjax transport that is not random, "auto", or any callable
+            (stack, wi, wo) -> values.
+        noise: relative, unitless, >= 0.
+        floor: in 1/sr, >= 0.
+        seed: of the noise.
+
+    Returns:
+        (N, C) values, and the deviation that was used as `sigma`, None if `noise` and `floor` are 0. Samples where the
+        stack gives 0 and `floor` is 0 carry no noise, which no measurement does: they are masked.
+
+    Raises:
+        ValueError: a negative `noise` or `floor`, or a transport that is random or cannot carry the stack.
     """
     for name, level in (("noise", noise), ("floor", floor)):
         if not (math.isfinite(level) and level >= 0):

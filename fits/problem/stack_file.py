@@ -78,7 +78,11 @@ class ProblemFile:
 
 
 def read_problem(path: str | Path) -> ProblemFile:
-    """Read a stack, and what else the file says about fitting it. ValueError, on one line, for bad input."""
+    """Read a stack, and what else the TOML file says about fitting it.
+
+    Raises:
+        ValueError: on one line, which names the file, the place in it and what may stand there.
+    """
     path = Path(path)
     text, tables = read_tables(path)
     try:
@@ -107,7 +111,17 @@ def write_problem(
     objective: Objective = "likelihood",
     force: bool = False,
 ) -> None:
-    """Write a file that `read_problem` reads back to the same. An existing file is a ValueError unless `force`."""
+    """Write a TOML file that `read_problem` reads back to the same.
+
+    Args:
+        path: the file.
+        stack: may hold `Free`.
+        transport, noise, scale, objective: see `Problem`; what is left out of the call is left out of the file.
+        force: replace a file that is there.
+
+    Raises:
+        ValueError: the file exists and `force` is False.
+    """
     tables: dict[str, Any] = {}
     if not isinstance(transport, str):
         table = _module_to_dict(transport)

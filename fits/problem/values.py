@@ -120,21 +120,21 @@ def whole_number(where: str, value: Any) -> int:
 
 
 def whole_numbers(where: str, value: Any, count: int) -> tuple[int, ...]:
-    """So many of them, as a list."""
+    """A list of `count` whole numbers of at most 32 bits each, as a tuple; ValueError for anything else."""
     if not isinstance(value, list) or len(value) != count or any(type(number) is not int for number in value):
         raise ValueError(f"{where} is {shown(value)}, must be a list of {count} whole numbers")
     return tuple(whole_number(f"{where}[{index}]", number) for index, number in enumerate(value))
 
 
 def truth(where: str, value: Any) -> bool:
-    """True or false."""
+    """The value itself, if it is true or false; ValueError for anything else."""
     if not isinstance(value, bool):
         raise ValueError(f"{where} is {shown(value)}, must be true or false")
     return value
 
 
 def choice(where: str, value: Any, allowed: Iterable[str]) -> str:
-    """One of these words."""
+    """The value itself, if it is one of the allowed words; ValueError, with a likely one, for anything else."""
     allowed = tuple(allowed)
     if not (isinstance(value, str) and value in allowed):
         raise ValueError(f"{where} is {shown(value)}{_suggestion(value, allowed)}, must be one of {', '.join(allowed)}")
@@ -142,7 +142,7 @@ def choice(where: str, value: Any, allowed: Iterable[str]) -> str:
 
 
 def check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    """ValueError for a key of the table that is none of these."""
+    """Raise a ValueError for a key of the table that is not among the allowed ones."""
     for key in table:
         if key not in allowed:
             raise ValueError(
@@ -151,7 +151,7 @@ def check_keys(where: str, table: Mapping[str, Any], allowed: tuple[str, ...]) -
 
 
 def require_table(where: str, table: Any) -> dict[str, Any]:
-    """The value itself, if it is a table."""
+    """The value itself, if it is a table; ValueError for anything else."""
     if not isinstance(table, dict):
         raise ValueError(f"{where} is {shown(table)}, must be a table")
     return table

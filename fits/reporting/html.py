@@ -53,8 +53,16 @@ def report(
 ) -> None:
     """Writes the report of a fit to `path`, whole or not at all.
 
-    others: further fits of the same data by name, or their posteriors, to be compared with this one, called `name`.
-    Raises ValueError where `path` exists and `force` is False, and for `others` that cannot be compared.
+    Args:
+        fit: what the report is about.
+        posterior: what `fits.sample` made of the fit, if it was sampled.
+        path: HTML file to write, pictures inside.
+        others: further fits of the same data, or their posteriors, by name, to be compared with this one.
+        name: what this fit is called beside `others`.
+        force: replace a file that is there.
+
+    Raises:
+        ValueError: `path` exists and `force` is False, or `others` cannot be compared with this fit.
     """
     images = draw(fit, posterior, others, name)
     write_text(path, page(fit, posterior, images, others, name), force=force)

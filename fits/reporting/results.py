@@ -58,8 +58,14 @@ PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
 def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
     """Writes a result directory, without report, whole or not at all.
 
-    Raises ValueError where `directory` is not empty, unless `force` is given and it holds an earlier result; and for a
-    transport that a file cannot name (a function).
+    Args:
+        fit: what is saved.
+        directory: made if it is not there.
+        force: replace an earlier result.
+
+    Raises:
+        ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
+            callable, which a file cannot name; or a channel cannot be written (see `write_csv`).
     """
     with reserved(directory, force), replacing(directory, force) as folder:
         write_fit(fit, folder)
@@ -122,7 +128,11 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
 
 
 def load_fit(directory: str | Path) -> "Fit":
-    """The fit that was saved in a directory. ValueError, on one line, for one that holds none or a damaged one."""
+    """The fit that was saved in a directory.
+
+    Raises:
+        ValueError: on one line, for a directory that holds none or a damaged one.
+    """
     from fits.inference.fit_result import Fit, Minimum
     from fits.inference.identifiability import Combination
     from fits.problem.problem import Problem
@@ -176,7 +186,9 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     """The posterior that was sampled in a result directory, as far as it got; None before its first step.
 
     Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
-    Raises ValueError, on one line, for a damaged file.
+
+    Raises:
+        ValueError: on one line, for a damaged file.
     """
     from fits.inference.posterior import NoSteps, load
 
@@ -195,7 +207,8 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
 def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
     """Writes the estimates beside the chain that `fits.sample` keeps in the directory.
 
-    Raises ValueError for a chain that is too short to report from.
+    Raises:
+        ValueError: the chain is too short to report from.
     """
     content = {
         "layerjax_result": SCHEMA,

@@ -109,6 +109,25 @@ def test_results_are_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_every_record_has_a_line_and_six_digits(tmp_path: Path) -> None:
+    rows = [{"name": "first", "error": 1 / 3, "pair": (1e-9 / 7, 2)}, {"name": "second", "error": None, "pair": [1, 2]}]
+    content = {"environment": {"cores": 2}, "angles": [0.1, 30.0], "done": True, "none": [], "rows": rows}
+    before = results.write("x", content, "", tmp_path)[0].read_text()
+    assert '    {"name": "first", "error": 0.333333, "pair": [1.42857e-10, 2]},\n' in before
+    assert '  "angles": [0.1, 30.0],\n' in before
+    assert json.loads(before) == results.rounded(content)
+    rows[1]["error"] = 0.5
+    after = results.write("x", content, "", tmp_path)[0].read_text()
+    assert sum(a != b for a, b in zip(before.splitlines(), after.splitlines(), strict=True)) == 1
+
+
+@pytest.mark.parametrize("path", sorted(results.DIRECTORY.glob("*.json")), ids=lambda path: path.stem)
+def test_stored_results_stand_as_they_would_be_written_now(path: Path) -> None:
+    content = json.loads(path.read_text())
+    assert path.read_text() == results.as_json(content)
+    assert content["environment"].keys() <= environment.describe().keys() | set(environment.PACKAGES)
+
+
 def test_tables_line_up() -> None:
     lines = results.table(("work", "ns"), [("a", "1"), ("longer", "1,234.5")]).splitlines()
     assert lines == ["| work   |      ns |", "|--------|--------:|", "| a      |       1 |", "| longer | 1,234.5 |"]

@@ -3,14 +3,14 @@
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from benchmarks.measuring import accuracy, environment
-from benchmarks.measuring.writing import DIRECTORY, write
+from benchmarks.measuring.writing import DIRECTORY, rounded, write
 from benchmarks.studies.error_vs_time import pictures as error_pictures
 from benchmarks.studies.error_vs_time import tables as error_tables
 from benchmarks.studies.error_vs_time.models import MODELS, Model, Programs, Row, Size, row, run, supports
@@ -29,13 +29,38 @@ QUICK_STEP = 6
 
 
 @dataclass(frozen=True)
+class Setup:
+    """What is compared with what, how long, and where the results go."""
+
+    directory: Path
+    quick: bool
+    models: Sequence[Model]
+    references: References
+    size: Size
+    surroundings: dict[str, str | int]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What has to be the same for results to stand in one file, as they stand there."""
+        references = {name: repr(getattr(self.references, name)) for name in ("truth", "check", "solver", "walk")}
+        return rounded(
+            {
+                **asdict(self.size),
+                "values a stack": error_tables.VALUES,
+                "floor": accuracy.FLOOR,
+                **references,
+            }
+        )
+
+
+@dataclass(frozen=True)
 class Held:
     """What is measured so far. judged, truths: by stack; rows: of every model; untold: stacks without a truth."""
 
-    judged: dict[str, Judged]
-    truths: dict[str, Truth]
-    rows: list[Row]
-    untold: list[str]
+    judged: dict[str, Judged] = field(default_factory=dict)
+    truths: dict[str, Truth] = field(default_factory=dict)
+    rows: list[Row] = field(default_factory=list)
+    untold: list[str] = field(default_factory=list)
 
 
 def study(
@@ -65,72 +90,78 @@ def study(
     if cases is None:
         cases = suite.load(families)[:: QUICK_STEP if quick else 1]
     size = size or (QUICK if quick else Size())
-    surroundings = environment.describe()
-    settings = {
-        **asdict(size),
-        "values a stack": error_tables.VALUES,
-        "floor": accuracy.FLOOR,
-        **{name: repr(getattr(references, name)) for name in ("truth", "check", "solver", "walk")},
-    }
-    held = _held(directory, settings) if resume else Held({}, {}, [], [])
+    setup = Setup(directory, quick, models, references, size, environment.describe())
+    held = _held(directory, setup.settings) if resume else Held()
     programs = Programs()
-
-    def save() -> tuple[str, tuple[Path, ...]]:
-        judged = list(held.judged.values())
-        text = error_tables.markdown(surroundings, models, judged, held.rows, size, references, held.untold)
-        content = {
-            "environment": surroundings,
-            "quick": quick,
-            "settings": settings,
-            "stacks": [asdict(judgement) | {"limit": judgement.limit} for judgement in judged],
-            "without a truth": held.untold,
-            "rows": [asdict(row) for row in held.rows],
-        }
-        truths = directory / f"{NAME}-truth.npz"
-        paths = write(NAME, content, text, directory)
-        write_bytes(truths, pack(held.truths), force=True)
-        return text, (*paths, truths)
-
     for index, case in enumerate(cases, start=1):
         if index % KEPT == 0:
             jax.clear_caches()
         began = time.perf_counter()
-        if case.name in held.untold:
+        if not _measure(case, setup, held, programs):
             continue
-        if not all(supports(transport, case.stack) for transport in vars(references).values()):
-            held.untold.append(case.name)
-            continue
-        done = {row.model for row in held.rows if row.stack == case.name}
-        # the models first: what the references compile would no longer count among their compile times
-        runs = [found for model in models if model.name not in done for found in run(case, model, size, programs)]
-        if case.name in held.judged:
-            judgement, truth = held.judged[case.name], held.truths[case.name]
-            if not runs:
-                continue
-        else:
-            judgement, truth = judge(case, references, size.walked(case), size.longest)
-        held.judged[case.name], held.truths[case.name] = judgement, truth
-        held.rows.extend(row(case, found, truth, judgement.limit) for found in runs)
-        save()
+        _save(setup, held)
+        judgement = held.judged[case.name]
         report(
             f"{index}/{len(cases)} {case.family}: {case.name}: truth to {judgement.limit:.1e}, "
             f"z {judgement.z_root_mean_square:.2f}, {time.perf_counter() - began:.1f} s"
         )
-    text, paths = save()
+    text, paths = _save(setup, held)
     picture = as_png(error_pictures.picture(models, list(held.judged.values()), held.rows))
     write_bytes(directory / f"{NAME}.png", picture, force=True)
     return text, (*paths, directory / f"{NAME}.png")
 
 
+def _measure(case: Case, setup: Setup, held: Held, programs: Programs) -> bool:
+    """Add to `held` what it lacks of a stack; False if that is nothing."""
+    if case.name in held.untold:
+        return False
+    if not all(supports(transport, case.stack) for transport in vars(setup.references).values()):
+        held.untold.append(case.name)
+        return False
+    done = {row.model for row in held.rows if row.stack == case.name}
+    # the models first: what the references compile would no longer count among their compile times
+    lacking = [model for model in setup.models if model.name not in done]
+    runs = [found for model in lacking for found in run(case, model, setup.size, programs)]
+    if case.name not in held.judged:
+        held.judged[case.name], held.truths[case.name] = judge(
+            case, setup.references, setup.size.walked(case), setup.size.longest
+        )
+    elif not runs:
+        return False
+    judgement, truth = held.judged[case.name], held.truths[case.name]
+    held.rows.extend(row(case, found, truth, judgement.limit) for found in runs)
+    return True
+
+
+def _save(setup: Setup, held: Held) -> tuple[str, tuple[Path, ...]]:
+    """Write all that is measured so far, but no picture; returns markdown and paths."""
+    judged = list(held.judged.values())
+    text = error_tables.markdown(
+        setup.surroundings, setup.models, judged, held.rows, setup.size, setup.references, held.untold
+    )
+    content = {
+        "environment": setup.surroundings,
+        "quick": setup.quick,
+        "settings": setup.settings,
+        "stacks": [asdict(judgement) | {"limit": judgement.limit} for judgement in judged],
+        "without a truth": held.untold,
+        "rows": [asdict(row) for row in held.rows],
+    }
+    truths = setup.directory / f"{NAME}-truth.npz"
+    paths = write(NAME, content, text, setup.directory)
+    write_bytes(truths, pack(held.truths), force=True)
+    return text, (*paths, truths)
+
+
 def _held(directory: Path, settings: dict[str, Any]) -> Held:
-    """What the directory holds."""
+    """What the directory holds; ValueError if that was measured with other settings."""
     path = directory / f"{NAME}.json"
     if not path.exists():
-        return Held({}, {}, [], [])
+        return Held()
     content = json.loads(path.read_text())
     if content["settings"] != settings:
         raise ValueError(f"{path}: measured with other settings, it cannot be resumed")
-    known = {field.name for field in fields(Judged)}
+    known = {entry.name for entry in fields(Judged)}
     judged = {
         entry["stack"]: Judged(
             **{key: value for key, value in entry.items() if key in known} | {"failures": tuple(entry["failures"])}

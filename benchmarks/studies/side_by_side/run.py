@@ -31,7 +31,7 @@ TEXT = """\
 # Which transport when
 
 Every transport of layerjax on the same stacks, beside the truth. All numbers are those of
-[error against run time](../benchmarks/results/error-vs-time.md), measured {date} ({processor}, {cores} cores);
+[error against run time](../benchmarks/results/error-vs-time.md), measured on {processor}, {cores} cores;
 `python -m benchmarks side-by-side` makes this page from its file again.
 
 ![BSDF in the plane of incidence by every transport, one stack of each family](which_transport.png)
@@ -162,7 +162,6 @@ def page(results: Path = DIRECTORY) -> tuple[list[Model], str]:
     present = {row.model for row in rows}
     models = [model for model in MODELS if model.name in present]
     text = TEXT.format(
-        date=content["environment"]["date"],
         processor=content["environment"]["processor"],
         cores=content["environment"]["cores"],
         carried=carried(models),

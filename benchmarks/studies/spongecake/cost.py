@@ -32,7 +32,7 @@ STACKS = {
 
 
 def costs(quick: bool = False) -> Iterator[Cost]:
-    """Least times of both, one after the other in every round, and operations of one pair."""
+    """Least times of `SingleScattering` and `SpongeCake`, which take turns in every round, and operations a pair."""
     random = np.random.default_rng(0)
     pairs = QUICK_PAIRS if quick else PAIRS
     wi, wo = (_directions(random, pairs, sides) for sides in (1, 2))

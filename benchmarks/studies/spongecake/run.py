@@ -22,7 +22,16 @@ import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, write
 from benchmarks.studies.spongecake.cost import ROUNDS, costs
-from benchmarks.studies.spongecake.tables import Errors, Figure, Fitted, Furnace, Gain, markdown
+from benchmarks.studies.spongecake.tables import (
+    Errors,
+    Figure,
+    Findings,
+    Fitted,
+    Furnace,
+    Gain,
+    Settings,
+    markdown,
+)
 from layerjax.normals.sggx import Kind
 from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import data as materials
@@ -58,41 +67,40 @@ def study(
     work: Path = Path("spongecake-data"),
 ) -> tuple[str, tuple[Path, ...]]:
     """Measure, and write ``spongecake.json`` and ``.md`` into the directory; returns the markdown and the paths."""
-    counts, walks = (QUICK_COUNTS, QUICK_WALKS) if quick else (COUNTS, WALKS)
-    errors, furnaces = [], []
-    for media, count in enumerate(counts, start=1):
-        for there in materials.make(work, count, media, "test", SEED):
-            report(f"media {media}: truth of {there} of {count}")
-        samples = materials.load(work, count, media, "test", SEED)
-        errors += held_out(samples, media)
+    settings = Settings(
+        QUICK_COUNTS if quick else COUNTS,
+        ANGLES,
+        QUICK_WALKS if quick else WALKS,
+        ROUNDS,
+        *(QUICK_GAINS if quick else GAINS),
+    )
+    found = Findings()
+    for media, count in enumerate(settings.counts, start=1):
+        samples = _solved(work, count, media, report)
+        found.errors.extend(held_out(samples, media))
         report(f"media {media}: errors")
-        furnaces += furnace(samples, media)
+        found.furnace.extend(furnace(samples, media))
         report(f"media {media}: furnace")
-    gain = QUICK_GAINS if quick else GAINS
-    steps = gains(work, *gain, report)
-    drawn = []
+    found.gains.extend(gains(work, settings.gain_materials, settings.gain_epochs, report))
     for name, stack, which in list(figures())[:: 6 if quick else 1]:
-        drawn.append(drawn_figure(name, stack, which, walks))
+        found.figures.append(drawn_figure(name, stack, which, settings.paths))
         report(f"figures: {name}")
-    fitted = []
     for name, phase, truth in thick()[:: 5 if quick else 1]:
-        fitted.append(fit(name, phase, truth))
-        report(f"fits: {name}: bias {fitted[-1].cake_bias:.3f}, single scattering {fitted[-1].first_bias:.3f}")
-    cost = list(costs(quick))
-    report(f"costs: at most {max(row.ratio for row in cost):.2f} times single scattering")
+        found.fits.append(fit(name, phase, truth))
+        report(f"fits: {name}: bias {found.fits[-1].cake_bias:.3f}, single scattering {found.fits[-1].first_bias:.3f}")
+    found.costs.extend(costs(quick))
+    report(f"costs: at most {max(row.ratio for row in found.costs):.2f} times single scattering")
     surroundings = environment.describe()
-    text = markdown(surroundings, counts, errors, furnaces, steps, drawn, fitted, cost, ROUNDS, walks, ANGLES, gain)
-    content: dict[str, Any] = {
-        "environment": surroundings,
-        "quick": quick,
-        "errors": [asdict(row) for row in errors],
-        "furnace": [asdict(row) for row in furnaces],
-        "gains": [asdict(row) for row in steps],
-        "figures": [asdict(row) for row in drawn],
-        "fits": [asdict(row) for row in fitted],
-        "costs": [asdict(row) for row in cost],
-    }
+    text = markdown(surroundings, settings, found)
+    content = {"environment": surroundings, "quick": quick, **asdict(found)}
     return text, write("spongecake", content, text, directory)
+
+
+def _solved(work: Path, count: int, media: int, report: Callable[[str], None]) -> materials.Samples:
+    """The held-out materials with their truth, kept in the folder `work`."""
+    for there in materials.make(work, count, media, "test", SEED):
+        report(f"media {media}: truth of {there} of {count}")
+    return materials.load(work, count, media, "test", SEED)
 
 
 def lobes_alone(stack: lj.Stack) -> lj.Prepared:
@@ -153,7 +161,7 @@ def groups(samples: materials.Samples, media: int) -> dict[str, NDArray[np.bool_
 
 
 def held_out(samples: materials.Samples, media: int) -> list[Errors]:
-    """Errors of all kinds of materials."""
+    """Errors of the held-out materials, by kind."""
     lobes, cake = (_values(samples, ready) for ready in WAYS)
     first = _values(samples, partial(lj.prepare, transport=FIRST))
     truth = first + samples.values
@@ -195,7 +203,7 @@ def held_out(samples: materials.Samples, media: int) -> list[Errors]:
 
 
 def furnace(samples: materials.Samples, media: int) -> list[Furnace]:
-    """Energy of the same materials without absorption."""
+    """Energy of the held-out materials with their absorption taken away, by kind."""
     wi = jnp.asarray(lj.direction(jnp.deg2rad(jnp.asarray(ANGLES)), 0.4), jnp.float32)
     found = np.zeros((len(WAYS), len(samples.values), len(ANGLES)))
     for rows, make, numbers in _structures(samples):

@@ -1,8 +1,7 @@
 """What the study of SpongeCake's multiple scattering finds, and its tables."""
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from benchmarks.measuring.writing import environment_lines, figure, table
@@ -137,109 +136,130 @@ class Cost:
     operations: float
 
 
-def markdown(
-    surroundings: dict[str, Any],
-    counts: tuple[int, int],
-    errors: Sequence[Errors],
-    furnaces: Sequence[Furnace],
-    steps: Sequence[Gain],
-    drawn: Sequence[Figure],
-    fitted: Sequence[Fitted],
-    cost: Sequence[Cost],
-    rounds: int,
-    paths: int,
-    angles: Sequence[float],
-    gain: tuple[int, int],
-) -> str:
-    """The tables."""
+@dataclass(frozen=True)
+class Settings:
+    """How much was measured.
 
-    def two(values: Sequence[float]) -> str:
-        return f"{figure(values[0], 2)} / {figure(values[1], 2)}"
+    counts: slabs of one medium and of two. angles: of light in the furnace, degrees. paths: of the walk. rounds: of
+    timing. gain_materials, gain_epochs: of the training that says what each step is worth.
+    """
 
-    names = ("full", "multiple", "reflected", "transmitted", "reflected_multiple", "transmitted_multiple")
-    heads = ("full", "multiple", "R, full", "T, full", "R, multiple", "T, multiple", "single", "lobes alone")
+    counts: tuple[int, int]
+    angles: tuple[float, ...]
+    paths: int
+    rounds: int
+    gain_materials: int
+    gain_epochs: int
+
+
+@dataclass(frozen=True)
+class Findings:
+    """All that the study found, a list a section."""
+
+    errors: list[Errors] = field(default_factory=list)
+    furnace: list[Furnace] = field(default_factory=list)
+    gains: list[Gain] = field(default_factory=list)
+    figures: list[Figure] = field(default_factory=list)
+    fits: list[Fitted] = field(default_factory=list)
+    costs: list[Cost] = field(default_factory=list)
+
+
+def markdown(surroundings: dict[str, Any], settings: Settings, found: Findings) -> str:
+    """The page of results: words, and a table a section."""
     return TEXT.format(
         environment=environment_lines(surroundings),
-        one=counts[0],
-        two=counts[1],
-        angles=", ".join(f"{angle:g}" for angle in angles),
-        paths=paths,
-        gain_materials=gain[0],
-        gain_epochs=gain[1],
-        errors=table(
-            ("materials", "media", "count", *heads),
-            [
-                (
-                    row.kind,
-                    str(row.media),
-                    str(row.count),
-                    *(two(getattr(row, name)) for name in (*names, "single", "lobes")),
-                )
-                for row in errors
-            ],
-        ),
-        furnace=table(
-            ("materials", "media", "count", "lobes alone", "SpongeCake"),
-            [(row.kind, str(row.media), str(row.count), two(row.lobes), two(row.both)) for row in furnaces],
-        ),
-        gains=table(
-            ("second lobe", "full", "multiple", "energy"),
-            [(row.step, *(two(values) for values in (row.full, row.multiple, row.energy))) for row in steps],
-        ),
-        figures=table(
-            (
-                "material",
-                "figures",
-                "R walk",
-                "R single",
-                "R",
-                "T walk",
-                "T single",
-                "T",
-                "lobe single, %",
-                "lobe, %",
-                "noise, %",
-            ),
-            [
-                (
-                    row.material,
-                    row.figures,
-                    *itertools.chain.from_iterable(
-                        (f"{row.walk[s]:.4f} +- {row.walk_error[s]:.4f}", f"{row.single[s]:.4f}", f"{row.both[s]:.4f}")
-                        for s in (0, 1)
-                    ),
-                    figure(row.lobe_single, 2),
-                    figure(row.lobe_both, 2),
-                    figure(row.lobe_noise, 2),
-                )
-                for row in drawn
-            ],
-        ),
-        fits=table(
-            ("material", "truth", "SpongeCake", "single scattering", "bias", "bias, single"),
-            [
-                (
-                    row.material,
-                    *(", ".join(figure(v) for v in values) for values in (row.truth, row.cake, row.first)),
-                    figure(row.cake_bias),
-                    figure(row.first_bias),
-                )
-                for row in fitted
-            ],
-        ),
-        rounds=rounds,
-        costs=table(
-            ("material", "side", "precision", "single", "SpongeCake", "ratio", "operations"),
-            [
-                (
-                    row.material,
-                    row.side,
-                    row.precision,
-                    *(figure(value) for value in (row.single, row.both, row.ratio, row.operations)),
-                )
-                for row in cost
-            ],
-        ),
-        closer=sum(row.cake_bias < row.first_bias for row in fitted),
-        all=len(fitted),
+        one=settings.counts[0],
+        two=settings.counts[1],
+        angles=", ".join(f"{angle:g}" for angle in settings.angles),
+        paths=settings.paths,
+        rounds=settings.rounds,
+        gain_materials=settings.gain_materials,
+        gain_epochs=settings.gain_epochs,
+        errors=_errors_table(found.errors),
+        furnace=_furnace_table(found.furnace),
+        gains=_gains_table(found.gains),
+        figures=_figures_table(found.figures),
+        fits=_fits_table(found.fits),
+        closer=sum(row.cake_bias < row.first_bias for row in found.fits),
+        all=len(found.fits),
+        costs=_costs_table(found.costs),
     )
+
+
+def _errors_table(rows: Sequence[Errors]) -> str:
+    columns = {
+        "full": "full",
+        "multiple": "multiple",
+        "reflected": "R, full",
+        "transmitted": "T, full",
+        "reflected_multiple": "R, multiple",
+        "transmitted_multiple": "T, multiple",
+        "single": "single",
+        "lobes": "lobes alone",
+    }
+    cells = [
+        (row.kind, str(row.media), str(row.count), *(_middle_and_high(getattr(row, name)) for name in columns))
+        for row in rows
+    ]
+    return table(("materials", "media", "count", *columns.values()), cells)
+
+
+def _furnace_table(rows: Sequence[Furnace]) -> str:
+    cells = [
+        (row.kind, str(row.media), str(row.count), _middle_and_high(row.lobes), _middle_and_high(row.both))
+        for row in rows
+    ]
+    return table(("materials", "media", "count", "lobes alone", "SpongeCake"), cells)
+
+
+def _gains_table(rows: Sequence[Gain]) -> str:
+    cells = [(row.step, *map(_middle_and_high, (row.full, row.multiple, row.energy))) for row in rows]
+    return table(("second lobe", "full", "multiple", "energy"), cells)
+
+
+def _figures_table(rows: Sequence[Figure]) -> str:
+    energies = [f"{energy}{how}" for energy in "RT" for how in (" walk", " single", "")]
+    lobes = ("lobe single, %", "lobe, %", "noise, %")
+    cells = [
+        (
+            row.material,
+            row.figures,
+            *_energies(row, 0),
+            *_energies(row, 1),
+            *(figure(error, 2) for error in (row.lobe_single, row.lobe_both, row.lobe_noise)),
+        )
+        for row in rows
+    ]
+    return table(("material", "figures", *energies, *lobes), cells)
+
+
+def _energies(row: Figure, side: int) -> tuple[str, str, str]:
+    """By the walk, single scattering and SpongeCake; side: 0 reflected, 1 transmitted."""
+    walk = f"{row.walk[side]:.4f} +- {row.walk_error[side]:.4f}"
+    return walk, f"{row.single[side]:.4f}", f"{row.both[side]:.4f}"
+
+
+def _fits_table(rows: Sequence[Fitted]) -> str:
+    cells = [
+        (
+            row.material,
+            *(", ".join(map(figure, values)) for values in (row.truth, row.cake, row.first)),
+            figure(row.cake_bias),
+            figure(row.first_bias),
+        )
+        for row in rows
+    ]
+    return table(("material", "truth", "SpongeCake", "single scattering", "bias", "bias, single"), cells)
+
+
+def _costs_table(rows: Sequence[Cost]) -> str:
+    cells = [
+        (row.material, row.side, row.precision, *map(figure, (row.single, row.both, row.ratio, row.operations)))
+        for row in rows
+    ]
+    return table(("material", "side", "precision", "single", "SpongeCake", "ratio", "operations"), cells)
+
+
+def _middle_and_high(values: tuple[float, float]) -> str:
+    """Median and 95th percentile, as TEXT says."""
+    return f"{figure(values[0], 2)} / {figure(values[1], 2)}"

@@ -86,7 +86,7 @@ def stack_of(parameters: Any) -> lj.Stack:
 
 
 def model(p: Floats, wi: Floats, wo: Floats) -> Floats:
-    """The same material in plain numpy, (N,), for directions (N, 3) above the surface."""
+    """BSDF of the six-parameter material in plain numpy, (N,), for directions (N, 3) above the surface."""
     thickness, albedo, alpha, depth, g, base = p
     ci, co = wi[:, 2], wo[:, 2]
     half = wi + wo
@@ -103,7 +103,7 @@ def model(p: Floats, wi: Floats, wo: Floats) -> Floats:
 
 
 def coated_lobe(seed: int = 0) -> fits.Problem:
-    """2,000 noisy values of that material at random directions, and what is free in it."""
+    """2,000 noisy values of the six-parameter material at random directions, and what is free in it."""
     wi, wo = pairs(SAMPLES, "reflection", seed)
     exact = model(TRUTH, wi, wo)
     sigma = NOISE * exact

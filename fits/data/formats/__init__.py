@@ -1,4 +1,7 @@
-"""Readers of measured BSDFs, one file format a module; `read` looks at the content first and at the name last."""
+"""Readers and writers of measured BSDFs, one file format a module.
+
+`read` takes any of them, looks at the content first and at the name last, and gives `fits.Measurements`.
+"""
 
 from pathlib import Path
 
@@ -30,11 +33,17 @@ def read(
 ) -> Measurements:
     """Read a measurement file: CSV, MERL binary, Zemax BSDF or FRED text.
 
-    format: one of `FORMATS`; None finds out from the content.
-    quantity: what the numbers in the file are, "brdf", "brdf_cos" or "reflectance_factor". A CSV says so in its column
-        names, and then this picks among them; Zemax and FRED files hold "brdf" unless this says otherwise.
-    geometry, lookup: for MERL only, the directions to look up and how (see `fits.data.formats.merl.read`).
-    Raises ValueError, on one line, that names the file and, where there is one, line, column, value and allowed range.
+    Args:
+        path: the file.
+        format: "csv", "merl", "zemax" or "fred"; None finds out from the content.
+        quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
+            "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
+            FRED files hold "brdf" unless this says otherwise.
+        geometry: for MERL only, the directions to look up; None: the default `slices`.
+        lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
+
+    Raises:
+        ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
     """
     path = Path(path)
     checked = check_quantity(quantity)

@@ -109,11 +109,20 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
 def write_csv(measurements: Measurements, path: str | Path, force: bool = False) -> None:
     """Write samples as CSV in this project's convention (BSDF in 1/sr), with their source in comments.
 
-    Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees. An existing file is a ValueError
-    unless `force`; the file appears whole or not at all.
+    Values, sigma and mask come back exactly as they are, directions to 1e-10 degrees. The file appears whole or not at
+    all.
+
+    Args:
+        measurements: what is written.
+        path: the file.
+        force: replace a file that is there.
+
+    Raises:
+        ValueError: the file exists and `force` is False, or the name of a channel would not come back: "cos" (the
+            column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one.
     """
-    suffixes = [""] if measurements.channels == channel_names(1) else [f"_{name}" for name in measurements.channels]
-    names = ["theta_i", "phi_i", "theta_o", "phi_o", *(f"brdf{suffix}" for suffix in suffixes)]
+    value_names = _names_to_write(measurements.channels)
+    names = ["theta_i", "phi_i", "theta_o", "phi_o", *value_names]
     columns = [
         measurements.theta_i,
         measurements.phi_i,
@@ -122,7 +131,7 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
         *measurements.values.T,
     ]
     if measurements.sigma is not None:
-        names += [f"brdf{suffix}_sigma" for suffix in suffixes]
+        names += [f"{name}_sigma" for name in value_names]
         columns += [*measurements.sigma.T]
     source = measurements.source
     comments = {"source": source.path, "format": source.format, "quantity": source.quantity}
@@ -186,12 +195,10 @@ def _delimiter(header: str) -> str:
 def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
     """What the names of the value columns begin with, one of `_QUANTITY_OF`, and they, as channel name -> column."""
     found: dict[str, dict[str, str]] = {}
-    longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
     for name in names:
-        match = next((known for known in longest_first if name == known or name.startswith(f"{known}_")), None)
-        if match is not None and not name.endswith(_SUFFIXES):
-            channel = name.removeprefix(match).removeprefix("_") or channel_names(1)[0]
-            found.setdefault(match, {})[channel] = name
+        kind, channel = _kind_and_channel(name)
+        if kind is not None and not name.endswith(_SUFFIXES):
+            found.setdefault(kind, {})[channel] = name
     if not found:
         allowed = ", ".join(_QUANTITY_OF)
         raise header.error(f"no value column: must be one of {allowed}; the file has {', '.join(names)}")
@@ -210,6 +217,27 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
             f"columns {', '.join(columns.values())}: one without a channel name cannot stand beside others"
         )
     return kinds[0], columns
+
+
+def _kind_and_channel(column: str) -> tuple[str | None, str]:
+    """Which of `_QUANTITY_OF` the name of a column begins with, None for another column, and the channel it names."""
+    longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
+    kind = next((known for known in longest_first if column == known or column.startswith(f"{known}_")), None)
+    return kind, column.removeprefix(kind or "").removeprefix("_") or channel_names(1)[0]
+
+
+def _names_to_write(channels: tuple[str, ...]) -> list[str]:
+    """The columns of these channels; ValueError for a channel that the reader would not find in its column."""
+    if channels == channel_names(1):
+        return ["brdf"]
+    columns = [f"brdf_{channel}" for channel in channels]
+    for channel, column in zip(channels, columns, strict=True):
+        one_line = len(column.splitlines()) == 1 and column == column.strip()
+        if not one_line or column.endswith(_SUFFIXES) or _kind_and_channel(column) != ("brdf", channel):
+            raise ValueError(
+                f"channel {channel!r} cannot be written: its column would be read as another; give it another name"
+            )
+    return columns
 
 
 def _named(columns: list[str]) -> str:

@@ -95,7 +95,10 @@ def half_difference(wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def _half_difference(wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:
-    """The same with phi_d in [0, 2 pi]: beyond pi it is that of the pair with wi and wo exchanged, plus pi."""
+    """Half and difference angles of pairs of directions (N, 3), in radians, with phi_d in [0, 2 pi].
+
+    Beyond pi it is that of the pair with wi and wo exchanged, plus pi.
+    """
     half = wi + wo
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     theta_h = np.arctan2(np.hypot(half[:, 0], half[:, 1]), half[:, 2])

@@ -89,14 +89,14 @@ def value_label(data: "Measurements", channel: int) -> str:
 
 
 def chosen(every: list[Incidence]) -> list[Incidence]:
-    """At most `MOST_INCIDENCES` of them, evenly spaced and with both ends."""
+    """At most `MOST_INCIDENCES` of the incidences, evenly spaced and with both ends."""
     if len(every) <= MOST_INCIDENCES:
         return every
     return [every[index] for index in np.round(np.linspace(0, len(every) - 1, MOST_INCIDENCES)).astype(int)]
 
 
 def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
-    """Those of `shown` whose viewers leave the plane of incidence enough to draw a map, at most four."""
+    """The incidences among `shown` whose viewers leave the plane of incidence enough to draw a map, at most four."""
     off_plane = ~in_plane(data) & data.mask
     spread = [incidence for incidence in shown if np.count_nonzero(off_plane[incidence.rows]) >= 10]
     return spread if len(spread) <= 4 else [spread[i] for i in np.round(np.linspace(0, len(spread) - 1, 4)).astype(int)]

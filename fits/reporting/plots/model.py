@@ -166,7 +166,7 @@ def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
 
 def assumed_sigma(fit: "Fit") -> Floats:
     """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
-    from fits.problem.problem import Model
+    from fits.problem.model import Model
 
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
@@ -201,7 +201,7 @@ def _along(model: Any, vectors: Any, wi: Any, wo: Any) -> Any:
     """Scaled BSDF (S, M, C) of the stacks that `vectors` (S, P) describe."""
     import jax
 
-    from fits.problem.problem import forward
+    from fits.problem.model import forward
 
     def one(vector: Any) -> Any:
         parts = model.build(vector)

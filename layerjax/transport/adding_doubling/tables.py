@@ -8,6 +8,7 @@ summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many mo
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -53,61 +54,96 @@ class Tables(eqx.Module):
     steps: int | None = eqx.field(static=True)
 
 
+class _End(NamedTuple):
+    """The medium above or below the stack: its nodes, and matrices from values there to the points of a table."""
+
+    region: Region
+    lift: Array
+
+
 def make_tables(
-    grid: Grid, whole: Layer, azimuths: int | None, opaque: bool, caught: Callable[[Vector], Channels | None]
+    grid: Grid, whole: Layer, azimuths: int | None, opaque: bool, interacting: Callable[[Vector], Channels | None]
 ) -> Tables:
-    """Tables of a solved stack. caught: share of light along a direction that meets an event at all (None: all)."""
-    top, bottom = grid.regions[0], grid.regions[-1]
-    count = 1 if azimuths is None else azimuths
+    """Tables of a solved stack.
+
+    Args:
+        grid: the directions that it was solved at.
+        whole: the operators of all its layers together.
+        azimuths: ordinates in azimuth; None: Fourier modes.
+        opaque: only light from above, and what is reflected.
+        interacting: share of light along a direction that meets an event at all, per channel (None: all).
+    """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
-    lifts = {id(region): _lift(grid, region, modes, azimuths) for region in (top, bottom)}
+    top, bottom = (_End(region, _lift(grid, region, modes, azimuths)) for region in (grid.regions[0], grid.regions[-1]))
+    values = _values(whole, top, bottom, azimuths, steps, opaque)
 
-    def kernel(flux: Operator, out: Region) -> Operator:
-        if flux is None:
-            return None
-        weight = 2.0 * jnp.pi * jnp.repeat(out.weight, count) / count
-        return safe_div(flux, jnp.broadcast_to(weight[:, None], flux.shape))
-
-    def table(there: Operator, back: Operator, out: Region, into: Region) -> Array | None:
-        if there is None or back is None:
-            return None
-        back = turned(back, azimuths)
-        assert back is not None
-        mean = 0.5 * (there + jnp.swapaxes(back, -1, -2))
-        values = mean * (jnp.repeat(out.cosine, count)[:, None] + jnp.repeat(into.cosine, count))
-        fine = lifts[id(out)] @ values @ jnp.swapaxes(lifts[id(into)], -1, -2)
-        if steps is None:
-            return fine[:, 0]
-        return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
-
-    reflected = kernel(whole.reflect_top.rest, top)
-    quadrants = [table(reflected, reflected, top, top)]
+    lit = [(top, whole.reflect_top, whole.transmit_down, 1.0)]
     if not opaque:
-        reflected = kernel(whole.reflect_bottom.rest, bottom)
-        down, up = kernel(whole.transmit_down.rest, bottom), kernel(whole.transmit_up.rest, top)
-        quadrants += [table(reflected, reflected, bottom, bottom), table(down, up, bottom, top)]
-    present = [quadrant for quadrant in quadrants if quadrant is not None]
-    values = None
-    if present:
-        like = jnp.zeros_like(present[0])
-        together = jnp.concatenate([like if quadrant is None else quadrant for quadrant in quadrants], axis=1)
-        values = tuple(together[c] for c in range(together.shape[0]))
-    rows = [(whole.reflect_top, whole.transmit_down, top), (whole.reflect_bottom, whole.transmit_up, bottom)]
-    near: list[Array] = []
-    far: list[Array] = []
-    for reflect, transmit, region in rows[: 1 if opaque else 2]:
-        lift = lifts[id(region)][0]
-        met = caught(_node_directions(region, azimuths, 1.0 if region is top and not near else -1.0))
-        share = jnp.ones((1, lift.shape[-1]), lift.dtype) if met is None else jnp.stack(met)
-        for energies, flux in ((near, reflect.total), (far, transmit.total)):
-            sums = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
-            energies.append(
-                safe_div(sums, jnp.broadcast_to(share, jnp.broadcast_shapes(sums.shape, share.shape))) @ lift.T
-            )
+        lit.append((bottom, whole.reflect_bottom, whole.transmit_up, -1.0))
+    near, far = [], []
+    for end, reflect, transmit, side in lit:
+        share = interacting(_node_directions(end.region, azimuths, side))
+        near.append(_energy(reflect.total, share, end))
+        far.append(_energy(transmit.total, share, end))
     shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])
-    stacked = [jnp.stack([jnp.broadcast_to(row, shape) for row in rows]) for rows in (near, far)]
-    return Tables(grid, values, stacked[0], stacked[1], opaque, azimuths, steps)
+    near, far = ([jnp.broadcast_to(row, shape) for row in rows] for rows in (near, far))
+    return Tables(grid, values, jnp.stack(near), jnp.stack(far), opaque, azimuths, steps)
+
+
+def _values(
+    whole: Layer, top: _End, bottom: _End, azimuths: int | None, steps: int | None, opaque: bool
+) -> tuple[Array, ...] | None:
+    """The quadrants one after the other, an array a channel; None where nothing scatters more than once."""
+
+    def table(there: Operator, back: Operator, out: _End, into: _End) -> Array | None:
+        there, back = (_per_weight(flux, end, azimuths) for flux, end in ((there, out), (back, into)))
+        return _quadrant(there, turned(back, azimuths), out, into, azimuths, steps)
+
+    above = whole.reflect_top.rest
+    quadrants = [table(above, above, top, top)]
+    if not opaque:
+        below = whole.reflect_bottom.rest
+        quadrants.append(table(below, below, bottom, bottom))
+        quadrants.append(table(whole.transmit_down.rest, whole.transmit_up.rest, bottom, top))
+    present = [quadrant for quadrant in quadrants if quadrant is not None]
+    if not present:
+        return None
+    zero = jnp.zeros_like(present[0])
+    together = jnp.concatenate([zero if quadrant is None else quadrant for quadrant in quadrants], axis=1)
+    return tuple(together[c] for c in range(together.shape[0]))
+
+
+def _per_weight(flux: Operator, out: _End, azimuths: int | None) -> Operator:
+    """f / ior_o^2 between nodes: the flux into each node over its share of the projected solid angle."""
+    if flux is None:
+        return None
+    count = azimuths or 1
+    weight = 2.0 * jnp.pi * jnp.repeat(out.region.weight, count) / count
+    return safe_div(flux, jnp.broadcast_to(weight[:, None], flux.shape))
+
+
+def _quadrant(
+    there: Operator, back: Operator, out: _End, into: _End, azimuths: int | None, steps: int | None
+) -> Array | None:
+    """A table of reciprocal values; back: the same light the other way round, turned to the directions of `there`."""
+    if there is None or back is None:
+        return None
+    count = azimuths or 1
+    mean = 0.5 * (there + jnp.swapaxes(back, -1, -2))
+    values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
+    fine = out.lift @ values @ jnp.swapaxes(into.lift, -1, -2)
+    if steps is None:
+        return fine[:, 0]
+    return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
+
+
+def _energy(flux: Operator, share: Channels | None, end: _End) -> Array:
+    """Energy that leaves for light along each direction of a table, of what interacts: (channels or 1, points)."""
+    lift = end.lift[0]
+    leaving = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
+    met = jnp.ones((1, lift.shape[-1]), lift.dtype) if share is None else jnp.stack(share)
+    return safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))) @ lift.T
 
 
 def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:

@@ -4,7 +4,7 @@ Everything that needs a quadrature is done here, once for a stack: a pair of dir
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,6 +31,11 @@ GRAZING = 1e-6
 """Cosine that stands for 0."""
 
 
+Facet = tuple[Interface | Conductor, Array]
+"""The first interface or base that light meets, and the ratio of the indices behind and before it (of a conductor: the
+index of what it is in)."""
+
+
 class Columns(eqx.Module):
     """Where the quantities of a lobe stand in a row: first column and count of its scale and of its roughness.
 
@@ -52,7 +57,7 @@ class Table(eqx.Module):
     shares: Array
     near: Array
     far: Array
-    facet: tuple[Interface | Conductor, Array] | None
+    facet: Facet | None
     reflected: tuple[Columns, ...]
     transmitted: tuple[Columns, ...]
 
@@ -70,56 +75,59 @@ def look_up(rows: Array, cosine: Array, sine: Array) -> Array:
     return sum((weights[j][..., None] * rows[first + j] for j in range(1, 4)), weights[0][..., None] * rows[first])
 
 
+class _ShapedLobe(NamedTuple):
+    """A lobe by its energy (C or 1, POINTS), its roughness (None: the facet itself) and its cosine."""
+
+    energy: Array
+    alpha: Array | None
+    cosine: Array
+
+
+class _Rows:
+    """Rows of a table as they fill up with the columns of one lobe after the other."""
+
+    def __init__(self) -> None:
+        self.columns: list[Array] = []
+
+    def put(self, lobe: _ShapedLobe, unscaled: Array) -> Columns:
+        """Add the columns of a lobe; unscaled: energy of the lobe of its roughness."""
+        scale = self._put(lobe.energy / at_least(unscaled, LEAST_ENERGY))
+        return Columns(scale, None if lobe.alpha is None else self._put(lobe.alpha))
+
+    def _put(self, values: Array) -> tuple[int, int]:
+        start = sum(column.shape[0] for column in self.columns)
+        self.columns.append(values)
+        return start, values.shape[0]
+
+
 def make_table(stack: Stack, options: Options, upward: bool) -> Table:
     """Table of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are left out."""
     dtype = precision(stack)
     cosine = at_least(points(dtype), GRAZING)
     found = statistics(stack, cosine, options, upward)
-    columns: list[Array] = []
-
-    def put(values: Array) -> tuple[int, int]:
-        start = sum(column.shape[0] for column in columns)
-        columns.append(values)
-        return start, values.shape[0]
-
-    near = far = jnp.zeros((1, POINTS), dtype)
-    facet: tuple[Interface | Conductor, Array] | None = None
-    lobes: list[tuple[Array, Array | None, Array]] = []  # energy, roughness (None: the facet itself), cosine
-    for entry in found.reflected:
-        near = near + jnp.sum(entry.lobe.energy, axis=0)
-        for order, energy in enumerate(entry.lobe.energy):
-            if entry.facet is not None and order == 0:
-                facet = entry.facet
-                lobes.append((energy, None, cosine))
-            else:
-                lobes.append((energy, lobe_roughness(_widened(entry.lobe.variance, entry.spread, order)), cosine))
-    reflecting = len(lobes)
-    within: list[Array] = []
-    if found.transmitted is not None:
-        passing, within = _passing(stack, found, cosine, upward)
-        far = sum((energy for energy, _, _ in passing), far)
-        lobes += passing
-    shares = [jnp.mean(energy, axis=0) for energy, _, _ in lobes]
-    reached = _lobe_energies(lobes)
-    reflected, transmitted = [], []
-    for k, (energy, alpha, _) in enumerate(lobes):
-        if alpha is None:
-            assert facet is not None
-            reflected.append(Columns(put(energy / at_least(_unscaled(*facet, cosine), LEAST_ENERGY)), None))
-        elif k < reflecting:
-            reflected.append(Columns(put(energy / at_least(reached[k], LEAST_ENERGY)), put(alpha)))
-        else:
-            leaving = reached[k] * within[k - reflecting]
-            transmitted.append(Columns(put(energy / at_least(leaving, LEAST_ENERGY)), put(alpha)))
-    empty = jnp.zeros((0, POINTS), dtype)
+    reflected, facet = _returning(found, cosine)
+    transmitted, escaping = _passing(stack, found, cosine, upward)
+    lobes = [*reflected, *transmitted]
+    unscaled = _lobe_energies(lobes)
+    rows = _Rows()
+    of_reflected = [
+        rows.put(lobe, energy if facet is None or lobe.alpha is not None else _unscaled(*facet, cosine))
+        for lobe, energy in zip(reflected, unscaled[: len(reflected)], strict=True)
+    ]
+    of_transmitted = [
+        rows.put(lobe, energy * share)
+        for lobe, energy, share in zip(transmitted, unscaled[len(reflected) :], escaping, strict=True)
+    ]
+    empty, dark = jnp.zeros((0, POINTS), dtype), jnp.zeros((1, POINTS), dtype)
+    shares = [jnp.mean(lobe.energy, axis=0) for lobe in lobes]
     return Table(
-        rows=jnp.concatenate(columns or [empty]).T,
+        rows=jnp.concatenate(rows.columns or [empty]).T,
         shares=jnp.stack(shares, axis=-1) if shares else empty.T,
-        near=near.T,
-        far=far.T,
+        near=sum((jnp.sum(entry.lobe.energy, axis=0) for entry in found.reflected), dark).T,
+        far=sum((lobe.energy for lobe in transmitted), dark).T,
         facet=facet,
-        reflected=tuple(reflected),
-        transmitted=tuple(transmitted),
+        reflected=tuple(of_reflected),
+        transmitted=tuple(of_transmitted),
     )
 
 
@@ -148,43 +156,56 @@ def unfolded(w: Vector, ratio: Array) -> Vector:
     return x, y, -jnp.where(w[2] > 0, safe_sqrt(1.0 - x * x - y * y), 0.0)
 
 
-def _passing(
-    stack: Stack, found: Statistics, cosine: Array, upward: bool
-) -> tuple[list[tuple[Array, Array | None, Array]], list[Array]]:
-    """Energy, roughness and cosine of the transmitted lobes, by orders, in the medium of the reference index.
+def _returning(found: Statistics, cosine: Array) -> tuple[list[_ShapedLobe], Facet | None]:
+    """The reflected lobes by orders, and the facet that stands for one of them itself, if any does."""
+    facet: Facet | None = None
+    lobes = []
+    for entry in found.reflected:
+        for order, energy in enumerate(entry.lobe.energy):
+            if entry.facet is not None and order == 0:
+                facet, alpha = entry.facet, None
+            else:
+                alpha = lobe_roughness(_widened(entry.lobe.variance, entry.spread, order))
+            lobes.append(_ShapedLobe(energy, alpha, cosine))
+    return lobes, facet
+
+
+def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tuple[list[_ShapedLobe], list[Array]]:
+    """The transmitted lobes by orders, in the medium of the reference index, none over a base.
 
     Also the share of each that is not totally reflected on the way out of that medium. What nothing meets (no
     interface, no collision) passes straight and is no lobe.
     """
-    assert found.transmitted is not None
+    if found.transmitted is None:
+        return [], []
     below, reference = index_below(stack), reference_index(stack)
     enters, leaves = (below, jnp.ones_like(below)) if upward else (jnp.ones_like(below), below)
     here, _ = refracted_cosine(cosine, reference / enters, 1.0 - GRAZING)
     behind, _ = refracted_cosine(cosine, leaves / enters, STEEPEST)
     widening = leaves * behind / (reference * here)  # variance in the reference medium of a unit of it behind
     met = any(isinstance(layer, Interface) for layer in stack.layers)
-    lobes: list[tuple[Array, Array | None, Array]] = []
+    lobes: list[_ShapedLobe] = []
     for order, energy in enumerate(found.transmitted.energy):
         if order > 0 or met:
             sigma = _widened(found.transmitted.variance, found.transmitted_spread, order)
-            lobes.append((energy, lobe_roughness(widening * sigma), here))
-    if not lobes:
+            lobes.append(_ShapedLobe(energy, lobe_roughness(widening * sigma), here))
+    widths = [lobe.alpha for lobe in lobes if lobe.alpha is not None]
+    if not widths:
         return [], []
-    sizes = np.cumsum([alpha.shape[0] for _, alpha, _ in lobes if alpha is not None])
-    widths = jnp.concatenate([alpha for _, alpha, _ in lobes if alpha is not None])
-    return lobes, jnp.split(retained(here, widths, leaves / reference), sizes[:-1])
+    ends = np.cumsum([alpha.shape[0] for alpha in widths])
+    return lobes, jnp.split(retained(here, jnp.concatenate(widths), leaves / reference), ends[:-1])
 
 
-def _lobe_energies(lobes: Sequence[tuple[Array, Array | None, Array]]) -> list[Array]:
+def _lobe_energies(lobes: Sequence[_ShapedLobe]) -> list[Array]:
     """Energies of the lobes of a surface that reflects all, by one quadrature; 1 for facets themselves."""
-    widths = [alpha for _, alpha, _ in lobes if alpha is not None]
+    widths = [lobe.alpha for lobe in lobes if lobe.alpha is not None]
     if not widths:
         return [jnp.ones(()) for _ in lobes]
-    cosines = [jnp.broadcast_to(cosine, alpha.shape) for _, alpha, cosine in lobes if alpha is not None]
+    cosines = [jnp.broadcast_to(lobe.cosine, lobe.alpha.shape) for lobe in lobes if lobe.alpha is not None]
     energies = lobe_energy(jnp.concatenate(cosines), jnp.concatenate(widths))
     found, start = [], 0
-    for _, alpha, _ in lobes:
-        count = 0 if alpha is None else alpha.shape[0]
+    for lobe in lobes:
+        count = 0 if lobe.alpha is None else lobe.alpha.shape[0]
         found.append(energies[start : start + count] if count else jnp.ones(()))
         start += count
     return found

@@ -247,3 +247,23 @@ def test_writer_is_atomic_and_does_not_overwrite(tmp_path, monkeypatch):
 
 def _full_disk(*_) -> None:
     raise OSError("disk full")
+
+
+@pytest.mark.parametrize("channel", ["cos", "cos_red", "blue_std", "blue_sigma", "sigma", "", "red ", "red\nedge"])
+def test_a_channel_whose_column_would_be_read_as_another_is_not_written(tmp_path, channel):
+    w = np.array([[0.0, 0.6, 0.8]])
+    data = Measurements(w, w, np.ones((1, 2)), None, np.array([True]), ("red", channel))
+    with pytest.raises(ValueError, match=r"channel .* cannot be written: its column would be read as"):
+        write_csv(data, tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("channel", ["cosine", "650nm", "red edge", "a, b", "value", "brdf"])
+def test_other_channels_come_back(tmp_path, channel):
+    w = np.array([[0.0, 0.6, 0.8]])
+    data = Measurements(w, w, np.array([[1.0, 2.0]]), np.full((1, 2), 0.1), np.array([True]), ("other", channel))
+    write_csv(data, tmp_path / "out.csv")
+    again = read(tmp_path / "out.csv")
+    assert again.channels == data.channels
+    np.testing.assert_array_equal(again.values, data.values)
+    np.testing.assert_array_equal(again.sigma, data.sigma)

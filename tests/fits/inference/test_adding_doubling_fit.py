@@ -7,8 +7,9 @@ import pytest
 import layerjax as lj
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
+from fits.problem.model import Model
 from fits.problem.parameters import Free
-from fits.problem.problem import Model, Problem
+from fits.problem.problem import Problem
 from fits.problem.simulate import simulate, slices
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
