@@ -87,7 +87,7 @@ class SpongeCake(Transport):
         values = SingleScattering().evaluate(state.first, wi, wo, side)
         if state.second is None or (state.opaque and side == "transmission"):
             return values
-        return _sum(values, evaluate_second(state.second, wi, wo, side, state.opaque))
+        return _sum(values, evaluate_second(state.second, wi, wo, side, state.opaque))  # the three lobes of Sec. 5
 
     def sample(self, state: Mapped, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return draw(self._choices(state, wi), wi, uniforms)
@@ -105,7 +105,7 @@ class SpongeCake(Transport):
     def _choices(self, state: Mapped, wi: Vector) -> list[tuple[Array, Any]]:
         """Lobes to draw from, with their probabilities."""
         first = choices(state.first, wi)
-        if self.proposal == "first" or state.second is None:
+        if self.proposal == "first" or state.second is None:  # Sec. 4.6
             return first
         levels = [Hemisphere(False)] if state.opaque else [Hemisphere(False), Hemisphere(True)]
         share = 0.5 * SECOND_SHARE
