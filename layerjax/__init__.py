@@ -33,4 +33,4 @@ from layerjax.transport import WeidlichWilkie as WeidlichWilkie
 from layerjax.transport.random_walk.goniophotometer import Goniogram as Goniogram
 from layerjax.transport.random_walk.goniophotometer import goniophotometer as goniophotometer
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -11,7 +11,7 @@ THE CONVENTIONS (everything else in the package links here)
 - Radiance is carried; between media of different index, reciprocity holds for f / ior_o^2.
 
 Inside the package a direction is a tuple ``(x, y, z)`` of arrays (`Vector`): separate components keep XLA from
-shuffling an inner axis of three.
+shuffling an inner axis of three. Functions of components take any shapes that broadcast, and return their common shape.
 """
 
 import jax
@@ -41,7 +41,7 @@ def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:
-    """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions of shape ``(..., 3)``, in radians."""
+    """Polar angle in [0, pi] and azimuth in (-pi, pi] of directions ``(..., 3)``, in radians, shape ``(...)`` each."""
     x, y, z = split(floating("w", w))
     planar = x * x + y * y
     at_pole = planar == 0  # the azimuth is undefined there: give 0, with gradient 0
@@ -123,7 +123,7 @@ def sanitised(w: Vector, valid: Array | None = None) -> Vector:
 
 
 def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vector, Array]:
-    """Half vector h of wi and wo, and the cosine |wi . h|.
+    """Half vector h of the unit vectors wi and wo, and the cosine |wi . h|, in [0, 1].
 
     At wo = -wi the half vector is undefined (any vector normal to wi is a limit): one fixed vector normal to wi
     stands in. `same_side` promises that wi and wo lie on the same side of the surface, where that cannot happen, and

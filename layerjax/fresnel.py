@@ -1,4 +1,7 @@
-"""Fresnel reflectance of unpolarised light at smooth interfaces."""
+"""Fresnel reflectance of unpolarised light at smooth interfaces.
+
+Arguments broadcast against each other; a reflectance has their common shape and lies in [0, 1].
+"""
 
 import jax.numpy as jnp
 from jax import Array
@@ -8,7 +11,12 @@ from layerjax.directions import squared_cosine_of_refraction
 
 
 def schlick(cosine: Array, f0: Array | float) -> Array:
-    """Schlick's approximation f0 + (1 - f0) (1 - cosine)^5 for |cosine| in [0, 1] (Schlick 1994)."""
+    """Schlick's approximation f0 + (1 - f0) (1 - cosine)^5 (Schlick 1994).
+
+    Args:
+        cosine: cosine between the direction of incidence and the facet normal, in [0, 1].
+        f0: reflectance along the normal, in [0, 1].
+    """
     complement = at_least(1.0 - cosine, 0.0)  # a cosine may round to just above 1
     squared = complement * complement
     fifth = squared * squared * complement
@@ -41,7 +49,7 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     """Reflectance of a conductor with complex index ior + i k relative to the medium above it.
 
     Args:
-        cosine: cosine of incidence in [0, 1].
+        cosine: cosine between the direction of incidence and the facet normal, in [0, 1].
         ior: real part of the index, > 0.
         k: extinction coefficient, >= 0; k = 0 is a dielectric.
     """

@@ -15,7 +15,7 @@ ALONG_X = (1.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Material:
-    """A material. source: where it comes from; remark: what was assumed; build: makes the stack."""
+    """A material. source: where it comes from; remark: what was assumed; build: makes the stack, of 1 or 3 channels."""
 
     name: str
     source: str

@@ -22,13 +22,17 @@ Rule = tuple[Nodes, Nodes]
 
 @functools.cache
 def gauss_legendre(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on [0, 1]."""
+    """Gauss-Legendre nodes and weights on [0, 1], shape ``(nodes,)`` each."""
     x, w = np.polynomial.legendre.leggauss(nodes)
     return 0.5 * (x + 1.0), 0.5 * w
 
 
 def panels(edges: Array, nodes: int) -> tuple[Array, Array]:
-    """Nodes and weights of Gauss panels between the edges (last axis), crowded towards every edge.
+    """Nodes and weights of Gauss panels between edges, crowded towards every edge, ``(..., (E - 1) * nodes)`` each.
+
+    Args:
+        edges: in ascending order along the last axis, shape ``(..., E)``.
+        nodes: in each panel.
 
     The edges are where an integrand kinks or, towards grazing, changes quickly.
     """
@@ -40,7 +44,10 @@ def panels(edges: Array, nodes: int) -> tuple[Array, Array]:
 
 
 def hemisphere_rule(wi: Vector, nodes: int) -> Nodes:
-    """Nodes over the upper hemisphere, split where theta_o = theta_i and where the azimuth differs by +-pi/2."""
+    """Nodes over the upper hemisphere, split where theta_o = theta_i and where the azimuth differs by +-pi/2.
+
+    wi: components of shape ``batch``. The rule has 4 nodes^2 directions, shape ``batch + (4 * nodes**2,)``.
+    """
     s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
     psi, w_psi = panels(_half_turns(wi[2].dtype), nodes)
     planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])[..., None, None]
@@ -70,6 +77,12 @@ def flake_rule(wi: Vector, radial: Array, axial: Array, axis: Vector | None, nod
     With m = normalize(S^(1/2) y) the density of visible normals is uniform in the cosine of y, however narrow it is.
     Great circles of y through the image of wi are great circles of m through wi, and each of them crosses the horizon
     of wo once: polar coordinates about that point split the two hemispheres exactly.
+
+    Args:
+        wi: unit vectors, components of shape ``batch``.
+        radial, axial: half widths of the ellipsoid across and along the axis, > 0, shape ``()``.
+        axis: unit vector; None: z.
+        nodes: points on each great circle and side of the horizon; half as many circles in each panel between edges.
     """
     a: Vector = axis if axis is not None else (jnp.zeros_like(wi[2]), jnp.zeros_like(wi[2]), jnp.ones_like(wi[2]))
 
@@ -111,6 +124,8 @@ def flake_rule(wi: Vector, radial: Array, axial: Array, axis: Vector | None, nod
 def henyey_greenstein_inverse(g: Array, s: Array) -> tuple[Array, Array]:
     """Cosine and sine of deflection at s in [-1, 1], uniform in s: the inverse of the cumulative distribution.
 
+    g is the mean cosine, in (-1, 1), and broadcasts with s; both results have their common shape.
+
     Both factors of the sine are products of positive terms, so nothing cancels at g = 0 or at the poles.
     """
     norm = 2.0 * (1.0 + g * s) ** 2
@@ -120,7 +135,10 @@ def henyey_greenstein_inverse(g: Array, s: Array) -> tuple[Array, Array]:
 
 
 def henyey_greenstein_rule(wi: Vector, g: Array, nodes: int) -> Rule:
-    """Nodes uniform in the cumulative distribution of the deflection, and in azimuth about the direction of travel."""
+    """Nodes uniform in the cumulative distribution of the deflection, and in azimuth about the direction of travel.
+
+    wi: components of shape ``batch``; g: mean cosine in (-1, 1), shape ``()``.
+    """
     axis = scale(-1.0, wi)
     first, second = _panel_frame(axis, (jnp.zeros_like(wi[2]), jnp.zeros_like(wi[2]), jnp.ones_like(wi[2])))
     wi, axis, first, second = (_expand(w, 1) for w in (wi, axis, first, second))

@@ -124,15 +124,16 @@ def _from_above(slab: Media, wi: Vector, wo: Vector) -> dict[int, Channels]:
     for k, medium in enumerate(slab.media):
         weight = medium.phase.cross_section(wi) * wo[2] + medium.phase.cross_section(wo) * wi[2]
         weight = at_least(weight, WEIGHT_FLOOR)
+        # exp(-x) and 1 - exp(-x) of Eq. (12): x = tau (sigma_i/c_i + sigma_o/c_o)
         shares = [absorb(tau * (weight * inverse)) for tau in per_channel(medium.thickness)]
         if k in scattering:
-            lost = tuple(share / weight for _, share in shares)
+            lost = tuple(share / weight for _, share in shares)  # G / (c_i c_o), Eqs. (11) and (12)
             lobes[k] = times(_collision(medium, wi, wo, half), lost if through is None else times(through, lost))
         if k < last or slab.base is not None:
             transmitted = tuple(share for share, _ in shares)
             through = transmitted if through is None else times(through, transmitted)
     if slab.base is not None and through is not None:
-        lobes[BASE] = times(through, slab.base.evaluate(wi, wo))
+        lobes[BASE] = times(through, slab.base.evaluate(wi, wo))  # Sec. 4.5
     return lobes
 
 
@@ -151,10 +152,10 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
     def gain(thickness: Array, into: Array, out: Array, path_i: Array, path_o: Array) -> Array:
         if side == "all":
             into, out = jnp.where(same_side, 0.0, into), jnp.where(same_side, into + out, out)
-        if len(slab.media) > 1:
+        if len(slab.media) > 1:  # Sec. 4.4
             path = path_i + path_o
             into, out = into + path, out + path
-        return thickness * inverse * decay_between(into, out)
+        return thickness * inverse * decay_between(into, out)  # G / (c_i c_o) of Eqs. (12) and (16)
 
     for k in scattering:
         medium = slab.media[k]
@@ -164,7 +165,7 @@ def _from_any_side(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int,
 
 
 def _paths(depths: Sequence[Channels], w: Vector) -> list[Channels]:
-    """Optical depth that a ray along w crosses between the outside and each layer; one channel count for all layers."""
+    """Optical depth that a ray along w crosses between outside and each layer (Sec. 4.4); as many channels for all."""
     above = w[2] > 0
     zero = jnp.zeros_like(w[2])
     per_channel_paths = []
@@ -183,7 +184,7 @@ def _uses_half_vector(slab: Media) -> bool:
 
 
 def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array] | None) -> Channels:
-    """gamma F D/4 (Eq. 4), or gamma times the phase function: what a collision sends from wi to wo."""
+    """gamma F D/4 (Eqs. 4 and 5), or gamma times the phase function: what a collision sends from wi to wo."""
     strength: Channels = (medium.phase.kernel(wi, wo, None if half is None else half[0]),)
     if half is not None and medium.f0 is not None:
         levels = (0.0,) if is_known(medium.f0, 0.0) else per_channel(medium.f0)

@@ -121,9 +121,10 @@ def _lobes(stack: Stack, wi: Vector, wo: Vector) -> list[Channels]:
         ior = layer.ior / above
         level = fresnel.dielectric(cosine, ior)
         lobe, masking = _facets(h, wi, wo, layer.alpha)
-        lobes.append(times(through, (level * lobe,)))
+        lobes.append(times(through, (level * lobe,)))  # f_1
         refracted = 1.0 - level  # T12, T21
         wi, wo, cosine, inside = _refracted(wi, wo, h, cosine, ior)
+        # T12 t
         through = times(through, (jnp.where(inside, refracted * (1.0 - masking + refracted * masking), 0.0),))
         above = layer.ior
     assert stack.base is not None

@@ -11,7 +11,7 @@ from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium
 
 MOST = 2
-"""Media that a network is trained for."""
+"""Media that a network is trained for, as in Sec. 5."""
 
 
 def is_traced(media: tuple[Medium, ...]) -> bool:

@@ -45,14 +45,14 @@ class BlurredSGGX(SGGX):
         across, along = squared_lengths(total, self._axis())
         stretched = across / (radial * radial) + along / (axial * axial)
         ratio = (dot(total, total) + self.blur) / (stretched + self.blur)
-        return 0.25 / (jnp.pi * radial * radial * axial) * ratio * ratio
+        return 0.25 / (jnp.pi * radial * radial * axial) * ratio * ratio  # D_b/4: Eq. (4), Eq. (7) with b
 
     def sharp(self, wi: Vector, wo: Vector) -> Array:
         """The kernel without the blur, which is what is drawn from."""
         return SGGX.kernel(self, wi, wo, None)
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
-        return self.sharp(wi, wo) / self.cross_section(wi)
+        return self.sharp(wi, wo) / self.cross_section(wi)  # Eq. (4)
 
 
 class SecondLobe(eqx.Module):
@@ -78,6 +78,7 @@ def second_lobe(
     albedo = mean([number.albedo for number in numbers])
     f0 = mean([number.f0 for number in numbers])
     coloured = any(jnp.ndim(medium.thickness) for medium in media)  # else one thickness serves all channels
+    # the parameters that Fig. 5 and Fig. 6 put out (Sec. 5), but f0; kind and axis stay
     shapes = [shape_of(net, number._replace(albedo=albedo, f0=f0)) for number in (numbers if coloured else numbers[:1])]
     alpha, blur = mean([shape.alpha for shape in shapes]), mean([shape.blur for shape in shapes])
     slab = []
@@ -138,7 +139,7 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
         values = []
         for c, rim in enumerate(rims):
             plain, more = (_of_side(second.weights.lobes[c, :, k, n], wi, wo, side, opaque) for n in (0, 1))
-            values.append((plain + more * edge) * rim * pick(lobe, c))
+            values.append((plain + more * edge) * rim * pick(lobe, c))  # W_1 of Sec. 5 times Eqs. (11) and (16)
         found[k] = tuple(values)
     return found
 
@@ -151,7 +152,7 @@ def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
     for c in range(_channels(second)):
         level = _of_side(second.weights.levels[c], wi, wo, side, opaque)
         slope = _rising(second.weights.slopes[c], rises, wi, wo, side, opaque)
-        values.append(jnp.where(valid, level * slope, 0.0))
+        values.append(jnp.where(valid, level * slope, 0.0))  # W_2 of Sec. 5
     return tuple(values)
 
 

@@ -28,7 +28,7 @@ from jax import Array
 from layerjax._numerics import at_least, safe_sqrt
 
 WIDTH, DEPTH = 128, 3
-"""Hidden layers: how wide, how many."""
+"""Hidden layers: how wide, how many (Sec. 5)."""
 
 LEAST_ALPHA = 0.03
 """Narrower lobes are mapped as these: none is learned from."""

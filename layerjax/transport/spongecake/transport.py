@@ -99,6 +99,7 @@ class SpongeCake(DeterministicTransport):
         values = SingleScattering().evaluate(state.first, wi, wo, side)
         if state.second is None or (state.opaque and side == "transmission"):
             return values
+        # the three lobes of Sec. 5
         return total([values, evaluate_second(state.second, wi, wo, side, state.opaque)])
 
     def sample(self, state: Mapped, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
@@ -117,7 +118,7 @@ class SpongeCake(DeterministicTransport):
     def _choices(self, state: Mapped, wi: Vector) -> list[tuple[Array, Any]]:
         """Lobes to draw from, with their probabilities."""
         first = choices(state.first, wi)
-        if self.proposal == "first" or state.second is None:
+        if self.proposal == "first" or state.second is None:  # Sec. 4.6
             return first
         levels = [Hemisphere(False)] if state.opaque else [Hemisphere(False), Hemisphere(True)]
         share = 0.5 * SECOND_SHARE
