@@ -15,7 +15,7 @@ from jax import Array
 
 from layerjax._numerics import safe_sqrt
 from layerjax.directions import Vector, dot, refract
-from layerjax.normals.sggx import ggx_sample
+from layerjax.normals.ggx import ggx_sample
 
 
 def facing_area(w: Vector, alpha: Array) -> Array:

@@ -21,7 +21,7 @@ from layerjax import fresnel
 from layerjax._numerics import horizon
 from layerjax.channels import Channels, count, mean, per_channel, pick
 from layerjax.directions import Factor, Vector, combine, half_vector, select
-from layerjax.normals.sggx import ggx_density, sggx_area
+from layerjax.normals.ggx import ggx_area, ggx_density
 from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import Side, Transport, refuse_vmf
@@ -142,7 +142,7 @@ def _conductor(base: Conductor, cosine: Array, above: Factor) -> Channels:
 
 def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Array]:
     """D G / (4 cos cos) and G of GGX facets, G = G1 G1: no cosine is left to divide by."""
-    visible = 1.0 / ((wi[2] + sggx_area(wi, "surface", alpha, None)) * (wo[2] + sggx_area(wo, "surface", alpha, None)))
+    visible = 1.0 / ((wi[2] + ggx_area(wi, alpha)) * (wo[2] + ggx_area(wo, alpha)))
     return ggx_density(h, alpha) * visible, 4.0 * wi[2] * wo[2] * visible
 
 

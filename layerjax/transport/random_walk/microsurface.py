@@ -21,7 +21,7 @@ from layerjax.microsurface.heitz_walk import (
     next_height,
     pass_through,
 )
-from layerjax.normals.sggx import ggx_density
+from layerjax.normals.ggx import ggx_density
 from layerjax.surfaces import Conductor
 from layerjax.surfaces.microfacet import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene

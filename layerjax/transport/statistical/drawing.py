@@ -8,7 +8,7 @@ from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.normals.facets import facet_density
-from layerjax.normals.sggx import ggx_sample
+from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.first_order import mirror

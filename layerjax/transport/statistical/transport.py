@@ -16,7 +16,7 @@ from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
 from layerjax.normals.facets import facet_density
-from layerjax.normals.sggx import ggx_density, ggx_sample, sggx_area
+from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack, simplify
@@ -298,7 +298,7 @@ def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
     alpha = bounded(alpha)  # a cubic may leave the range of its points
-    area_i, area_o = sggx_area(wi, "surface", alpha, None), sggx_area(wo, "surface", alpha, None)
+    area_i, area_o = ggx_area(wi, alpha), ggx_area(wo, alpha)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 
 
