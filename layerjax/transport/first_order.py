@@ -21,7 +21,7 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.surfaces.interface import interface_reflection, interface_transmission
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 

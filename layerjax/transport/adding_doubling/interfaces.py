@@ -21,7 +21,7 @@ from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.normals import facets
 from layerjax.quadrature import gauss_legendre
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.adding_doubling.grid import Grid, Region, spread
 from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import BALANCING, balance, modes_at_nodes, straight_on

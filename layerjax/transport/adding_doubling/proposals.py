@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax.directions import Vector, select
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.first_order import Face, FirstOrder, mirror
 from layerjax.transport.single_scattering import SingleScattering
 

@@ -18,8 +18,8 @@ from layerjax.channels import Channels, count, mean, pick
 from layerjax.directions import Vector, dot, half_vector, reflect, refract, select
 from layerjax.normals import facets
 from layerjax.quadrature import Nodes
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.endf.chains import (
     Coat,
     Face,

@@ -14,7 +14,7 @@ from layerjax._numerics import at_least
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector
 from layerjax.normals import vmf
-from layerjax.surfaces.microfacet import refraction_lobe
+from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.endf.chains import (
     Coat,
     Face,

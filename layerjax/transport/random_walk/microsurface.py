@@ -23,7 +23,7 @@ from layerjax.microsurface.heitz_walk import (
 )
 from layerjax.normals.ggx import ggx_density
 from layerjax.surfaces import Conductor
-from layerjax.surfaces.microfacet import refraction_lobe
+from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, merge, roughness, turned
 

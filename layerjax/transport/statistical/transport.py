@@ -21,7 +21,7 @@ from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack, simplify
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import Side, Transport, refuse_vmf
 from layerjax.transport.first_order import mirror
 from layerjax.transport.statistical.diffuse_base import make_diffuse
