@@ -18,8 +18,8 @@ from jax import Array
 
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, direction, split
+from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, simplify
-from layerjax.transport.adding_doubling.interfaces import Microfacets
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest

@@ -13,6 +13,7 @@ from jax import Array
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import facet_density, sample
 from layerjax.stack import Interface, Stack, simplify
 from layerjax.surfaces.lambertian import sample_cosine
@@ -20,7 +21,7 @@ from layerjax.transport.contract import Side, Transport, refuse_vmf
 from layerjax.transport.random_walk.lanes import average, upright
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
-from layerjax.transport.random_walk.walk import Microfacets, Orders, Walk
+from layerjax.transport.random_walk.walk import Orders, Walk
 
 
 class RandomWalk(Transport):

@@ -19,13 +19,13 @@ from jax import Array
 
 from layerjax.channels import Channels, largest, pick
 from layerjax.directions import Vector, scale, select
+from layerjax.microsurface import Microfacets
 from layerjax.transport.random_walk import microsurface as microsurface
 from layerjax.transport.random_walk import surfaces as surfaces
 from layerjax.transport.random_walk.flight import boundary, fly
 from layerjax.transport.random_walk.scene import Scene, choose
 from layerjax.transport.random_walk.state import Aim, Event, Lane, Step, make_goal, merge, to_level, weights
 
-Microfacets = Literal["single", "multiple"]
 Orders = Literal["all", "first", "multiple"]
 
 ROULETTE = 0.25

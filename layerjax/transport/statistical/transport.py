@@ -15,6 +15,7 @@ from jax import Array
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
+from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import facet_density
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
 from layerjax.phase import SGGX
@@ -49,7 +50,6 @@ from layerjax.transport.statistical.tables import (
     unfolded,
 )
 
-Microfacets = Literal["single", "multiple"]
 Diffuse = Literal["exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
