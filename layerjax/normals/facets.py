@@ -46,7 +46,7 @@ def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     """Density D(m) of normals above the horizon, 1/sr; the integral of D cos over the hemisphere is 1."""
     if distribution == "ggx":
         return ggx_density(m, alpha)
-    return vmf.facet_density(m, vmf.concentration(alpha))
+    return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
 def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
@@ -65,10 +65,10 @@ def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
 
 
 def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:
-    """A normal that is seen from wi (above the horizon), from two uniform numbers; see `facet_density`."""
+    """A normal that is seen from wi (above the horizon), from two uniform numbers; see `reflection_pdf`."""
     if distribution == "ggx":
         return ggx_sample(wi, alpha, u1, u2)
-    normal = vmf.facet_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
+    normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
     slope, rim = _azimuths(wi[2] * cosine, planar * sine)
@@ -79,12 +79,12 @@ def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distrib
     return x * along - y * across, y * along + x * across, cosine
 
 
-def facet_density(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
+def reflection_pdf(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
     if distribution == "ggx":
         return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     kappa = vmf.concentration(alpha)
-    drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.facet_density(h, kappa)
+    drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * at_least(dot(wi, h), LEAST_WEIGHT))
 
 

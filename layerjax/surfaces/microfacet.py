@@ -8,7 +8,7 @@ from layerjax._parameters import Parameter, parameter
 from layerjax.channels import count, per_channel, pick
 from layerjax.directions import Vector, half_vector, reflect
 from layerjax.normals import facets
-from layerjax.normals.facets import Distribution, check_facets, facet_density
+from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.contract import Surface
 
@@ -48,7 +48,7 @@ class Conductor(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return facet_density(h, wi, self.alpha, self.distribution)
+        return reflection_pdf(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         return facets.rule(wi, self.alpha, nodes, self.distribution)

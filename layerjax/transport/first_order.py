@@ -16,7 +16,7 @@ from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.normals.facets import Distribution, facet_density, rule, sample
+from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
@@ -41,7 +41,7 @@ class Face(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return facet_density(h, wi, self.alpha, self.distribution)
+        return reflection_pdf(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         return rule(wi, self.alpha, nodes, self.distribution)

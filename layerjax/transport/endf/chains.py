@@ -102,7 +102,7 @@ def reflections(coat: Coat, options: Options, wi: Vector, wo: Vector) -> list[Ch
 
 def _facets(h: Vector, wi: Vector, wo: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
     """Microfacet lobe of normals that reflect all, D G / (4 cos cos), 1/sr."""
-    return 0.25 * vmf.facet_density(h, kappa) * visible(wi, kappa, masking) * visible(wo, kappa, masking)
+    return 0.25 * vmf.hemisphere_density(h, kappa) * visible(wi, kappa, masking) * visible(wo, kappa, masking)
 
 
 def _by_mean_directions(
@@ -119,7 +119,7 @@ def _by_mean_directions(
     lobes: list[Channels] = []
     for k in range(1, options.bounces + 1):
         energy = times(times(energy, step), (level,)) if k > 1 else times(energy, step)
-        lobes.append(times(energy, (vmf.facet_density(h, chain_concentration(k, wi[2], top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, chain_concentration(k, wi[2], top, base)),)))
     return lobes
 
 
@@ -136,7 +136,7 @@ def _below_the_surface(coat: Coat, top: Face, base: Mirror, options: Options, wi
     lobes: list[Channels] = []
     for k in range(1, options.bounces + 1):
         energy = times(times(energy, step), (inside,)) if k > 1 else times(energy, step)
-        lobes.append(times(energy, (vmf.facet_density(h, inner_concentration(k, cosine, top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, inner_concentration(k, cosine, top, base)),)))
     return lobes
 
 

@@ -160,12 +160,12 @@ def _density(coat: Coat, lobe: Proposal, wi: Vector, wo: Vector) -> Array:
     """Density of one lobe's draws before they are mirrored down."""
     if lobe.place == "outside":
         h, _ = half_vector(wi, wo, same_side=True)
-        return facets.facet_density(h, wi, width(lobe.kappa), "vmf")
+        return facets.reflection_pdf(h, wi, width(lobe.kappa), "vmf")
     assert coat.top is not None
     (inner_i, enters), (inner_o, leaves) = entered(wi, coat.top.ior), entered(wo, coat.top.ior)
     h, _ = half_vector(inner_i, inner_o, same_side=True)
     slope = wo[2] / (coat.top.ior * coat.top.ior * inner_o[2])  # of solid angle inside by outside
-    return jnp.where(enters & leaves, slope * facets.facet_density(h, inner_i, width(lobe.kappa), "vmf"), 0.0)
+    return jnp.where(enters & leaves, slope * facets.reflection_pdf(h, inner_i, width(lobe.kappa), "vmf"), 0.0)
 
 
 def energies(coat: Coat, options: Options, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:

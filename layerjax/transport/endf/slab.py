@@ -68,7 +68,7 @@ def _by_mean_directions(
     lobes: list[Channels] = []
     for j in range(options.bounces + 1):
         energy = times(energy, step) if j else energy
-        lobes.append(times(energy, (vmf.facet_density(h, slab_concentration(j, wi[2], top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, slab_concentration(j, wi[2], top, base)),)))
     return lobes
 
 
@@ -85,7 +85,7 @@ def _below_the_surface(
     lobes: list[Channels] = []
     for j in range(options.bounces + 1):
         energy = times(energy, step) if j else energy
-        lobes.append(times(energy, (vmf.facet_density(h, inner_slab_concentration(j, cosine, top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, inner_slab_concentration(j, cosine, top, base)),)))
     return lobes
 
 

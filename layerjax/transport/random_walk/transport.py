@@ -14,7 +14,7 @@ from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
 from layerjax.microsurface import Microfacets
-from layerjax.normals.facets import facet_density, sample
+from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack, simplify
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.contract import Side, Transport, refuse_vmf
@@ -138,7 +138,7 @@ class RandomWalk(Transport):
         facets = _facets(state)
         if facets is not None:
             h, _ = half_vector(local, towards)
-            mirrored = facet_density(h, local, facets.alpha, facets.distribution)
+            mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
             density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
         return density
 

@@ -7,7 +7,7 @@ from jax import Array
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, half_vector, reflect, select
-from layerjax.normals.facets import facet_density
+from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
@@ -104,7 +104,7 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
     rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
     total = jnp.zeros_like(wi[2] * wo[2])
     for share, alpha in zip(shares, reflected, strict=False):
-        total = total + share * facet_density(h, wi, alpha)
+        total = total + share * reflection_pdf(h, wi, alpha)
     if diffuse is not None:
         total = total + rest * up[2] / np.pi
     total = jnp.where(above, total, 0.0)
@@ -117,7 +117,7 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
         h, _ = half_vector(a, b, same_side=True)
         stretch = exit * exit * under[2] / b[2]
         for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):
-            total = total + jnp.where(below, share * stretch * facet_density(h, a, alpha), 0.0)
+            total = total + jnp.where(below, share * stretch * reflection_pdf(h, a, alpha), 0.0)
     return jnp.where(lit, total, 0.0)
 
 

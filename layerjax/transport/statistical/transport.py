@@ -16,7 +16,7 @@ from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
 from layerjax.directions import Vector, add, dot, half_vector, reflect, select
 from layerjax.microsurface import Microfacets
-from layerjax.normals.facets import facet_density
+from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import gauss_legendre
@@ -256,7 +256,7 @@ class Statistical(Transport):
             alpha = width[..., None]
             m = ggx_sample(wi, alpha, u1, u2)
             wo = reflect(wi, m)
-            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), facet_density(m, wi, alpha))
+            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), reflection_pdf(m, wi, alpha))
             lobe = self._reflections(table, wi, wo)[j]
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         ratios = 1.0 / state.reference, state.below / state.reference
@@ -267,7 +267,7 @@ class Statistical(Transport):
             a = folded(wi, entry)
             m = ggx_sample(a, alpha, u1, u2)
             b = reflect(a, m)
-            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * facet_density(m, a, alpha))
+            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * reflection_pdf(m, a, alpha))
             lobe = self._transmissions(state, turned(wi), turned(unfolded(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         return _summed(near), _summed(far)
