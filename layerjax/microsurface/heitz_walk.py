@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._numerics import safe_sqrt
-from layerjax.directions import Vector, dot, refract
+from layerjax.directions import Vector, dot, flip, refract
 from layerjax.normals.ggx import ggx_sample
 
 
@@ -58,4 +58,4 @@ def meet_facet(wi: Vector, alpha: Array, u1: Array, u2: Array) -> tuple[Vector, 
 def pass_through(wi: Vector, m: Vector, ior: Array, height: Array) -> tuple[Vector, Array, Array]:
     """Direction and height of light refracted at a facet, both as seen from the other side, and whether it exists."""
     refracted, exists = refract(wi, m, ior)
-    return (refracted[0], refracted[1], -refracted[2]), height_overturned(height), exists
+    return flip(refracted), height_overturned(height), exists

@@ -15,7 +15,7 @@ from jax import Array
 from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, count, pick
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.directions import Vector, flip, half_vector, reflect, select
 from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.phase import SGGX
 from layerjax.quadrature import Nodes
@@ -26,7 +26,7 @@ from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 
 
-class Face(Surface):
+class ReflectingInterface(Surface):
     """Reflection at an interface, seen from its upper side. ior: index below over index above."""
 
     ior: Parameter
@@ -55,7 +55,7 @@ class FirstOrder(eqx.Module):
 
     upper: Media
     lower: Media | None
-    crossing: Face | None
+    crossing: ReflectingInterface | None
     opaque: bool = eqx.field(static=True)
     layered: bool = eqx.field(static=True)
     """Whether there are interfaces."""
@@ -69,7 +69,7 @@ def first_order(stack: Stack) -> FirstOrder:
     first, last = interfaces[0], interfaces[-1]
     face = stack.layers[first]
     assert isinstance(face, Interface)
-    upper = Media(_media(stack.layers[:first]), Face(face.ior, face.alpha, face.distribution))
+    upper = Media(_media(stack.layers[:first]), ReflectingInterface(face.ior, face.alpha, face.distribution))
     if stack.base is not None:
         return FirstOrder(upper, None, None, True, True)
     above: Any = 1.0
@@ -80,10 +80,10 @@ def first_order(stack: Stack) -> FirstOrder:
     bottom = stack.layers[last]
     assert isinstance(bottom, Interface)
     lower = Media(
-        tuple(map(_mirrored, reversed(_media(stack.layers[last + 1 :])))),
-        Face(above / bottom.ior, bottom.alpha, bottom.distribution),
+        tuple(map(_flipped, reversed(_media(stack.layers[last + 1 :])))),
+        ReflectingInterface(above / bottom.ior, bottom.alpha, bottom.distribution),
     )
-    crossing = Face(face.ior, face.alpha, face.distribution) if first == last else None
+    crossing = ReflectingInterface(face.ior, face.alpha, face.distribution) if first == last else None
     return FirstOrder(upper, lower, crossing, False, True)
 
 
@@ -96,7 +96,7 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     if side != "transmission":
         parts.append(single.evaluate(state.upper, wi, wo, "reflection"))
     if side == "all" and state.lower is not None:
-        parts.append(single.evaluate(state.lower, mirror(wi), mirror(wo), "reflection"))
+        parts.append(single.evaluate(state.lower, flip(wi), flip(wo), "reflection"))
     if side != "reflection" and state.crossing is not None:
         parts.append(_refracted(state, state.crossing, wi, wo))
     zero = jnp.zeros_like(wi[2] * wo[2])
@@ -122,12 +122,7 @@ def share_met(media: Sequence[Medium], w: Vector) -> Channels:
     return tuple(jnp.where(total > 0, one_minus_exp(total), 1.0 / jnp.abs(w[2])) for total in totals)
 
 
-def mirror(w: Vector) -> Vector:
-    """The image below of a direction above, and the other way round."""
-    return (w[0], w[1], -w[2])
-
-
-def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channels:
+def _refracted(state: FirstOrder, face: ReflectingInterface, wi: Vector, wo: Vector) -> Channels:
     assert state.lower is not None
     downward = wi[2] > 0
     over, under = select(downward, wi, wo), select(downward, wo, wi)
@@ -137,7 +132,7 @@ def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channel
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
     value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
     value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
-    depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, mirror(under))
+    depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, flip(under))
     through = []
     for c in range(max(1, count(*depths))):
         total = sum((pick(depth, c) for depth in depths), jnp.zeros_like(value))
@@ -149,8 +144,8 @@ def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:
     return tuple(layer for layer in layers if isinstance(layer, Medium))
 
 
-def _mirrored(medium: Medium) -> Medium:
+def _flipped(medium: Medium) -> Medium:
     if isinstance(medium.phase, SGGX) and medium.phase.axis is not None:
-        flip = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(medium.phase.axis).dtype)
-        return eqx.tree_at(lambda m: m.phase.axis, medium, medium.phase.axis * flip)
+        over = jnp.asarray([1.0, 1.0, -1.0], jnp.asarray(medium.phase.axis).dtype)
+        return eqx.tree_at(lambda m: m.phase.axis, medium, medium.phase.axis * over)
     return medium

@@ -25,7 +25,7 @@ from layerjax.normals.ggx import ggx_area, ggx_density
 from layerjax.stack import Medium, Stack, is_known, media_of, optical_depths, simplify
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import Side, Transport, refuse_vmf
-from layerjax.transport.first_order import Face
+from layerjax.transport.first_order import ReflectingInterface
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
@@ -171,7 +171,7 @@ def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
             continue
         ior = layer.ior / above
         level = fresnel.dielectric(w[2], ior)
-        energies.append((reached * level, Face(ior, layer.alpha)))
+        energies.append((reached * level, ReflectingInterface(ior, layer.alpha)))
         reached = reached * (1.0 - level) ** 2
         w, _, _, _ = _refracted(w, w, normal, w[2], ior)
         above = layer.ior

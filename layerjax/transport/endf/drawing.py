@@ -15,15 +15,15 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._numerics import at_most, safe_sqrt
 from layerjax.channels import Channels, count, mean, pick
-from layerjax.directions import Vector, dot, half_vector, reflect, refract, select
+from layerjax.directions import Vector, dot, flip, half_vector, reflect, refract, select
 from layerjax.normals import facets
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.endf.chains import (
     Coat,
-    Face,
     Options,
+    UpperSide,
     absorbed,
     chain_concentration,
     entered,
@@ -36,7 +36,6 @@ from layerjax.transport.endf.chains import (
     width,
 )
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration, transmissions
-from layerjax.transport.first_order import mirror
 
 Place = Literal["outside", "inside"]
 
@@ -134,20 +133,20 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
         assert coat.top is not None
         outer, escapes = _left(coat.top, lifted(out))
         out, leaves = select(inside, outer, out), leaves & (~inside | (enters & escapes))
-    return select(through, mirror(out), out), leaves
+    return select(through, flip(out), out), leaves
 
 
 def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) -> Array:
     """Density of `draw` in solid angle, 1/sr, for wi above."""
-    lit, up, down = is_above(wi), is_above(wo), is_above(mirror(wo))
-    wi, over = lifted(wi), lifted(select(down, mirror(wo), wo))
+    lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
+    wi, over = lifted(wi), lifted(select(down, flip(wo), wo))
     total = COSINE * (1.0 if opaque else 0.5) * over[2] / jnp.pi
     if _is_interface(coat):
         assert coat.top is not None
         ior, alpha = coat.top.ior, width(coat.top.kappa)
         reflected = interface_reflection(wi, over, ior, alpha, "vmf")
-        passed = interface_transmission(wi, mirror(over), ior, alpha, "vmf")
-        out = select(up, over, mirror(over))
+        passed = interface_transmission(wi, flip(over), ior, alpha, "vmf")
+        out = select(up, over, flip(over))
         facet = interface_pdf(jnp.where(up, reflected, passed), wi, out, ior, alpha, "vmf")
         total = total + (1.0 - COSINE) * facet
     else:
@@ -219,15 +218,15 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
     return select(inside, outer, wo), weight * jnp.where(inside, slope, 1.0)
 
 
-def _refracted_energy(top: Face, options: Options, wi: Vector, nodes: int) -> Array:
+def _refracted_energy(top: UpperSide, options: Options, wi: Vector, nodes: int) -> Array:
     """Energy through one interface, over the facets that wi sees."""
     planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])
     flat: Vector = (-planar.reshape(1, 1), jnp.zeros((1, 1), planar.dtype), wi[2].reshape(1, 1))
     m, weight = facets.seen_normals(flat, width(top.kappa), nodes, 2 * nodes)
     cosine = dot(flat, m)
     wo, exists = refract(flat, m, top.ior)
-    passes = exists & is_above(mirror(wo))
-    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(lifted(mirror(wo)), top.kappa, options.masking)
+    passes = exists & is_above(flip(wo))
+    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(lifted(flip(wo)), top.kappa, options.masking)
     lit = visible(wi, top.kappa, options.masking) / visible(wi, top.kappa, "normal")  # as the weights have it
     return lit * jnp.sum(jnp.where(passes, weight * share, 0.0))
 
@@ -242,7 +241,7 @@ def _is_interface(coat: Coat) -> bool:
     return coat.top is not None and coat.base is None
 
 
-def _left(top: Face, inner: Vector) -> tuple[Vector, Array]:
+def _left(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
     """Where light inside goes outside a level facet (both upward), and whether it does."""
     x, y = top.ior * inner[0], top.ior * inner[1]
     squared = 1.0 - x * x - y * y

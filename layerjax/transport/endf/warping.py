@@ -31,7 +31,7 @@ class Gains(NamedTuple):
 
 
 def refracted_cosine(cosine: Array, ior: Array) -> tuple[Array, Array]:
-    """Cosine beyond a facet of relative index ior, and whether light passes there at all (else an interior number)."""
+    """Cosine beyond a facet of relative index ior, and whether light passes; under total reflection 0.5 stands in."""
     squared = ((ior - 1.0) * (ior + 1.0) + cosine * cosine) / (ior * ior)
     passes = squared > 1e-18
     return jnp.sqrt(jnp.where(passes, squared, 0.25)), passes

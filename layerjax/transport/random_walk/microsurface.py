@@ -12,7 +12,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax.channels import Channels, count, per_channel, pick
-from layerjax.directions import Vector, add, dot, normalize, reflect, scale, select
+from layerjax.directions import Vector, add, dot, flip, normalize, reflect, scale, select
 from layerjax.microsurface.heitz_walk import (
     escape_probability,
     facing_area,
@@ -138,7 +138,7 @@ def _sent_by_interface(wi: Vector, wo: Vector, height: Array, ior: Array, alpha:
     lobe, cosine = _sent_by_mirror(wi, wo, height, alpha)
     reflected = lobe * fresnel.dielectric(jnp.minimum(cosine, 1.0), ior)
     facets, transmittance = refraction_lobe(wi, wo, ior, alpha)
-    escape = escape_probability((wo[0], wo[1], -wo[2]), height_overturned(height), alpha)
+    escape = escape_probability(flip(wo), height_overturned(height), alpha)
     refracted = facets * transmittance / facing_area(scale(-1.0, wi), alpha) * escape
     return jnp.where(wo[2] > 0, reflected, jnp.where(facets > 0, refracted, 0.0))
 

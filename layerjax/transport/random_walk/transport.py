@@ -12,7 +12,7 @@ from jax import Array
 
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.directions import Vector, flip, half_vector, reflect, select
 from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack, simplify
@@ -123,7 +123,7 @@ class RandomWalk(Transport):
         local = _lifted((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
         cosine = sample_cosine(u1, u2)
-        wo = select(u < near, cosine, (cosine[0], cosine[1], -cosine[2]))
+        wo = select(u < near, cosine, flip(cosine))
         facets = _facets(state)
         if facets is not None:
             m = sample(local, facets.alpha, u1, u2, facets.distribution)

@@ -6,12 +6,11 @@ from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, select
+from layerjax.directions import Vector, flip, half_vector, reflect, select
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.first_order import mirror
 from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
@@ -110,7 +109,7 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
     total = jnp.where(above, total, 0.0)
     if transmitted:
         below = wo[2] < -edge
-        under = lifted(mirror(wo), below)
+        under = lifted(flip(wo), below)
         a, b = folded(wi, entry), folded(under, exit)
         below = below & (a[2] > edge) & (b[2] > edge)
         a, b = lifted(a, below), lifted(b, below)

@@ -14,7 +14,7 @@ from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, count, pick
-from layerjax.directions import Vector, add, dot, half_vector, reflect, select
+from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, select
 from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
@@ -24,7 +24,6 @@ from layerjax.stack import Interface, Medium, Stack, simplify
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import Side, Transport, refuse_vmf
-from layerjax.transport.first_order import mirror
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
 from layerjax.transport.statistical.drawing import (
@@ -54,7 +53,7 @@ Diffuse = Literal["exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
 
-class Statistics(eqx.Module):
+class LobeTables(eqx.Module):
     """A stack made ready: tables for light from above and from below (None over a base), and the diffuse part."""
 
     top: Table
@@ -121,7 +120,7 @@ class Statistical(Transport):
             if reason is not None:
                 raise ValueError(f'{reason}; Statistical(diffuse="exact") takes any')
 
-    def prepare(self, stack: Stack) -> Statistics:
+    def prepare(self, stack: Stack) -> LobeTables:
         slim = simplify(stack)
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side)
         diffuse: DiffusePart | None = None
@@ -132,7 +131,7 @@ class Statistical(Transport):
                 diffuse = make_diffuse(slim, slim.base, self.microfacets)
             else:
                 diffuse = make_diffuse_lobe(slim)
-        return Statistics(
+        return LobeTables(
             top=make_table(slim, options, upward=False),
             bottom=None if slim.base is not None else make_table(slim, options, upward=True),
             diffuse=diffuse,
@@ -140,33 +139,33 @@ class Statistical(Transport):
             reference=reference_index(slim),
         )
 
-    def evaluate(self, state: Statistics, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: LobeTables, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
             parts += self._reflections(state.top, wi, wo)
             if state.diffuse is not None:
                 parts.append(diffuse_part(state.diffuse, wi, wo))
             if side == "all" and state.bottom is not None:
-                parts += self._reflections(state.bottom, mirror(wi), mirror(wo))
+                parts += self._reflections(state.bottom, flip(wi), flip(wo))
         if side != "reflection" and state.bottom is not None:
             parts += self._transmissions(state, wi, wo)
         return _summed(parts)
 
-    def sample(self, state: Statistics, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: LobeTables, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(state.top, state.diffuse, wi, uniforms, 1.0 / state.reference, state.below / state.reference)
         if state.bottom is None:
             return down
-        up = draw(state.bottom, None, mirror(wi), uniforms, state.below / state.reference, 1.0 / state.reference)
-        return select(wi[2] > 0, down, mirror(up))
+        up = draw(state.bottom, None, flip(wi), uniforms, state.below / state.reference, 1.0 / state.reference)
+        return select(wi[2] > 0, down, flip(up))
 
-    def pdf(self, state: Statistics, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: LobeTables, wi: Vector, wo: Vector) -> Array:
         down = density(state.top, state.diffuse, wi, wo, 1.0 / state.reference, state.below / state.reference)
         if state.bottom is None:
             return down
         ratios = state.below / state.reference, 1.0 / state.reference
-        return jnp.where(wi[2] > 0, down, density(state.bottom, None, mirror(wi), mirror(wo), *ratios))
+        return jnp.where(wi[2] > 0, down, density(state.bottom, None, flip(wi), flip(wo), *ratios))
 
-    def albedo(self, state: Statistics, wi: Vector, nodes: int) -> Energies:
+    def albedo(self, state: LobeTables, wi: Vector, nodes: int) -> Energies:
         """Forward: the energies of the lobes. Symmetric: by quadrature, 2 nodes^2 points a lobe."""
         above = wi[2] > horizon(wi[2].dtype)
         near, far = self._energies(state, state.top, lifted(wi, above), nodes, upward=False)
@@ -175,7 +174,7 @@ class Statistical(Transport):
         if state.bottom is None:
             return tuple(jnp.where(above, e, 0.0) for e in near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
-        other = self._energies(state, state.bottom, lifted(mirror(wi), below), nodes, upward=True)
+        other = self._energies(state, state.bottom, lifted(flip(wi), below), nodes, upward=True)
         sides = []
         for down, up in zip((near, far), other, strict=True):
             sides.append(
@@ -185,7 +184,7 @@ class Statistical(Transport):
             )
         return sides[0], sides[1]
 
-    def _energies(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _energies(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
         if self.symmetric:
             return self._integrated(state, table, wi, nodes, upward)
         return read_energies(table, wi)
@@ -209,12 +208,12 @@ class Statistical(Transport):
             lobes.append(_product(scale, shape, valid))
         return lobes
 
-    def _transmissions(self, state: Statistics, wi: Vector, wo: Vector) -> list[Channels]:
+    def _transmissions(self, state: LobeTables, wi: Vector, wo: Vector) -> list[Channels]:
         """Every lobe that passes, for light and viewer on different sides: lobes of a reflection, folded over."""
         assert state.bottom is not None
         edge = horizon(wi[2].dtype)
         downward = wi[2] > 0
-        over, under = select(downward, wi, wo), mirror(select(downward, wo, wi))
+        over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
         valid = (over[2] > edge) & (under[2] > edge)
         over, under = lifted(over, valid), lifted(under, valid)
         ratio_over, ratio_under = 1.0 / state.reference, state.below / state.reference
@@ -241,7 +240,7 @@ class Statistical(Transport):
             lobes.append(_product(scales, shape, valid))
         return lobes
 
-    def _integrated(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _integrated(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
         """Energy of every lobe by a quadrature over the facets seen from wi, above (`upward`: turned up)."""
         s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
         turn = (jnp.arange(2 * nodes, dtype=s.dtype) + 0.5) / (2 * nodes)
@@ -261,7 +260,7 @@ class Statistical(Transport):
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         ratios = 1.0 / state.reference, state.below / state.reference
         entry, exit = ratios[::-1] if upward else ratios
-        turned = mirror if upward else _same
+        turned = flip if upward else _same
         for j, width in enumerate(transmitted):
             alpha = width[..., None]
             a = folded(wi, entry)
