@@ -21,7 +21,7 @@ ALBEDO, ROUGHNESS = (0.518, 0.331, 0.184), 0.5
 SEED = 3
 COLOURS, WIDTH = fits.Free([0.4, 0.4, 0.4], 0.0, 1.0), fits.Free(0.4, 0.0, 1.0)
 SURFACES = {
-    "VMF diffuse, transport": lj.VMFDiffuse(COLOURS, WIDTH, form="transport"),
+    "VMF diffuse, transport": lj.VMFDiffuse(COLOURS, WIDTH, form="all_orders"),
     "VMF diffuse, paper": lj.VMFDiffuse(COLOURS, WIDTH),
     "Oren-Nayar, energy preserving": lj.OrenNayar(COLOURS, WIDTH),
     "Oren-Nayar, classic": lj.OrenNayar(COLOURS, WIDTH, form="classic"),
@@ -31,7 +31,7 @@ SURFACES = {
 
 def sand_data(noise=0.03, seed=SEED):
     """Readings at four incidences in two planes."""
-    sand = lj.Stack([], lj.VMFDiffuse(ALBEDO, ROUGHNESS, form="transport"))
+    sand = lj.Stack([], lj.VMFDiffuse(ALBEDO, ROUGHNESS, form="all_orders"))
     geometry = fits.slices(incidence=(10, 35, 60, 75), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     return fits.simulate(sand, geometry, noise=noise, seed=seed)
 

@@ -84,6 +84,11 @@ def scale(factor: Factor, a: Vector) -> Vector:
     return (factor * a[0], factor * a[1], factor * a[2])
 
 
+def flip(a: Vector) -> Vector:
+    """The vector as it is where the stack lies upside down: below for above, and the other way round."""
+    return a[0], a[1], -a[2]
+
+
 def combine(p: Factor, a: Vector, q: Factor, b: Vector) -> Vector:
     """p a + q b."""
     return (p * a[0] + q * b[0], p * a[1] + q * b[1], p * a[2] + q * b[2])

@@ -30,7 +30,7 @@ SURFACES: dict[str, Callable[[Any, Any], Surface]] = {
     "Oren-Nayar, classic": lambda albedo, roughness: lj.OrenNayar(albedo, roughness, form="classic"),
     "Oren-Nayar, energy preserving": lambda albedo, roughness: lj.OrenNayar(albedo, roughness),
     "VMF diffuse, paper": lambda albedo, roughness: lj.VMFDiffuse(albedo, roughness),
-    "VMF diffuse, transport": lambda albedo, roughness: lj.VMFDiffuse(albedo, roughness, form="transport"),
+    "VMF diffuse, transport": lambda albedo, roughness: lj.VMFDiffuse(albedo, roughness, form="all_orders"),
 }
 
 TEXT = """\
@@ -166,7 +166,7 @@ def white_sky(surface: Surface, nodes: int = 24) -> NDArray[np.float64]:
 def nearest(name: str, roughness: float) -> Shape:
     """The surface of a kind that comes nearest to the exact solution of VMF diffuse with this roughness."""
     geometry, make = _geometry(), SURFACES[name]
-    exact = lj.Stack([], lj.VMFDiffuse(SHAPE_ALBEDO, roughness, form="transport"))
+    exact = lj.Stack([], lj.VMFDiffuse(SHAPE_ALBEDO, roughness, form="all_orders"))
     data = fits.simulate(exact, geometry)
     weight = np.abs(geometry.wi[:, 2:] * geometry.wo[:, 2:])
     free = (fits.Free(0.7, 0.0, 1.0), fits.Free(0.5, 0.0, 1.0))

@@ -194,7 +194,7 @@ def _passing(cap: Cap, ior: Array, points: int) -> tuple[Array, Array]:
 
 
 def _sigma(cosine: Array, alpha: Array) -> Array:
-    """Projected area sigma of the facets and of their backs, see `layerjax.normals.sggx.sggx_area`."""
+    """Projected area sigma of the facets and of their backs, see `layerjax.normals.ggx.ggx_area`."""
     return jnp.sqrt(alpha * alpha * (1.0 - cosine) * (1.0 + cosine) + cosine * cosine)
 
 

@@ -15,8 +15,9 @@ from jax import Array
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax._parameters import check_range, is_placeholder
 from layerjax.directions import Vector, dot
-from layerjax.normals import sggx as distributions
 from layerjax.normals import vmf
+from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
+from layerjax.normals.sggx import radii
 from layerjax.quadrature import Nodes, flake_rule, gauss_legendre, panels
 
 Distribution = Literal["ggx", "vmf"]
@@ -44,8 +45,8 @@ def check_facets(owner: str, distribution: Any, alpha: Any) -> None:
 def density(m: Vector, alpha: Array, distribution: Distribution) -> Array:
     """Density D(m) of normals above the horizon, 1/sr; the integral of D cos over the hemisphere is 1."""
     if distribution == "ggx":
-        return distributions.ggx_density(m, alpha)
-    return vmf.facet_density(m, vmf.concentration(alpha))
+        return ggx_density(m, alpha)
+    return vmf.hemisphere_density(m, vmf.concentration(alpha))
 
 
 def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distribution) -> Array:
@@ -54,7 +55,7 @@ def twice_seen(cosine: Array, w: Vector, alpha: Array, distribution: Distributio
     Densities of light that a facet scatters are quotients by it, so that no cosine is left to divide by.
     """
     if distribution == "ggx":
-        return cosine + distributions.sggx_area(w, "surface", alpha, None)
+        return cosine + ggx_area(w, alpha)
     return 2.0 / vmf.masking_over_cosine(cosine, vmf.concentration(alpha))
 
 
@@ -64,10 +65,10 @@ def masking(w: Vector, alpha: Array, distribution: Distribution) -> Array:
 
 
 def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distribution) -> Vector:
-    """A normal that is seen from wi (above the horizon), from two uniform numbers; see `facet_density`."""
+    """A normal that is seen from wi (above the horizon), from two uniform numbers; see `reflection_pdf`."""
     if distribution == "ggx":
-        return distributions.ggx_sample(wi, alpha, u1, u2)
-    normal = vmf.facet_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
+        return ggx_sample(wi, alpha, u1, u2)
+    normal = vmf.hemisphere_sample(vmf.concentration(alpha), u1, jnp.zeros_like(u2))
     planar, x, y = _plane(wi)
     sine, cosine = safe_sqrt(normal[0] * normal[0] + normal[1] * normal[1]), normal[2]
     slope, rim = _azimuths(wi[2] * cosine, planar * sine)
@@ -78,12 +79,12 @@ def sample(wi: Vector, alpha: Array, u1: Array, u2: Array, distribution: Distrib
     return x * along - y * across, y * along + x * across, cosine
 
 
-def facet_density(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
+def reflection_pdf(h: Vector, wi: Vector, alpha: Array, distribution: Distribution = "ggx") -> Array:
     """Density, 1/sr, of directions mirrored at facets that `sample` draws, by their half vector with wi."""
     if distribution == "ggx":
-        return distributions.ggx_density(h, alpha) * distributions.ggx_masking(wi, alpha) / (4.0 * wi[2])
+        return ggx_density(h, alpha) * ggx_masking(wi, alpha) / (4.0 * wi[2])
     kappa = vmf.concentration(alpha)
-    drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.facet_density(h, kappa)
+    drawn = _share_drawn(wi, h, kappa) * vmf.hemisphere_norm(kappa) * vmf.hemisphere_density(h, kappa)
     return drawn / (4.0 * at_least(dot(wi, h), LEAST_WEIGHT))
 
 
@@ -100,7 +101,7 @@ def draw_weight(wi: Vector, m: Vector, alpha: Array) -> Array:
 def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> Nodes:
     """Quadrature over the directions above the horizon that the facets mirror wi to (see `layerjax.quadrature`)."""
     if distribution == "ggx":
-        return flake_rule(wi, *distributions.radii("surface", alpha), None, nodes)[0]
+        return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]
     return _mirror_rule(wi, vmf.concentration(alpha), nodes)
 
 

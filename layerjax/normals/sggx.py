@@ -1,8 +1,8 @@
-"""Distributions of facet and flake normals: SGGX (Heitz et al. 2015) and GGX (Walter et al. 2007).
+"""Normals of flakes in a volume: SGGX (Heitz et al. 2015, "The SGGX microflake distribution").
 
-Both kinds of SGGX flake are symmetric about an axis a, so everything needed follows from the two squared lengths of a
+Both kinds of flake are symmetric about an axis a, so everything needed follows from the two squared lengths of a
 direction across and along it: S = radial^2 (I - a a') + axial^2 a a', with (radial, axial) = (alpha, 1) for "surface"
-flakes and (1, alpha) for "fiber" flakes. GGX is the "surface" case around the normal, cut at the horizon.
+flakes and (1, alpha) for "fiber" flakes.
 
 Densities are written in tangential form (squared lengths, never 1 - cos^2): the usual form loses every digit in float32
 below alpha = 1e-3.
@@ -74,24 +74,3 @@ def sggx_sample(wi: Vector, kind: Kind, alpha: Array, axis: Vector | None, u1: A
     x, y, z = radius * jnp.cos(phi), radius * jnp.sin(phi), safe_sqrt(1.0 - u1)
     local = add(combine(x, tangent, y, bitangent), scale(z, v))
     return normalize(stretch(local, radial, axial, axis))
-
-
-def ggx_density(m: Vector, alpha: Array) -> Array:
-    """GGX density D(m) of facet normals above the horizon, 1/sr; integral of D cos over the hemisphere is 1."""
-    return sggx_density(m, "surface", alpha, None)
-
-
-def ggx_masking(w: Vector, alpha: Array) -> Array:
-    """Smith masking G1(w) = 2 cos / (cos + sigma(w)) for w above the horizon (Walter 2007, Eq. 34)."""
-    cosine = w[2]
-    return 2.0 * cosine / (cosine + sggx_area(w, "surface", alpha, None))
-
-
-def ggx_sample(wi: Vector, alpha: Array, u1: Array, u2: Array) -> Vector:
-    """Facet normal seen from wi (above the horizon), with density G1 <wi, m> D(m) / cos (Dupuy & Benyoub 2023)."""
-    v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
-    phi = 2.0 * jnp.pi * u1
-    z = (1.0 - u2) * (1.0 + v[2]) - v[2]
-    sine = safe_sqrt(1.0 - z * z)
-    h = (sine * jnp.cos(phi) + v[0], sine * jnp.sin(phi) + v[1], z + v[2])
-    return normalize((alpha * h[0], alpha * h[1], h[2]))

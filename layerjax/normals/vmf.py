@@ -48,7 +48,7 @@ def hemisphere_norm(kappa: Array) -> Array:
     return 0.25 * share / exprel(2.0 * kappa)
 
 
-def facet_density(m: Vector, kappa: Array) -> Array:
+def hemisphere_density(m: Vector, kappa: Array) -> Array:
     """Density D(m), 1/sr, of facet normals above the horizon; the integral of D cos over the hemisphere is 1."""
     flat = m[0] * m[0] + m[1] * m[1]
     drop = flat / (1.0 + m[2])  # 1 - cos, without cancellation
@@ -152,7 +152,7 @@ def masking_over_cosine(cosine: Array, kappa: Array, form: Masking = "normal") -
     return norm / at_least(area, norm * cosine)
 
 
-def facet_sample(kappa: Array, u1: Array, u2: Array) -> Vector:
+def hemisphere_sample(kappa: Array, u1: Array, u2: Array) -> Vector:
     """Normal above the horizon with density M / (its integral there, `upper_share`), from two uniform numbers."""
     drop = -jnp.log1p(-u1 * -jnp.expm1(-kappa)) / kappa  # 1 - cos
     sine = safe_sqrt(drop * (2.0 - drop))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from layerjax.precompute.shares import shares as walked_shares
+from layerjax.precompute.interface_walks import multiply_scattered
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.statistical import diffuse
 
@@ -279,7 +279,7 @@ def _walks(size: dict[str, Any], report: Callable[[str], Any]) -> np.ndarray:
         points = np.stack(np.broadcast_arrays(cosine[:, None], alpha[:, None], n), axis=-1)
         flat = jnp.asarray(points.reshape(-1, 3), jnp.float32)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(SEED), side), len(flat))
-        found = np.asarray(walked_shares(flat, keys, TAUS, size["paths"]), float)
+        found = np.asarray(multiply_scattered(flat, keys, TAUS, size["paths"]), float)
         sides.append(found.reshape(*points.shape[:-1], 2, len(TAUS)))
     return np.stack(sides)
 

@@ -4,8 +4,7 @@ Coefficients of the polynomials of `layerjax.microsurface.multiple_bounces`, fit
 microsurface (Heitz et al. 2016, "Multiple-scattering microfacet BSDFs with the Smith model") at low-discrepancy points
 of the parameters. A walk starts with a given first event and is weighted with its Fresnel share; what leaves at each
 facet is counted in full expectation, and where all of it is known by quadrature only its division is taken from walks.
-Heights are counted as -log C1 >= 0, in which the facets are a homogeneous medium
-(`layerjax.transport.random_walk.microsurface`).
+Heights and directions are those of `layerjax.microsurface.heitz_walk`.
 """
 
 import functools
@@ -19,10 +18,10 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.directions import Vector, dot, normalize, reflect, refract, scale, select
+from layerjax.directions import Vector, normalize, reflect, scale, select
 from layerjax.microsurface.directional_albedo import first_event, first_mirror
+from layerjax.microsurface.heitz_walk import escape_probability, facing_area, meet_facet, next_height, pass_through
 from layerjax.microsurface.multiple_bounces import conductor_basis, interface_bases
-from layerjax.normals.sggx import ggx_sample
 
 SEED = 2016
 FACETS = 200
@@ -131,7 +130,7 @@ def _estimate(
     zero, up = jnp.zeros_like(cosine), jnp.zeros(shape, bool)
     heights, walks = jax.random.split(key)
     travel: Vector = (jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), zero, -cosine)
-    height = -jnp.log1p(-jax.random.uniform(heights, shape, jnp.float32)) * cosine / _area(travel, alpha)
+    height = -jnp.log1p(-jax.random.uniform(heights, shape, jnp.float32)) * cosine / facing_area(travel, alpha)
 
     def goes_on(state: tuple[Any, ...]) -> Array:
         return (state[0] < FACETS) & (jnp.max(jnp.mean(state[3] * state[4], axis=1)) > ENOUGH)
@@ -141,30 +140,25 @@ def _estimate(
         begins = facet == 0
         u = jax.random.uniform(jax.random.fold_in(walks, facet), (4, *shape), jnp.float32)
         wi = scale(-1.0, travel)
-        m = ggx_sample(wi, alpha, u[0], u[1])
-        c = jnp.clip(dot(wi, m), 0.0, 1.0)
+        m, c = meet_facet(wi, alpha, u[0], u[1])
         wo = reflect(wi, m)
         if first == "mirror":
             level = level * fresnel.conductor(c, ior, k)
         else:
-            refracted, exists = refract(wi, m, ior)
+            refracted, below, exists = pass_through(wi, m, ior, height)
             reflectance = fresnel.dielectric(c, ior)
-            # z counts away from the surface on the side that the ray is on; below, the heights are turned over
-            across: Vector = (refracted[0], refracted[1], -refracted[2])
             crosses = exists & jnp.where(begins, first == "refracted", u[2] >= reflectance)
             share = reflectance if first == "reflected" else jnp.where(exists, 1.0 - reflectance, 0.0)
             level = jnp.where(begins, share, level)
-            wo = select(crosses, across, wo)
-            height = jnp.where(crosses, _overturned(height), height)
+            wo = select(crosses, refracted, wo)
+            height = jnp.where(crosses, below, height)
             ior, beyond = jnp.where(crosses, 1.0 / ior, ior), beyond ^ crosses
-        area = _area(wo, alpha)
-        rises = wo[2] > 0
-        escape = jnp.where(rises, jnp.exp(-height * area / jnp.where(rises, wo[2], 1.0)), 0.0)
+        escape = escape_probability(wo, height, alpha)
         leaves = jnp.where(begins, 0.0, weight * escape)
         near = near + jnp.where(beyond, 0.0, level * leaves)
         far = far + (leaves if first == "mirror" else jnp.where(beyond, level * leaves, 0.0))
         path = -jnp.log1p(-u[3] * (1.0 - escape))  # to the next facet, given that there is one
-        height = jnp.maximum(height - wo[2] * path / jnp.maximum(area, 1e-30), 1e-6)
+        height = jnp.maximum(next_height(wo, height, alpha, path), 1e-6)
         return facet + 1, normalize(wo), height, weight * (1.0 - escape), level, ior, beyond, near, far
 
     one = jnp.ones_like(zero)
@@ -172,16 +166,3 @@ def _estimate(
     end = jax.lax.while_loop(goes_on, step, start)
     near, far = (x.astype(float).mean(axis=1) for x in end[-2:])
     return near, far
-
-
-def _area(w: Vector, alpha: Array) -> Array:
-    """Projected area of the facets that face a ray along w, (sigma - w_z) / 2."""
-    across = alpha * alpha * (w[0] * w[0] + w[1] * w[1])
-    sigma = jnp.sqrt(across + w[2] * w[2])
-    return 0.5 * jnp.where(w[2] > 0, across / (sigma + jnp.abs(w[2])), sigma - w[2])
-
-
-def _overturned(height: Array) -> Array:
-    """-log(1 - exp(-height))."""
-    small = height < 0.6931
-    return -jnp.where(small, jnp.log(-jnp.expm1(-height)), jnp.log1p(-jnp.exp(-height)))

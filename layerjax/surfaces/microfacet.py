@@ -1,19 +1,14 @@
-"""Rough interfaces of microfacets: single scattering, separable Smith masking (Walter et al. 2007).
-
-`Conductor` is a base; a dielectric is an `Interface` of a stack, and its BSDF is given here as plain functions of
-directions, seen from either side by turning z round.
-"""
+"""Rough conductors of microfacets: single scattering, separable Smith masking (Walter et al. 2007)."""
 
 import equinox as eqx
-import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
 from layerjax._parameters import Parameter, parameter
 from layerjax.channels import each, per_channel
-from layerjax.directions import Vector, add, combine, dot, half_vector, normalize, reflect, refract, scale, select
+from layerjax.directions import Vector, half_vector, reflect
 from layerjax.normals import facets
-from layerjax.normals.facets import Distribution, check_facets, facet_density
+from layerjax.normals.facets import Distribution, check_facets, reflection_pdf
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.contract import Surface
 
@@ -53,7 +48,7 @@ class Conductor(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return facet_density(h, wi, self.alpha, self.distribution)
+        return reflection_pdf(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         return facets.rule(wi, self.alpha, nodes, self.distribution)
@@ -61,111 +56,13 @@ class Conductor(Surface):
 
 def mirror_lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array, distribution: Distribution) -> Array:
     """BRDF of facets that are perfect mirrors, D G / (4 cos cos), 1/sr."""
-    seen = _seen(wi[2], wi, wo[2], wo, alpha, distribution)
-    return facets.density(h, alpha, distribution) * seen
+    return facets.density(h, alpha, distribution) * visibility(wi[2], wi, wo[2], wo, alpha, distribution)
 
 
-def interface_reflection(wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx") -> Array:
-    """BRDF of a rough dielectric interface, 1/sr, without the cosine (Walter 2007, Eq. 20).
-
-    Args:
-        wi, wo: unit directions on the +z side.
-        ior: index on the far side over index on the side of wi, > 0.
-        alpha, distribution: of the normals.
-    """
-    h, cosine = half_vector(wi, wo, same_side=True)
-    lobe = mirror_lobe(h, wi, wo, alpha, distribution)
-    return fresnel.dielectric(cosine, ior) * lobe
-
-
-def interface_transmission(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
+def visibility(
+    cosine_i: Array, wi: Vector, cosine_o: Array, wo: Vector, alpha: Array, distribution: Distribution
 ) -> Array:
-    """BTDF of a rough dielectric interface, 1/sr, without the cosine (Walter 2007, Eq. 21, with its eta_o^2).
-
-    Radiance is carried: f / ior_o^2 is symmetric, and the integral of f |cos_o| over wo is the energy that passes.
-
-    Args:
-        wi: unit directions on the +z side.
-        wo: unit directions on the -z side.
-        ior: index on the far side over index on the side of wi, > 0. At 1 the BTDF is a delta, and 0 is returned.
-        alpha, distribution: of the normals.
-    """
-    lobe, transmitted = refraction_lobe(wi, wo, ior, alpha, distribution)
-    return 4.0 * _seen(wi[2], wi, -wo[2], wo, alpha, distribution) * lobe * transmitted
-
-
-def refraction_lobe(
-    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
-) -> tuple[Array, Array]:
-    """Facets that refract wi to wo: D <wi, m> <wo, m> ior^2 / (<wi, m> + ior <wo, m>)^2, and their transmittance 1 - F.
-
-    The first is 0 where no facet whose normal lies on the +z side does; wo.z < 0 is not checked.
-    """
-    v = combine(1.0, wi, ior, wo)  # along the facet normal; its length cancels from the result
-    total = add(wi, wo)
-    squared = dot(total, total)
-    step = ior - 1.0
-    # (wi.v, wo.v) as sums that keep their digits where wo is near -wi
-    towards_i, towards_o = 0.5 * ior * squared - step, 0.5 * squared + step
-    exists = (towards_i * towards_o < 0) & (towards_i * v[2] > 0)
-    exists = exists & (jnp.abs(step) > 64.0 * jnp.finfo(squared.dtype).eps)
-    a = jnp.where(exists, jnp.abs(towards_i), 1.0)
-    b = jnp.where(exists, jnp.abs(towards_o), 1.0)
-    x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
-    # 1 - F with both cosines known: no difference, and no angle of total reflection
-    transmitted = 2.0 * ior * a * b * (1.0 / (a + ior * b) ** 2 + 1.0 / (ior * a + b) ** 2)
-    if distribution == "ggx":
-        q = x * x + y * y + (alpha * z) ** 2
-        lobe = (ior * alpha * a / q) * (ior * alpha * b / q) / jnp.pi
-    else:
-        inverse = 1.0 / jnp.sqrt(x * x + y * y + z * z)
-        gain = (ior * a * inverse) * inverse * (ior * b * inverse) * inverse
-        lobe = facets.density((x * inverse, y * inverse, jnp.abs(z) * inverse), alpha, distribution) * gain
-    return jnp.where(exists, lobe, 0.0), transmitted
-
-
-def interface_sample(
-    wi: Vector, ior: Array, alpha: Array, u1: Array, u2: Array, u3: Array, distribution: Distribution = "ggx"
-) -> tuple[Vector, Array]:
-    """Direction that a facet seen from wi reflects or refracts to, chosen by its Fresnel reflectance.
-
-    Returns the direction and whether it leaves on the side that its kind allows (reflection: above); one that does not
-    is masked light, and is lost. For the density of those that do see `interface_pdf`.
-    """
-    wo, leaves, _ = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
-    return wo, leaves
-
-
-def interface_event(
-    wi: Vector, ior: Array, alpha: Array, u1: Array, u2: Array, u3: Array, distribution: Distribution
-) -> tuple[Vector, Array, Vector]:
-    """`interface_sample`, with the normal of the facet."""
-    m = facets.sample(wi, alpha, u1, u2, distribution)
-    refracted, exists = refract(wi, m, ior)
-    reflects = (u3 < fresnel.dielectric(dot(wi, m), ior)) | ~exists
-    wo = select(reflects, reflect(wi, m), refracted)
-    return wo, (wo[2] > 0) == reflects, m
-
-
-def interface_pdf(
-    f: Array, wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution = "ggx"
-) -> Array:
-    """Density of `interface_sample`, 1/sr, from the BSDF f of the pair: f |cos_o| / G1(wo), less what draws weigh."""
-    density = 0.5 * f * facets.twice_seen(jnp.abs(wo[2]), wo, alpha, distribution)
-    if distribution == "ggx":
-        return density
-    return density / facets.draw_weight(wi, between(wi, wo, ior), alpha)
-
-
-def between(wi: Vector, wo: Vector, ior: Array) -> Vector:
-    """Normal of the facet that reflects (wo above) or refracts wi to wo, on the +z side."""
-    total = combine(1.0, wi, jnp.where(wo[2] > 0, 1.0, ior), wo)
-    return normalize(scale(jnp.where(total[2] < 0, -1.0, 1.0), total))
-
-
-def _seen(cosine_i: Array, wi: Vector, cosine_o: Array, wo: Vector, alpha: Array, distribution: Distribution) -> Array:
-    """G1(i) G1(o) / (4 cos cos): no cosine is left to divide by."""
+    """G1(i) G1(o) / (4 cos cos) of two directions and their cosines, >= 0; no cosine is left to divide by."""
     seen_i = facets.twice_seen(cosine_i, wi, alpha, distribution)
     seen_o = facets.twice_seen(cosine_o, wo, alpha, distribution)
     return 1.0 / (seen_i * seen_o)

@@ -2,10 +2,10 @@
 
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Lambertian
-from layerjax.transport.adding_doubling.transport import AddingDoubling
+from layerjax.transport.adding_doubling import AddingDoubling
 from layerjax.transport.contract import Transport
 from layerjax.transport.single_scattering import SingleScattering
-from layerjax.transport.statistical.transport import Statistical
+from layerjax.transport.statistical import Statistical
 
 
 def automatic(given: Stack, simplified: Stack) -> Transport:

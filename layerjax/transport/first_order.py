@@ -15,17 +15,17 @@ from jax import Array
 from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
 from layerjax.channels import Channels, total
-from layerjax.directions import Vector, half_vector, reflect, sanitised, select
-from layerjax.normals.facets import Distribution, facet_density, rule, sample
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.surfaces.interface import interface_reflection, interface_transmission
 from layerjax.transport.contract import Side
 from layerjax.transport.single_scattering import Media, SingleScattering
 
 
-class Face(Surface):
+class ReflectingInterface(Surface):
     """Reflection at an interface, seen from its upper side. ior: index below over index above."""
 
     ior: Parameter
@@ -40,7 +40,7 @@ class Face(Surface):
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         h, _ = half_vector(wi, wo, same_side=True)
-        return facet_density(h, wi, self.alpha, self.distribution)
+        return reflection_pdf(h, wi, self.alpha, self.distribution)
 
     def rule(self, wi: Vector, nodes: int) -> Nodes:
         return rule(wi, self.alpha, nodes, self.distribution)
@@ -54,7 +54,7 @@ class FirstOrder(eqx.Module):
 
     upper: Media
     lower: Media | None
-    crossing: Face | None
+    crossing: ReflectingInterface | None
     opaque: bool = eqx.field(static=True)
     layered: bool = eqx.field(static=True)
     """Whether there are interfaces."""
@@ -68,7 +68,7 @@ def first_order(stack: Stack) -> FirstOrder:
     first, last = interfaces[0], interfaces[-1]
     face = stack.layers[first]
     assert isinstance(face, Interface)
-    upper = Media(_media(stack.layers[:first]), Face(face.ior, face.alpha, face.distribution))
+    upper = Media(_media(stack.layers[:first]), ReflectingInterface(face.ior, face.alpha, face.distribution))
     if stack.base is not None:
         return FirstOrder(upper, None, None, True, True)
     above: Any = 1.0
@@ -79,10 +79,10 @@ def first_order(stack: Stack) -> FirstOrder:
     bottom = stack.layers[last]
     assert isinstance(bottom, Interface)
     lower = Media(
-        tuple(map(_mirrored, reversed(_media(stack.layers[last + 1 :])))),
-        Face(above / bottom.ior, bottom.alpha, bottom.distribution),
+        tuple(map(_flipped, reversed(_media(stack.layers[last + 1 :])))),
+        ReflectingInterface(above / bottom.ior, bottom.alpha, bottom.distribution),
     )
-    crossing = Face(face.ior, face.alpha, face.distribution) if first == last else None
+    crossing = ReflectingInterface(face.ior, face.alpha, face.distribution) if first == last else None
     return FirstOrder(upper, lower, crossing, False, True)
 
 
@@ -95,7 +95,7 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     if side != "transmission":
         parts.append(single.evaluate(state.upper, wi, wo, "reflection"))
     if side == "all" and state.lower is not None:
-        parts.append(single.evaluate(state.lower, mirror(wi), mirror(wo), "reflection"))
+        parts.append(single.evaluate(state.lower, flip(wi), flip(wo), "reflection"))
     if side != "reflection" and state.crossing is not None:
         parts.append(_refracted(state, state.crossing, wi, wo))
     zero = jnp.zeros_like(wi[2] * wo[2])
@@ -119,12 +119,7 @@ def share_met(media: Sequence[Medium], w: Vector) -> Channels:
     return tuple(jnp.where(depth > 0, one_minus_exp(depth), 1.0 / jnp.abs(w[2])) for depth in depths)
 
 
-def mirror(w: Vector) -> Vector:
-    """The image below of a direction above, and the other way round."""
-    return (w[0], w[1], -w[2])
-
-
-def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channels:
+def _refracted(state: FirstOrder, face: ReflectingInterface, wi: Vector, wo: Vector) -> Channels:
     assert state.lower is not None
     downward = wi[2] > 0
     over, under = select(downward, wi, wo), select(downward, wo, wi)
@@ -134,7 +129,7 @@ def _refracted(state: FirstOrder, face: Face, wi: Vector, wo: Vector) -> Channel
     under = (under[0], under[1], jnp.where(valid, under[2], -0.5))
     value = interface_transmission(over, under, face.ior, face.alpha, face.distribution)
     value = jnp.where(downward, value, value / (face.ior * face.ior))  # f / ior_o^2 is reciprocal
-    depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, mirror(under))
+    depths = optical_depths(state.upper.media, over) + optical_depths(state.lower.media, flip(under))
     return tuple(jnp.where(valid, value * jnp.exp(-depth), 0.0) for depth in total(depths, jnp.zeros_like(value)))
 
 
@@ -142,6 +137,6 @@ def _media(layers: tuple[Interface | Medium, ...]) -> tuple[Medium, ...]:
     return tuple(layer for layer in layers if isinstance(layer, Medium))
 
 
-def _mirrored(medium: Medium) -> Medium:
+def _flipped(medium: Medium) -> Medium:
     phase = medium.phase.mirrored()
     return medium if phase is medium.phase else eqx.tree_at(lambda m: m.phase, medium, phase)

@@ -31,11 +31,11 @@ from layerjax.directions import (
     select,
     squared_cosine_of_refraction,
 )
-from layerjax.normals.sggx import ggx_density, sggx_area
+from layerjax.normals.ggx import ggx_area, ggx_density
 from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.first_order import Face
+from layerjax.transport.first_order import ReflectingInterface
 
 LEAST_SHARE = 0.02
 """Added to the energy of every lobe before they are drawn by it: none is missed where its estimate is 0."""
@@ -148,7 +148,7 @@ def _conductor(base: Conductor, cosine: Array, above: Factor) -> Channels:
 
 def _facets(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> tuple[Array, Array]:
     """D G / (4 cos cos) and G of GGX facets, G = G1 G1: no cosine is left to divide by."""
-    visible = 1.0 / ((wi[2] + sggx_area(wi, "surface", alpha, None)) * (wo[2] + sggx_area(wo, "surface", alpha, None)))
+    visible = 1.0 / ((wi[2] + ggx_area(wi, alpha)) * (wo[2] + ggx_area(wo, alpha)))
     return ggx_density(h, alpha) * visible, 4.0 * wi[2] * wo[2] * visible
 
 
@@ -177,7 +177,7 @@ def _choices(stack: Stack, wi: Vector) -> list[tuple[Array, Surface]]:
             continue
         ior = layer.ior / above
         level = fresnel.dielectric(w[2], ior)
-        energies.append((reached * level, Face(ior, layer.alpha)))
+        energies.append((reached * level, ReflectingInterface(ior, layer.alpha)))
         reached = reached * (1.0 - level) ** 2
         w, _, _, _ = _refracted(w, w, normal, w[2], ior)
         above = layer.ior

@@ -8,7 +8,7 @@ import scipy.stats
 
 import layerjax as lj
 from layerjax.directions import join, split
-from layerjax.normals import sggx as distributions
+from layerjax.normals.ggx import ggx_density, ggx_masking, ggx_sample
 from tests.helpers.cases import haze, tilt3
 
 DRAWS = 200_000
@@ -94,13 +94,13 @@ def test_ggx_normals_follow_the_visible_density():
     wi = lj.direction(1.2, 0.7)
     u = jax.random.uniform(jax.random.key(3), (2, DRAWS))
     towards = tuple(jnp.full(DRAWS, component) for component in wi)
-    normals = join(distributions.ggx_sample(towards, alpha, u[0], u[1]))
+    normals = join(ggx_sample(towards, alpha, u[0], u[1]))
 
     def density(m):
         m = split(m)
         cosine = wi[0] * m[0] + wi[1] * m[1] + wi[2] * m[2]
-        visible = jnp.maximum(cosine, 0.0) * distributions.ggx_density(m, alpha)
-        masked = distributions.ggx_masking(split(wi), alpha) / wi[2]
+        visible = jnp.maximum(cosine, 0.0) * ggx_density(m, alpha)
+        masked = ggx_masking(split(wi), alpha) / wi[2]
         return jnp.where(m[2] > 0, masked * visible, 0.0)
 
     probability, total = chi_square(normals, density)

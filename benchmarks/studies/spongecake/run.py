@@ -22,16 +22,7 @@ import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, write
 from benchmarks.studies.spongecake.cost import ROUNDS, costs
-from benchmarks.studies.spongecake.tables import (
-    Errors,
-    Figure,
-    Findings,
-    Fitted,
-    Furnace,
-    Gain,
-    Settings,
-    markdown,
-)
+from benchmarks.studies.spongecake.tables import Errors, Figure, Findings, Fitted, Furnace, Gain, Settings, markdown
 from layerjax.normals.sggx import Kind
 from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import data as materials

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from layerjax.evaluate import evaluate, prepare
 from layerjax.phase import SGGX, HenyeyGreenstein
 from layerjax.stack import Medium, Stack
-from layerjax.transport.adding_doubling.transport import AddingDoubling
+from layerjax.transport.adding_doubling import AddingDoubling
 
 Split = Literal["train", "test"]
 

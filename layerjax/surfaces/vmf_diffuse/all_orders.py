@@ -1,4 +1,4 @@
-"""The rough diffuse surface as its light transport has it: all orders, energy conserved.
+"""The rough diffuse surface with all orders of scattering between its flakes, energy conserved.
 
 The surface is the half-space of one-sided Lambertian flakes with von Mises-Fisher normals of d'Eon & Weidlich 2024
 ("VMF Diffuse: A unified rough diffuse BRDF"), whose fits miss the energy by up to 14 %. Here the solution of
@@ -39,7 +39,7 @@ FORM_MODES = tuple(m for count in MODES for m in range(count)) + (0,) * REST[0] 
 _WIDTH_SQUARED = 0.25 * np.pi  # where sigma(0) of narrow flakes, alpha / (2 sqrt(pi)), would reach the 1/4 of wide ones
 
 
-def transport_brdf(wi: Vector, wo: Vector, albedo: Channels, roughness: Array) -> tuple[Array, ...]:
+def all_orders_brdf(wi: Vector, wo: Vector, albedo: Channels, roughness: Array) -> tuple[Array, ...]:
     """BRDF of a half-space of Lambertian flakes, 1/sr, without the cosine, one array a channel.
 
     Errors against the half-space, for all roughnesses and cosines down to 1e-6: directional albedo 0.25 %, so that at

@@ -2,19 +2,14 @@
 
 After d'Eon & Weidlich 2024, "VMF Diffuse: a unified rough diffuse BRDF", CGF 43(4). It runs from Lambertian (r = 0) by
 rough surfaces, which an Oren-Nayar resembles, to a dilute cloud of Lambertian spheres (r = 1).
-
-Corrected where the paper is misprinted or silent: the azimuthal series is f0 + 2 f1 cos(phi) + 2 f2 cos(2 phi), its
-modes being plain means over azimuth; every order is bounded below by 0, without which light is lost and values are
-negative near grazing; the cross-section is exact.
 """
 
-from typing import Literal, NamedTuple, Self, get_args
+from typing import Literal, Self, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.special import erf
 from jax.typing import ArrayLike
 
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
@@ -24,14 +19,18 @@ from layerjax.directions import Vector, add, combine, dot, frame, normalize, sca
 from layerjax.quadrature import gauss_legendre
 from layerjax.surfaces.contract import Surface
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.vmf_diffuse.coefficients import Terms, first_order, second_order, third_order
-from layerjax.surfaces.vmf_diffuse.flakes import LEAST_ROUGHNESS, areas, concentration
+from layerjax.surfaces.vmf_diffuse.all_orders import all_orders_brdf
+from layerjax.surfaces.vmf_diffuse.paper import flake_albedo, paper_brdf
 
-Form = Literal["paper", "literal", "transport"]
-Orders = tuple[Array, Array, Array]
+Form = Literal["paper", "literal", "all_orders", "transport"]
+"""See `VMFDiffuse`; "transport" is the former name of "all_orders", and stands for it."""
 
 NODES = 32
 """Cosines of the albedo at normal incidence."""
+
+
+def _current_name(form: Form) -> Form:
+    return "all_orders" if form == "transport" else form
 
 
 class VMFDiffuse(Surface):
@@ -44,13 +43,14 @@ class VMFDiffuse(Surface):
     roughness r        [0, 1]               flakes have the concentration k = 2 / log(1 - sqrt(r))^2
     form               "paper"      "paper" the paper's fit; light scattered four and more times by Eq. (9) with
                        | "literal"          the exponent atan(X erf(C)) ("paper") or atan(X) erf(C) as printed
-                       | "transport"        ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
-                                            of what such flakes reflect, all orders ("transport")
+                       | "all_orders"       ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
+                                            of what such flakes reflect in all orders ("all_orders", once called
+                                            "transport", which is still taken for it)
     ========= ======== ============ ======= ======================================================================
 
     The fits follow the flakes' own reflection to 1 to 4 % (root mean square), and do not conserve energy: at albedo 1
     they reflect 0.90 to 1.14 of the light, up to albedo 0.95 less than 1 everywhere. Under layers that send nearly all
-    light back a base that reflects more than 1 has no solution: use "transport" there.
+    light back a base that reflects more than 1 has no solution: use "all_orders" there.
 
     Not smooth at roughness 0: the value there is albedo / pi, but Eq. (9) does not vanish as r -> 0 (0.011 at albedo 1
     and normal incidence). Derivatives by roughness would diverge at 0 (as r^-1/2 near grazing) and at 1 (where alpha
@@ -61,34 +61,17 @@ class VMFDiffuse(Surface):
 
     albedo: Parameter = parameter("VMFDiffuse.albedo")
     roughness: Parameter = parameter("VMFDiffuse.roughness")
-    form: Form = eqx.field(static=True, default="paper")
+    form: Form = eqx.field(static=True, default="paper", converter=_current_name)
 
     def __check_init__(self) -> None:
         if self.form not in get_args(Form):
-            raise ValueError(f'VMFDiffuse.form: {self.form!r} is not one of "paper", "literal", "transport"')
+            raise ValueError(f'VMFDiffuse.form: {self.form!r} is not one of "paper", "literal", "all_orders"')
 
     def evaluate(self, wi: Vector, wo: Vector) -> tuple[Array, ...]:
         albedos = per_channel(self.albedo)
-        if self.form == "transport":
-            from layerjax.surfaces.vmf_diffuse.all_orders import transport_brdf
-
-            return transport_brdf(wi, wo, albedos, self.roughness)
-        rough = self.roughness > 0
-        r = LEAST_ROUGHNESS + (1.0 - LEAST_ROUGHNESS) * self.roughness
-        orders = scattering_orders(wi, wo, r)
-        shape = _direction_factor(wi[2] * wo[2], r, self.form)
-
-        def multiple(c: Array) -> Array:
-            return at_least(_albedo_factor(c, r, self.form) * shape, 0.0)
-
-        # at roughness 0, where the value leaps to that of a Lambertian, the slope in roughness is still that of the fit
-        (f1, f2, f3), (s1, s2, s3) = orders, map(_slope_alone, orders)
-        values = []
-        for c in albedos:
-            fitted = c * (f1 + c * (f2 + c * f3)) + multiple(c)  # Eq. (7)
-            flat = c / jnp.pi + c * (s1 + c * (s2 + c * s3)) + _slope_alone(multiple(jax.lax.stop_gradient(c)))
-            values.append(jnp.where(rough, fitted, flat))
-        return tuple(values)
+        if self.form == "paper" or self.form == "literal":
+            return paper_brdf(wi, wo, albedos, self.roughness, self.form)
+        return all_orders_brdf(wi, wo, albedos, self.roughness)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
         # a cosine lobe that leans towards the light, as the flakes do that it meets; uniform for a share, because
@@ -134,92 +117,8 @@ class VMFDiffuse(Surface):
         for name, value in (("diffuse_albedo", target.albedo), ("roughness", target.roughness)):
             if is_placeholder(value):
                 raise ValueError(f"VMFDiffuse.from_diffuse_albedo: {name} is not given a value")
-        solve = _solved if exact else _mapped
-        return cls(solve(target), target.roughness, form)
-
-
-def _slope_alone(x: Array) -> Array:
-    """0, with the derivatives of x."""
-    return x - jax.lax.stop_gradient(x)
-
-
-def scattering_orders(wi: Vector, wo: Vector, r: Array) -> Orders:
-    """f1, f2, f3 of Eq. (7), 1/sr, without their powers of the albedo, each at least 0; roughness r in (0, 1]."""
-    k = concentration(r)
-    seen_i, seen_o = areas(wi, k), areas(wo, k)
-    ui, uo = wi[2], wo[2]
-    product, total, squares = ui * uo, ui + uo, ui * ui + uo * uo
-    # with phi the azimuth between wi and wo: sin sin cos(phi), and sin^2 sin^2 cos(2 phi)
-    x = wi[0] * wo[0] + wi[1] * wo[1]
-    y = 2.0 * x * x - (wi[0] * wi[0] + wi[1] * wi[1]) * (wo[0] * wo[0] + wo[1] * wo[1])
-
-    # u_i sigma(-u_o) + u_o sigma(u_i) in the form that is symmetric, as sigma(u) - sigma(-u) is linear in u
-    attenuation = ui * seen_o.mean + uo * seen_i.mean
-    ahead = seen_i.ahead * seen_o.ahead
-    (c0, c1, c2, c3), (d0, d1, exponent), (e0, e1) = first_order(r)
-    single = (
-        ahead * (c0 + c1 * product + c2 * product * product + c3 * squares)
-        + 2.0 * x * ahead**exponent * (d0 + d1 * product)
-    ) / attenuation + 2.0 * y * (e0 + e1 * ui) * (e0 + e1 * uo) / total
-
-    def later(mean: Terms, once: Terms) -> Array:
-        steady = mean[0] + mean[1] * product + mean[2] * total + mean[3] * product * product + mean[4] * squares
-        return (steady + 2.0 * x * (once[0] + once[1] * product + once[2] * total)) / total
-
-    orders = single, later(*second_order(r)), later(*third_order(r))
-    first, second, third = (at_least(order, 0.0) / jnp.pi for order in orders)
-    return first, second, third
-
-
-class Fit(NamedTuple):
-    """Constants of Eq. (9): of the exponent's X, of the powers' base, of C_k, and of the rest."""
-
-    x: tuple[float, float]
-    base: tuple[float, float]
-    losses: tuple[float, float, float]
-    scale: float
-    offset: float
-    shape: tuple[float, float, float]
-
-
-FITS = {
-    "paper": Fit(
-        (0.264641, 0.0225272),
-        (1.0075, 1.16942),
-        (0.5441615108674713, 0.45302863761693374, 1.4293127703064865),
-        0.384016,
-        0.341969,
-        (0.0898863, 0.0578978, 0.287663),
-    ),
-    "literal": Fit((0.265, 0.0225), (1.0, 1.169), (0.544, 0.453, 1.429), 0.384, 0.342, (0.09, 0.0579, 0.288)),
-}
-"""Eq. (9) as printed ("literal"), and with the digits that implementations of it carry ("paper")."""
-
-
-def _albedo_factor(c: Array, r: Array, form: Form) -> Array:
-    """The part of Eq. (9) that knows the albedo: the rest is the same for all channels."""
-    fit = FITS[form]
-    loss = safe_sqrt(1.0 - c)
-    x, missing = (r - fit.x[0]) * r + fit.x[1], erf(loss)
-    power = jnp.arctan(x) * missing if form == "literal" else jnp.arctan(x * missing)
-    kept = c * (fit.base[0] + fit.base[1] * loss) ** -power  # C_a
-    linear, square, below = fit.losses
-    return fit.scale * (1.0 - linear * loss - square * loss * loss) / (1.0 + below * loss) * (kept - fit.offset) * kept
-
-
-def _direction_factor(cosines: Array, r: Array, form: Form) -> Array:
-    """The part of Eq. (9) that knows directions, by u_i u_o."""
-    low, step, shift = FITS[form].shape
-    return jnp.abs(jnp.tanh(r) - low) - step / (cosines + shift)
-
-
-def _mapped(target: VMFDiffuse) -> Array:
-    """Section 5 in a form that neither cancels nor divides by 0: k_d = x / (x + s (1 - x^2)), solved for x."""
-    k, r = target.albedo, target.roughness
-    strength = 0.64985 + 0.631112 * r + 1.38922 * r * r  # s
-    lifted = 2.0 * strength * k / (1.0 - k + jnp.hypot(1.0 - k, 2.0 * strength * k))
-    root = safe_sqrt(r)
-    return at_most(lifted * root + (1.0 - root) * k, 1.0)
+        albedo = _solved(target) if exact else flake_albedo(target.albedo, target.roughness)
+        return cls(albedo, target.roughness, form)
 
 
 @eqx.filter_jit

@@ -6,7 +6,7 @@ is found facet by facet: those visible from a node are integrated over by quadra
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,16 +17,15 @@ from layerjax import fresnel
 from layerjax._numerics import at_least, safe_div, safe_sqrt
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
+from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.normals import facets
 from layerjax.quadrature import gauss_legendre
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.adding_doubling.grid import Grid, Region, spread
 from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import BALANCING, balance, modes_at_nodes, straight_on
-
-Microfacets = Literal["single", "multiple"]
 
 LEAST_FACETS = 24
 """Points of the quadrature of visible normals in either direction, at least (see `_visible_normals`)."""

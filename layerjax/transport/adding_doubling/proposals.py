@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax.directions import Vector, sanitised, select
+from layerjax.directions import Vector, flip, sanitised, select
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
-from layerjax.transport.first_order import Face, FirstOrder, mirror
+from layerjax.transport.first_order import FirstOrder, ReflectingInterface
 from layerjax.transport.single_scattering import SingleScattering
 
 BELOW_ONE = 1.0 - 1e-6
@@ -17,7 +17,7 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
     u, u1, u2 = uniforms
     lobes, facets, near, _ = _shares(state)
     above = wi[2] > 0
-    up = select(above, wi, mirror(wi))
+    up = select(above, wi, flip(wi))
     x, y, z = sample_cosine(u1, u2)
     wo = select(u < lobes + facets + near, (x, y, z), (x, y, -z))
     if state.crossing is not None:
@@ -26,12 +26,12 @@ def propose(state: FirstOrder, wi: Vector, uniforms: tuple[Array, Array, Array])
         ior = _ratio(face, above)
         refracted, leaves = interface_sample(up, ior, face.alpha, u1, u2, again, face.distribution)
         wo = select(u < lobes + facets, _nowhere_unless(leaves, refracted), wo)
-    wo = select(above, wo, mirror(wo))
+    wo = select(above, wo, flip(wo))
     inner = (jnp.minimum(u / lobes, BELOW_ONE), u1, u2)
     single = SingleScattering()
     lobe = single.sample(state.upper, wi, inner)
     if state.lower is not None:
-        lobe = select(above, lobe, mirror(single.sample(state.lower, mirror(wi), inner)))
+        lobe = select(above, lobe, flip(single.sample(state.lower, flip(wi), inner)))
         lobe = _nowhere_unless(lobe[2] * wi[2] > 0, lobe)  # what a face sends below its horizon is masked
     return select(u < lobes, lobe, wo)
 
@@ -44,16 +44,16 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
     single = SingleScattering()
     lobe = single.pdf(state.upper, wi, wo)
     if state.lower is not None:
-        lobe = jnp.where(above, lobe, single.pdf(state.lower, mirror(wi), mirror(wo)))
+        lobe = jnp.where(above, lobe, single.pdf(state.lower, flip(wi), flip(wo)))
         lobe = jnp.where(same, lobe, 0.0)
     density = lobes * lobe + jnp.where(same, near, far) * jnp.abs(wo[2]) / jnp.pi
     if state.crossing is not None:
-        up, out = select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
+        up, out = select(above, wi, flip(wi)), select(above, wo, flip(wo))
         face = state.crossing
         facets_of = (_ratio(face, above), face.alpha, face.distribution)
         up, out = sanitised(up, up[2] > 0), (out[0], out[1], jnp.where(out[2] == 0, 0.5, out[2]))
         reflected = interface_reflection(up, sanitised(out, out[2] > 0), *facets_of)
-        passed = interface_transmission(up, mirror(sanitised(mirror(out), out[2] < 0)), *facets_of)
+        passed = interface_transmission(up, flip(sanitised(flip(out), out[2] < 0)), *facets_of)
         density = density + facets * interface_pdf(jnp.where(same, reflected, passed), up, out, *facets_of)
     return density
 
@@ -70,5 +70,5 @@ def _nowhere_unless(leaves: Array, w: Vector) -> Vector:
     return (w[0], w[1], jnp.where(leaves, w[2], 0.0))
 
 
-def _ratio(face: Face, above: Array) -> Array:
+def _ratio(face: ReflectingInterface, above: Array) -> Array:
     return jnp.where(above, face.ior, 1.0 / face.ior)

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax.microsurface import Microfacets
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.adding_doubling.grid import Grid, make_grid
-from layerjax.transport.adding_doubling.interfaces import Microfacets, Normals, base_layer, interface_layer
+from layerjax.transport.adding_doubling.interfaces import Normals, base_layer, interface_layer
 from layerjax.transport.adding_doubling.media import doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.operators import Layer, add
 

@@ -48,14 +48,14 @@ class Options(NamedTuple):
     masking: vmf.Masking | None
 
 
-class Face(eqx.Module):
+class UpperSide(eqx.Module):
     """The upper side: index below over index above, and concentration of the normals."""
 
     ior: Array
     kappa: Array
 
 
-class Mirror(eqx.Module):
+class LowerSide(eqx.Module):
     """The lower side, from inside: concentration of its normals, and index n + i k relative to what lies above it."""
 
     kappa: Array
@@ -76,9 +76,9 @@ class Coat(eqx.Module):
     turned: where the coat lies upside down, and directions in its media with it; None: nowhere.
     """
 
-    top: Face | None
+    top: UpperSide | None
     media: tuple[Medium, ...]
-    base: Mirror | None
+    base: LowerSide | None
     turned: Array | None = None
 
 
@@ -101,11 +101,11 @@ def reflections(coat: Coat, options: Options, wi: Vector, wo: Vector) -> list[Ch
 
 def _facets(h: Vector, wi: Vector, wo: Vector, kappa: Array, masking: vmf.Masking | None) -> Array:
     """Microfacet lobe of normals that reflect all, D G / (4 cos cos), 1/sr."""
-    return 0.25 * vmf.facet_density(h, kappa) * visible(wi, kappa, masking) * visible(wo, kappa, masking)
+    return 0.25 * vmf.hemisphere_density(h, kappa) * visible(wi, kappa, masking) * visible(wo, kappa, masking)
 
 
 def _by_mean_directions(
-    coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, wo: Vector
+    coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, wo: Vector
 ) -> list[Channels]:
     """Chains with all terms at the mean directions that follow from wi (Guo 2015, Secs. 5.1 and 5.3, corrected)."""
     h, _ = half_vector(wi, wo, same_side=True)
@@ -118,11 +118,13 @@ def _by_mean_directions(
     lobes: list[Channels] = []
     for k in range(1, options.bounces + 1):
         energy = times(times(energy, step), (level,)) if k > 1 else times(energy, step)
-        lobes.append(times(energy, (vmf.facet_density(h, chain_concentration(k, wi[2], top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, chain_concentration(k, wi[2], top, base)),)))
     return lobes
 
 
-def _below_the_surface(coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, wo: Vector) -> list[Channels]:
+def _below_the_surface(
+    coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, wo: Vector
+) -> list[Channels]:
     """Chains about the half vector of both directions below the surface."""
     inner_i, inner_o, through, inside = crossed(top, wi, wo)
     h, cosine = half_vector(inner_i, inner_o, same_side=True)
@@ -135,11 +137,11 @@ def _below_the_surface(coat: Coat, top: Face, base: Mirror, options: Options, wi
     lobes: list[Channels] = []
     for k in range(1, options.bounces + 1):
         energy = times(times(energy, step), (inside,)) if k > 1 else times(energy, step)
-        lobes.append(times(energy, (vmf.facet_density(h, inner_concentration(k, cosine, top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, inner_concentration(k, cosine, top, base)),)))
     return lobes
 
 
-def crossed(top: Face, wi: Vector, wo: Vector) -> tuple[Vector, Vector, Array, Array]:
+def crossed(top: UpperSide, wi: Vector, wo: Vector) -> tuple[Vector, Vector, Array, Array]:
     """Both directions below a level facet, upward; T(i) T(o) / eta^2; and the reflectance from inside.
 
     The last is sqrt(F(i) F(o)), F of the mean angle: T(i) T(o) (1 + F + F^2 + ...) is then never above 1.
@@ -150,7 +152,7 @@ def crossed(top: Face, wi: Vector, wo: Vector) -> tuple[Vector, Vector, Array, A
     return inner_i, inner_o, through, safe_sqrt(level_i * level_o)
 
 
-def chain_concentration(k: int, cosine: Array, top: Face, base: Mirror) -> Array:
+def chain_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """kappa of the extended normals of a chain, by the cosine outside (Guo 2015, Eq. 26 and Fig. 12)."""
     inside, _ = refracted_cosine(cosine, top.ior)
     entry, exit = refraction_gains(cosine, top.ior), refraction_gains(inside, 1.0 / top.ior)
@@ -161,7 +163,7 @@ def chain_concentration(k: int, cosine: Array, top: Face, base: Mirror) -> Array
     return extended(joint(*lobes), reflection_gains(cosine))
 
 
-def inner_concentration(k: int, cosine: Array, top: Face, base: Mirror) -> Array:
+def inner_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """The same about the half vector below the surface, by its cosine with the light: variances add there."""
     spread = crossing(cosine, top.ior)
     inverse = k / base.kappa + 0.5 * spread * spread / top.kappa

@@ -15,15 +15,15 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import at_most, safe_sqrt
 from layerjax.channels import Channels, mean, total
-from layerjax.directions import Vector, dot, half_vector, is_above, reflect, refract, sanitised, select
+from layerjax.directions import Vector, dot, flip, half_vector, is_above, reflect, refract, sanitised, select
 from layerjax.normals import facets
 from layerjax.quadrature import Nodes
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.endf.chains import (
     Coat,
-    Face,
     Options,
+    UpperSide,
     absorbed,
     chain_concentration,
     entered,
@@ -34,7 +34,6 @@ from layerjax.transport.endf.chains import (
     width,
 )
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration, transmissions
-from layerjax.transport.first_order import mirror
 
 Place = Literal["outside", "inside"]
 
@@ -132,20 +131,20 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
         assert coat.top is not None
         outer, escapes = _left(coat.top, sanitised(out))
         out, leaves = select(inside, outer, out), leaves & (~inside | (enters & escapes))
-    return select(through, mirror(out), out), leaves
+    return select(through, flip(out), out), leaves
 
 
 def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) -> Array:
     """Density of `draw` in solid angle, 1/sr, for wi above."""
-    lit, up, down = is_above(wi), is_above(wo), is_above(mirror(wo))
-    wi, over = sanitised(wi), sanitised(select(down, mirror(wo), wo))
+    lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
+    wi, over = sanitised(wi), sanitised(select(down, flip(wo), wo))
     total = COSINE * (1.0 if opaque else 0.5) * over[2] / jnp.pi
     if _is_interface(coat):
         assert coat.top is not None
         ior, alpha = coat.top.ior, width(coat.top.kappa)
         reflected = interface_reflection(wi, over, ior, alpha, "vmf")
-        passed = interface_transmission(wi, mirror(over), ior, alpha, "vmf")
-        out = select(up, over, mirror(over))
+        passed = interface_transmission(wi, flip(over), ior, alpha, "vmf")
+        out = select(up, over, flip(over))
         facet = interface_pdf(jnp.where(up, reflected, passed), wi, out, ior, alpha, "vmf")
         total = total + (1.0 - COSINE) * facet
     else:
@@ -158,12 +157,12 @@ def _density(coat: Coat, lobe: Proposal, wi: Vector, wo: Vector) -> Array:
     """Density of one lobe's draws before they are mirrored down."""
     if lobe.place == "outside":
         h, _ = half_vector(wi, wo, same_side=True)
-        return facets.facet_density(h, wi, width(lobe.kappa), "vmf")
+        return facets.reflection_pdf(h, wi, width(lobe.kappa), "vmf")
     assert coat.top is not None
     (inner_i, enters), (inner_o, leaves) = entered(wi, coat.top.ior), entered(wo, coat.top.ior)
     h, _ = half_vector(inner_i, inner_o, same_side=True)
     slope = wo[2] / (coat.top.ior * coat.top.ior * inner_o[2])  # of solid angle inside by outside
-    return jnp.where(enters & leaves, slope * facets.facet_density(h, inner_i, width(lobe.kappa), "vmf"), 0.0)
+    return jnp.where(enters & leaves, slope * facets.reflection_pdf(h, inner_i, width(lobe.kappa), "vmf"), 0.0)
 
 
 def energies(coat: Coat, options: Options, wi: Vector, nodes: int, opaque: bool) -> tuple[Channels, Channels]:
@@ -217,15 +216,15 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
     return select(inside, outer, wo), weight * jnp.where(inside, slope, 1.0)
 
 
-def _refracted_energy(top: Face, options: Options, wi: Vector, nodes: int) -> Array:
+def _refracted_energy(top: UpperSide, options: Options, wi: Vector, nodes: int) -> Array:
     """Energy through one interface, over the facets that wi sees."""
     planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])
     flat: Vector = (-planar.reshape(1, 1), jnp.zeros((1, 1), planar.dtype), wi[2].reshape(1, 1))
     m, weight = facets.seen_normals(flat, width(top.kappa), nodes, 2 * nodes)
     cosine = dot(flat, m)
     wo, exists = refract(flat, m, top.ior)
-    passes = exists & is_above(mirror(wo))
-    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(sanitised(mirror(wo)), top.kappa, options.masking)
+    passes = exists & is_above(flip(wo))
+    share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(sanitised(flip(wo)), top.kappa, options.masking)
     lit = visible(wi, top.kappa, options.masking) / visible(wi, top.kappa, "normal")  # as the weights have it
     return lit * jnp.sum(jnp.where(passes, weight * share, 0.0))
 
@@ -235,7 +234,7 @@ def _is_interface(coat: Coat) -> bool:
     return coat.top is not None and coat.base is None
 
 
-def _left(top: Face, inner: Vector) -> tuple[Vector, Array]:
+def _left(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
     """Where light inside goes outside a level facet (both upward), and whether it does."""
     x, y = top.ior * inner[0], top.ior * inner[1]
     squared = 1.0 - x * x - y * y

@@ -12,14 +12,14 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._numerics import at_least
 from layerjax.channels import Channels, times
-from layerjax.directions import Vector, half_vector
+from layerjax.directions import Vector, flip, half_vector
 from layerjax.normals import vmf
-from layerjax.surfaces.microfacet import refraction_lobe
+from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.endf.chains import (
     Coat,
-    Face,
-    Mirror,
+    LowerSide,
     Options,
+    UpperSide,
     absorbed,
     crossed,
     crossing,
@@ -36,7 +36,6 @@ from layerjax.transport.endf.warping import (
     refracted_cosine,
     refraction_gains,
 )
-from layerjax.transport.first_order import mirror
 
 
 def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> list[Channels]:
@@ -53,7 +52,7 @@ def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> li
 
 
 def _by_mean_directions(
-    coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, under: Vector
+    coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, under: Vector
 ) -> list[Channels]:
     """All terms at the mean direction, straight on from wi."""
     h, _ = half_vector(wi, under, same_side=True)
@@ -67,28 +66,28 @@ def _by_mean_directions(
     lobes: list[Channels] = []
     for j in range(options.bounces + 1):
         energy = times(energy, step) if j else energy
-        lobes.append(times(energy, (vmf.facet_density(h, slab_concentration(j, wi[2], top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, slab_concentration(j, wi[2], top, base)),)))
     return lobes
 
 
 def _below_the_surface(
-    coat: Coat, top: Face, base: Mirror, options: Options, wi: Vector, under: Vector
+    coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, under: Vector
 ) -> list[Channels]:
     """About the half vector of both directions inside the slab."""
     inner_i, inner_o, through, inside = crossed(top, wi, under)
     h, cosine = half_vector(inner_i, inner_o, same_side=True)
     through = through * masked(wi, top.kappa, options.masking) * masked(under, base.kappa, options.masking)
     through = through * visible(inner_i, top.kappa, options.masking) * visible(inner_o, base.kappa, options.masking)
-    energy: Channels = times((0.25 * through,), absorbed(coat, inner_i, mirror(inner_o), 0.5))
-    step = times((inside * inside,), absorbed(coat, inner_i, mirror(inner_o)))
+    energy: Channels = times((0.25 * through,), absorbed(coat, inner_i, flip(inner_o), 0.5))
+    step = times((inside * inside,), absorbed(coat, inner_i, flip(inner_o)))
     lobes: list[Channels] = []
     for j in range(options.bounces + 1):
         energy = times(energy, step) if j else energy
-        lobes.append(times(energy, (vmf.facet_density(h, inner_slab_concentration(j, cosine, top, base)),)))
+        lobes.append(times(energy, (vmf.hemisphere_density(h, inner_slab_concentration(j, cosine, top, base)),)))
     return lobes
 
 
-def slab_concentration(j: int, cosine: Array, top: Face, base: Mirror) -> Array:
+def slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """kappa of the extended normals after j reflections at each side, by the cosine outside (Guo 2015, Eqs. 23, 24)."""
     inside, _ = refracted_cosine(cosine, top.ior)
     entry, exit = refraction_gains(cosine, top.ior), refraction_gains(inside, 1.0 / top.ior)
@@ -98,14 +97,14 @@ def slab_concentration(j: int, cosine: Array, top: Face, base: Mirror) -> Array:
     return extended(joint(*lobes), reflection_gains(cosine))
 
 
-def inner_slab_concentration(j: int, cosine: Array, top: Face, base: Mirror) -> Array:
+def inner_slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
     """The same about the half vector inside, by its cosine with the light: variances add there."""
     spread = crossing(cosine, top.ior)
     inverse = (j + 0.25 * spread * spread) * (1.0 / top.kappa + 1.0 / base.kappa)
     return 1.0 / at_least(inverse, LEAST_VARIANCE)
 
 
-def _refraction(top: Face, masking: vmf.Masking | None, wi: Vector, under: Vector) -> Array:
+def _refraction(top: UpperSide, masking: vmf.Masking | None, wi: Vector, under: Vector) -> Array:
     """BTDF of one rough interface (Walter et al. 2007, Eq. 21, with its eta_o^2); a delta, given as 0, at eta = 1."""
-    lobe, transmitted = refraction_lobe(wi, mirror(under), top.ior, width(top.kappa), "vmf")
+    lobe, transmitted = refraction_lobe(wi, flip(under), top.ior, width(top.kappa), "vmf")
     return lobe * transmitted * visible(wi, top.kappa, masking) * visible(under, top.kappa, masking)

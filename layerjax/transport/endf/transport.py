@@ -16,15 +16,14 @@ from jax import Array
 
 from layerjax import channels
 from layerjax.channels import Channels, per_channel, total
-from layerjax.directions import Vector, is_above, sanitised, select
+from layerjax.directions import Vector, flip, is_above, sanitised, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
 from layerjax.transport.contract import DeterministicTransport, Side
 from layerjax.transport.endf import drawing as drawing
-from layerjax.transport.endf.chains import Coat, Face, Form, Mirror, Options, reflections
+from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
-from layerjax.transport.first_order import mirror
 
 MOST_BOUNCES = 16
 """Each bounce is a lobe of its own in the program."""
@@ -119,15 +118,15 @@ class ENDF(DeterministicTransport):
         media = tuple(media_of(stack))
         if not faces:
             return Sides(Coat(None, media, _metal(stack.base, 1.0)), None)
-        top = Face(faces[0].ior, concentration(faces[0].alpha))
+        top = UpperSide(faces[0].ior, concentration(faces[0].alpha))
         if stack.base is not None:
             return Sides(Coat(top, media, _metal(stack.base, top.ior)), None)
         inverse = 1.0 / top.ior
         if len(faces) == 1:
-            return Sides(Coat(top, (), None), Coat(Face(inverse, top.kappa), (), None))
-        bottom = Face(top.ior, concentration(faces[1].alpha))
+            return Sides(Coat(top, (), None), Coat(UpperSide(inverse, top.kappa), (), None))
+        bottom = UpperSide(top.ior, concentration(faces[1].alpha))
         upper, lower = (
-            Coat(one, media, Mirror(other.kappa, (inverse,), None)) for one, other in ((top, bottom), (bottom, top))
+            Coat(one, media, LowerSide(other.kappa, (inverse,), None)) for one, other in ((top, bottom), (bottom, top))
         )
         return Sides(upper, lower)
 
@@ -135,9 +134,9 @@ class ENDF(DeterministicTransport):
         coat = state.upper
         if side != "reflection":
             coat, wi, wo = _facing(state, wi, wo)
-        lit, up, down = is_above(wi), is_above(wo), is_above(mirror(wo))
+        lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
         # both kinds of lobe share what depends on how steep wo is, not on its side
-        wi, over = sanitised(wi), sanitised(wo if side == "reflection" else select(down, mirror(wo), wo))
+        wi, over = sanitised(wi), sanitised(wo if side == "reflection" else select(down, flip(wo), wo))
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
             lobes = reflections(coat, self._options(), wi, over)
@@ -150,7 +149,7 @@ class ENDF(DeterministicTransport):
     def sample(self, state: Sides, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         coat, up, _ = _facing(state, wi, wi)
         wo = drawing.draw(coat, self._options(), up, uniforms, state.lower is None)
-        return wo if state.lower is None else select(wi[2] > 0, wo, mirror(wo))
+        return wo if state.lower is None else select(wi[2] > 0, wo, flip(wo))
 
     def pdf(self, state: Sides, wi: Vector, wo: Vector) -> Array:
         coat, wi, wo = _facing(state, wi, wo)
@@ -173,15 +172,15 @@ def _facing(state: Sides, wi: Vector, wo: Vector) -> tuple[Coat, Vector, Vector]
     upper, lower = ((coat.top, coat.base) for coat in (state.upper, state.lower))
     top, base = jax.tree.map(lambda one, other: jnp.where(above, one, other), upper, lower)
     coat = Coat(top, state.upper.media, base, ~above)
-    return coat, select(above, wi, mirror(wi)), select(above, wo, mirror(wo))
+    return coat, select(above, wi, flip(wi)), select(above, wo, flip(wo))
 
 
-def _metal(base: Any, above: Any) -> Mirror | None:
+def _metal(base: Any, above: Any) -> LowerSide | None:
     """The base under a medium of that index."""
     if base is None:
         return None
     ior, k = (tuple(value / above for value in per_channel(part)) for part in (base.ior, base.k))
-    return Mirror(concentration(base.alpha), ior, k)
+    return LowerSide(concentration(base.alpha), ior, k)
 
 
 def _is_one(index: Any) -> bool:

@@ -16,12 +16,13 @@ from jax.typing import ArrayLike
 from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
 from layerjax.directions import read_directions, split
+from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, channel_count, require_numbers, simplify
 from layerjax.transport.random_walk.lanes import follow, quotas, standard_error, upright
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
-from layerjax.transport.random_walk.walk import Microfacets, Walk
+from layerjax.transport.random_walk.walk import Walk
 
 
 class Goniogram(eqx.Module):

@@ -1,12 +1,8 @@
-"""Multiple scattering on a rough surface: the walk of Heitz et al. 2016 ("Multiple-scattering microfacet BSDFs with the
-Smith model") over GGX facets, for dielectrics and conductors.
+"""Multiple scattering on the rough surfaces of a stack, dielectric or metal, one facet a step of the walk.
 
-Under the Smith assumption a rough surface is a medium of facets without a bottom. In the coordinate
-height = -log C1(h) >= 0 (C1: the distribution of heights) it is homogeneous: a ray along w meets a facet after a free
-path with extinction A(w) / |w_z|, A(w) = (sigma(w) - w_z) / 2 the projected area of the facets that face it, and has
-left where the coordinate would fall below 0. Passing through a facet turns the surface over, C1 -> 1 - C1.
-
-Directions are local to the side that the ray is on: z is positive away from the surface.
+The physics of a facet is that of `layerjax.microsurface.heitz_walk`, whose heights and directions are counted from the
+side of the surface that the ray is on. Here a path keeps its place on a surface of the stack, and sends what it can to
+the direction that light is asked for.
 """
 
 from typing import NamedTuple
@@ -15,14 +11,21 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import safe_sqrt
 from layerjax.channels import Channels, each, per_channel
-from layerjax.directions import Vector, add, dot, normalize, reflect, refract, scale, select
-from layerjax.normals.sggx import ggx_density, ggx_sample
+from layerjax.directions import Vector, add, dot, flip, normalize, reflect, scale, select
+from layerjax.microsurface.heitz_walk import (
+    escape_probability,
+    facing_area,
+    height_overturned,
+    meet_facet,
+    next_height,
+    pass_through,
+)
+from layerjax.normals.ggx import ggx_density
 from layerjax.surfaces import Conductor
-from layerjax.surfaces.microfacet import refraction_lobe
+from layerjax.surfaces.interface import refraction_lobe
 from layerjax.transport.random_walk.scene import Scene
-from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, roughness, turned
+from layerjax.transport.random_walk.surfaces import Bounce, base_of, is_base, merge, roughness, turned
 
 
 class Position(NamedTuple):
@@ -66,7 +69,7 @@ def width(scene: Scene, surface: Array | None) -> Array:
 
 def fly(w: Vector, height: Array, alpha: Array, free_path: Array) -> tuple[Array, Array]:
     """Next height of a ray after a free path (in mean free paths), and whether it has left the surface."""
-    reached = height - w[2] * free_path / _area(w, alpha)
+    reached = next_height(w, height, alpha, free_path)
     return reached, (w[2] > 0) & (reached <= 0)
 
 
@@ -85,81 +88,72 @@ def bounce(
     """
     u1, u2, u3 = uniforms
     wi = turned(travel, from_above, -1.0)
-    alpha = width(scene, surface)
-    m = ggx_sample(wi, alpha, u1, u2)
-    cosine = jnp.clip(dot(wi, m), 0.0, 1.0)
-    reflected = reflect(wi, m)
-    at_base = is_base(scene, surface) if isinstance(scene.base, Conductor) else False
     towards = None if target is None else turned(target, from_above)
-    area = _area(scale(-1.0, wi), alpha)
-    one = jnp.ones_like(cosine)
-    sent: list[Channels] = []
-    wo, crosses = reflected, jnp.zeros(cosine.shape, bool)
-    kept: Channels = (one,)
+    alpha = width(scene, surface)
+    m, cosine = meet_facet(wi, alpha, u1, u2)
+    at_base = is_base(scene, surface) if isinstance(scene.base, Conductor) else False
+    results = []
+    after = height
     if at_base is not True:
         ior = scene.surface_ior(surface, from_above)
-        refracted, exists = refract(wi, m, ior)
-        crosses = (u3 >= fresnel.dielectric(cosine, ior)) & exists
-        wo = select(crosses, refracted, reflected)
-        if towards is not None:
-            sent.append((_dielectric(wi, towards, height, area, ior, alpha),))
+        at_interface, after = _meet_interface(wi, m, cosine, towards, height, ior, alpha, u3)
+        results.append(at_interface)
     if at_base is not False:
         base = base_of(scene)
         assert isinstance(base, Conductor)
-        if at_base is not True:
-            crosses, wo = crosses & ~at_base, select(at_base, reflected, wo)
-        shares = _reflectance(base, cosine)
-        kept = shares if at_base is True else tuple(jnp.where(at_base, share, one) for share in shares)
-        if towards is not None:
-            lobe, between = _mirror(wi, towards, height, area, alpha)
-            values = tuple(lobe * share for share in _reflectance(base, between))
-            if at_base is True:
-                sent.append(values)
-            else:
-                sent[0] = tuple(jnp.where(at_base, value, sent[0][0]) for value in values)
-    # sides are counted from where the ray is now: under the facets the surface is upside down
-    after = jnp.where(crosses, _overturned(height), height)
-    result = Bounce(sent[0] if sent else (), turned(wo, from_above), crosses, kept, jnp.ones_like(crosses))
-    return result, after
+        results.append(_meet_metal(base, wi, m, cosine, towards, height, alpha))
+    result = results[0]
+    if len(results) == 2:
+        result, after = merge(at_base, results[1], results[0]), jnp.where(at_base, height, after)
+    # directions are counted from where the ray is now: under the facets the surface is upside down
+    return result._replace(direction=turned(result.direction, from_above ^ result.crosses)), after
 
 
-def _dielectric(wi: Vector, wo: Vector, height: Array, area: Array, ior: Array, alpha: Array) -> Array:
-    """What a facet at this height, met along wi, sends to wo and out, per solid angle."""
-    lobe, cosine = _mirror(wi, wo, height, area, alpha)
+def _meet_interface(
+    wi: Vector, m: Vector, cosine: Array, towards: Vector | None, height: Array, ior: Array, alpha: Array, u: Array
+) -> tuple[Bounce, Array]:
+    """Reflection or refraction at a dielectric facet, chosen by Fresnel's shares; and the height afterwards."""
+    refracted, below, exists = pass_through(wi, m, ior, height)
+    crosses = (u >= fresnel.dielectric(cosine, ior)) & exists
+    wo = select(crosses, refracted, reflect(wi, m))
+    sent: Channels = () if towards is None else (_sent_by_interface(wi, towards, height, ior, alpha),)
+    bounced = Bounce(sent, wo, crosses, (jnp.ones_like(cosine),), jnp.ones_like(crosses))
+    return bounced, jnp.where(crosses, below, height)
+
+
+def _meet_metal(
+    base: Conductor, wi: Vector, m: Vector, cosine: Array, towards: Vector | None, height: Array, alpha: Array
+) -> Bounce:
+    """Reflection at a metal facet."""
+    sent: Channels = ()
+    if towards is not None:
+        lobe, between = _sent_by_mirror(wi, towards, height, alpha)
+        sent = tuple(lobe * share for share in _reflectance(base, between))
+    no = jnp.zeros(cosine.shape, bool)
+    return Bounce(sent, reflect(wi, m), no, _reflectance(base, cosine), ~no)
+
+
+def _sent_by_interface(wi: Vector, wo: Vector, height: Array, ior: Array, alpha: Array) -> Array:
+    """Light that a dielectric facet at this height, met along wi, sends to wo and out of the surface, 1/sr."""
+    lobe, cosine = _sent_by_mirror(wi, wo, height, alpha)
     reflected = lobe * fresnel.dielectric(jnp.minimum(cosine, 1.0), ior)
     facets, transmittance = refraction_lobe(wi, wo, ior, alpha)
-    below = (wo[0], wo[1], -wo[2])
-    refracted = facets * transmittance / area * _escape(below, _overturned(height), alpha)
+    escape = escape_probability(flip(wo), height_overturned(height), alpha)
+    refracted = facets * transmittance / facing_area(scale(-1.0, wi), alpha) * escape
     return jnp.where(wo[2] > 0, reflected, jnp.where(facets > 0, refracted, 0.0))
 
 
-def _mirror(wi: Vector, wo: Vector, height: Array, area: Array, alpha: Array) -> tuple[Array, Array]:
-    """The same by reflection, before Fresnel, and the cosine at the facet."""
+def _sent_by_mirror(wi: Vector, wo: Vector, height: Array, alpha: Array) -> tuple[Array, Array]:
+    """Light that a perfect mirror facet at this height, met along wi, sends to wo and out of the surface, 1/sr.
+
+    Also the cosine of wi with the facet, by which Fresnel's reflectance is still to be taken.
+    """
     total = add(wi, wo)
     h = normalize(total)
     valid = (wo[2] > 0) & (h[2] > 0) & (dot(total, total) > 0)
-    lobe = 0.25 * ggx_density(h, alpha) / area * _escape(wo, height, alpha)
+    escape = escape_probability(wo, height, alpha)
+    lobe = 0.25 * ggx_density(h, alpha) / facing_area(scale(-1.0, wi), alpha) * escape
     return jnp.where(valid, lobe, 0.0), jnp.maximum(dot(wi, h), 0.0)
-
-
-def _escape(w: Vector, height: Array, alpha: Array) -> Array:
-    """Share of light along w that leaves the surface from this height, exp(-Lambda(w) height)."""
-    return jnp.exp(-height * _area(w, alpha) / jnp.maximum(w[2], jnp.finfo(height.dtype).tiny * 1e4))
-
-
-def _area(w: Vector, alpha: Array) -> Array:
-    """Projected area of the facets that face a ray along w: (sigma - w_z) / 2, without cancellation."""
-    spread = alpha * alpha * (w[0] * w[0] + w[1] * w[1])
-    sigma = safe_sqrt(spread + w[2] * w[2])
-    floor = jnp.finfo(sigma.dtype).tiny * 1e4
-    return 0.5 * jnp.where(w[2] > 0, (spread + floor) / (sigma + jnp.maximum(w[2], 0.0) + floor), sigma - w[2])
-
-
-def _overturned(height: Array) -> Array:
-    """-log(1 - exp(-height)), to rounding at small and large heights."""
-    height = jnp.maximum(height, jnp.finfo(height.dtype).tiny)  # 0 would lie infinitely deep on the other side
-    small = height < 0.6931
-    return -jnp.where(small, jnp.log(-jnp.expm1(-height)), jnp.log1p(-jnp.exp(-height)))
 
 
 def _reflectance(base: Conductor, cosine: Array) -> Channels:

@@ -1,4 +1,4 @@
-"""What the walk carries: the state of its lanes, what it aims at, and what a step brings."""
+"""What the walk carries: the state of its paths, where a step takes them, and what it brings."""
 
 from typing import Any, NamedTuple
 
@@ -11,23 +11,6 @@ from layerjax.transport.random_walk.microsurface import Position
 from layerjax.transport.random_walk.scene import Scene, choose
 
 
-class Goal(NamedTuple):
-    """The direction that light is asked for, lane by lane, and what follows from it once."""
-
-    wo: Vector
-    above: Array
-    rates: list[Array]
-    exit: Array
-    """Interface that wo sees."""
-    outer: Array
-    """Region that wo lies in."""
-    inner: Array
-    """Region behind that interface."""
-    beyond: Array
-    """Surface next to the exit interface, on the inner region."""
-    outer_transmittance: Channels
-
-
 class Aim(NamedTuple):
     """A direction of travel to the exit interface, drawn once a path as wo would be lit through it."""
 
@@ -38,7 +21,7 @@ class Aim(NamedTuple):
     density: Array
 
 
-class Lane(NamedTuple):
+class PathState(NamedTuple):
     """State of a path. What the scene or the question does not need is None or empty."""
 
     direction: Vector
@@ -49,23 +32,36 @@ class Lane(NamedTuple):
     ratios: Channels
     """Density of the path for each channel over that for the channel that draws."""
     drawn_for: Array | None
+    """Channel that draws the distances."""
     order: Array | None
-    prelude: Array | None
+    """Number of events so far."""
+    aiming: Array | None
+    """Whether it is not yet a path of light, but a ray from wo's side that draws the aim of the path to come."""
     aim: Aim | None
     inverse_density: Array | None
     """1 / density of the last direction if that light was aimed through the exit interface as well, else 0."""
     facet: Position | None
 
 
-class Step(NamedTuple):
-    """What a step brings: the light sent to wo, and the paths that end."""
+class Arrival(NamedTuple):
+    """Where a flight ends: at a collision, at a surface, or outside of the stack."""
 
-    contribution: Channels
-    ends: Array
+    collides: Array
+    medium: Array | None
+    at_surface: Array | None
+    """None: there are no surfaces."""
+    surface: Array | None
     escapes: Array
+
+
+class Target(NamedTuple):
+    """Where the light of an event is asked for."""
+
     direction: Vector
-    weight: Channels
-    order: Array | None
+    direct: Array | None
+    """Whether that is wo itself, with no interface between; None: it always is."""
+    through_exit: Array | None
+    """Whether it is the aim of the path, whose light goes on to wo through the exit interface; None: it never is."""
 
 
 class Event(NamedTuple):
@@ -80,34 +76,31 @@ class Event(NamedTuple):
     """Density of the target among the new directions."""
     next_density: Array | None = None
     """Density of the new direction."""
+    leaves: Array | None = None
+    """Whether a path at a surface is done with it, and not on to another facet of it."""
+    exit_weight: Array | None = None
+    """Weight of what the exit interface sends to wo, beside that of light which was aimed through it."""
 
 
-def make_goal(scene: Scene, wo: Vector) -> Goal:
-    above = wo[2] > 0
-    last = len(scene.interfaces)
-    outer = jnp.where(above, 0, last)
-    crossed = [jnp.where(outer == region, 1.0, 0.0) for region in scene.region_of]
-    rates = scene.rates(wo)
-    return Goal(
-        wo=wo,
-        above=above,
-        rates=rates,
-        exit=jnp.where(above, 0, last - 1),
-        outer=outer,
-        inner=jnp.where(above, 1, last - 1),
-        beyond=jnp.where(above, 1, last - 2),
-        outer_transmittance=scene.transmittance(crossed, rates) if scene.media else (jnp.ones_like(wo[2]),),
-    )
+class Step(NamedTuple):
+    """What a step brings: the light sent to wo, and the paths that end."""
+
+    contribution: Channels
+    ends: Array
+    escapes: Array
+    direction: Vector
+    weight: Channels
+    order: Array | None
 
 
-def to_level(scene: Scene, lane: Lane, at_surface: Array, surface: Array | None) -> Lane:
-    """Lanes at a surface, placed there."""
-    if lane.depth is None:
-        return lane
+def to_level(scene: Scene, path: PathState, at_surface: Array, surface: Array | None) -> PathState:
+    """Paths at a surface, placed there."""
+    if path.depth is None:
+        return path
     level = choose(surface, [jnp.int32(level) for level in scene.levels])
-    if lane.layer is None:
-        return lane._replace(depth=jnp.where(at_surface, level.astype(scene.dtype), lane.depth))
-    return lane._replace(depth=jnp.where(at_surface, 0.0, lane.depth), layer=jnp.where(at_surface, level, lane.layer))
+    if path.layer is None:
+        return path._replace(depth=jnp.where(at_surface, level.astype(scene.dtype), path.depth))
+    return path._replace(depth=jnp.where(at_surface, 0.0, path.depth), layer=jnp.where(at_surface, level, path.layer))
 
 
 def merge(chosen: Array, a: Event, b: Event, channels: int) -> Event:
@@ -126,12 +119,14 @@ def merge(chosen: Array, a: Event, b: Event, channels: int) -> Event:
         per_channel(a.sent, b.sent),
         either(a.density, b.density),
         either(a.next_density, b.next_density),
+        either(a.leaves, b.leaves),
+        either(a.exit_weight, b.exit_weight),
     )
 
 
-def weights(lane: Lane) -> Channels:
+def weights(path: PathState) -> Channels:
     """Throughput of each channel, weighed over the channels that could have drawn the path."""
-    if not lane.ratios:
-        return lane.throughput
-    inverse = 1.0 / mean(lane.ratios)
-    return tuple(t * ratio * inverse for t, ratio in zip(lane.throughput, lane.ratios, strict=True))
+    if not path.ratios:
+        return path.throughput
+    inverse = 1.0 / mean(path.ratios)
+    return tuple(t * ratio * inverse for t, ratio in zip(path.throughput, path.ratios, strict=True))

@@ -18,8 +18,8 @@ from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, sanitised, select
 from layerjax.normals.facets import Distribution, draw_weight, masking, twice_seen
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import (
-    between,
+from layerjax.surfaces.interface import (
+    facet_normal,
     interface_event,
     interface_pdf,
     interface_reflection,
@@ -182,7 +182,7 @@ def exit_density(
         passed = transmittance * 2.0 / twice_seen(jnp.abs(wo[2]), wo, alpha, distribution)
         if distribution == "ggx":
             return value, passed
-        weight = draw_weight(wi, between(wi, wo, ior), alpha)
+        weight = draw_weight(wi, facet_normal(wi, wo, ior), alpha)
         return value / weight, passed * weight
 
     value, passed = _by_distribution(scene, surface, drawn)

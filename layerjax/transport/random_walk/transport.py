@@ -12,15 +12,16 @@ from jax import Array
 
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, sanitised, select
-from layerjax.normals.facets import facet_density, sample
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.microsurface import Microfacets
+from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
 from layerjax.transport.random_walk.lanes import average, upright
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
-from layerjax.transport.random_walk.walk import Microfacets, Orders, Walk
+from layerjax.transport.random_walk.walk import Orders, Walk
 
 
 class RandomWalk(RandomTransport):
@@ -114,7 +115,7 @@ class RandomWalk(RandomTransport):
         local = sanitised((wi[0], wi[1], wi[2] * side))
         near, far = _diffuse_shares(state)
         cosine = sample_cosine(u1, u2)
-        wo = select(u < near, cosine, (cosine[0], cosine[1], -cosine[2]))
+        wo = select(u < near, cosine, flip(cosine))
         facets = _facets(state)
         if facets is not None:
             m = sample(local, facets.alpha, u1, u2, facets.distribution)
@@ -129,7 +130,7 @@ class RandomWalk(RandomTransport):
         facets = _facets(state)
         if facets is not None:
             h, _ = half_vector(local, towards)
-            mirrored = facet_density(h, local, facets.alpha, facets.distribution)
+            mirrored = reflection_pdf(h, local, facets.alpha, facets.distribution)
             density = density + (1.0 - near - far) * jnp.where(h[2] > 0, mirrored, 0.0)
         return density
 

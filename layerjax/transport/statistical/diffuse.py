@@ -29,7 +29,7 @@ from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.quadrature import gauss_legendre, panels
 from layerjax.tables import load
-from layerjax.transport.statistical.variance import refracted_cosine, roughness, transmission_scale, variance
+from layerjax.transport.statistical.variance import bounded_refracted_cosine, roughness, transmission_scale, variance
 
 Table = Mapping[str, np.ndarray]
 
@@ -185,7 +185,7 @@ def _arriving(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -
         clear = coated_transmission(cosine, coat.alpha, n, jnp.ones_like(coat.tau))
         series = 1.0 / (1.0 - back * (1.0 - clear))
         energy = energy * coated_transmission(cosine, coat.alpha, n, coat.tau) * series
-        cosine, _ = refracted_cosine(cosine, n, STEEPEST)
+        cosine, _ = bounded_refracted_cosine(cosine, n, STEEPEST)
         # a smooth interface reflects both sides of a ray alike
         back = (1.0 - clear + clear * clear * back * series) * _powers(coat.tau, 2.0 / cosine)
     return energy

@@ -25,11 +25,12 @@ from jax import Array
 from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick, select, times
 from layerjax.directions import Vector, sanitised
+from layerjax.microsurface import Microfacets
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
 from layerjax.transport.adding_doubling.grid import Grid, Region, interpolated, lifted, table_region
-from layerjax.transport.adding_doubling.interfaces import Microfacets, Normals, entering_energy
+from layerjax.transport.adding_doubling.interfaces import Normals, entering_energy
 from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.first_order import share_met

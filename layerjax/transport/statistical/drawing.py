@@ -6,12 +6,11 @@ from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
-from layerjax.directions import Vector, half_vector, reflect, sanitised, select
-from layerjax.normals.facets import facet_density
-from layerjax.normals.sggx import ggx_sample
+from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
+from layerjax.normals.facets import reflection_pdf
+from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
-from layerjax.transport.first_order import mirror
 from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
@@ -99,20 +98,20 @@ def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, e
     rest = 1.0 - sum(shares[: len(reflected) + len(transmitted)], jnp.zeros_like(wi[2]))
     total = jnp.zeros_like(wi[2] * wo[2])
     for share, alpha in zip(shares, reflected, strict=False):
-        total = total + share * facet_density(h, wi, alpha)
+        total = total + share * reflection_pdf(h, wi, alpha)
     if diffuse is not None:
         total = total + rest * up[2] / np.pi
     total = jnp.where(above, total, 0.0)
     if transmitted:
         below = wo[2] < -edge
-        under = sanitised(mirror(wo), below)
+        under = sanitised(flip(wo), below)
         a, b = folded(wi, entry), folded(under, exit)
         below = below & (a[2] > edge) & (b[2] > edge)
         a, b = sanitised(a, below), sanitised(b, below)
         h, _ = half_vector(a, b, same_side=True)
         stretch = exit * exit * under[2] / b[2]
         for share, alpha in zip(shares[len(reflected) :], transmitted, strict=False):
-            total = total + jnp.where(below, share * stretch * facet_density(h, a, alpha), 0.0)
+            total = total + jnp.where(below, share * stretch * reflection_pdf(h, a, alpha), 0.0)
     return jnp.where(lit, total, 0.0)
 
 

@@ -21,8 +21,8 @@ from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
 from layerjax.transport.statistical.adding import Element, Lobe, add_element, nothing, retain
 from layerjax.transport.statistical.variance import (
+    bounded_refracted_cosine,
     phase_variance,
-    refracted_cosine,
     roughness,
     transmission_scale,
     variance,
@@ -106,7 +106,7 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
     spread: Array | None = None
     depth = jnp.zeros_like(cosine)[None]
     over: Array | None = None  # index above the nearest interface so far
-    cosines = [refracted_cosine(cosine, part.above / met[0].above, STEEPEST)[0] for part in met]
+    cosines = [bounded_refracted_cosine(cosine, part.above / met[0].above, STEEPEST)[0] for part in met]
     interfaces = iter(_interfaces(met, cosines, options))
     for (what, index, below), here in zip(met, cosines, strict=True):
         if isinstance(what, Medium):
@@ -141,7 +141,7 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     alpha = jnp.stack([jnp.asarray(met[k].what.alpha) for k in chosen])[:, None]
     ior = jnp.stack([jnp.asarray(met[k].below / met[k].above) for k in chosen])[:, None]
     smooth = [is_smooth(met[k].what.alpha) for k in chosen]
-    refracted, exists = refracted_cosine(cosine, ior, STEEPEST)
+    refracted, exists = bounded_refracted_cosine(cosine, ior, STEEPEST)
     r12, t12 = _dielectric(cosine, alpha, ior, smooth, options)
     r21, t21 = r12, t12  # Helmholtz: exact where the interface is smooth
     if options.own_side:

@@ -19,7 +19,7 @@ from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.grid import cubic
 from layerjax.transport.statistical.lobes import STEEPEST, Options, Statistics, lobe_roughness, precision, statistics
-from layerjax.transport.statistical.variance import refracted_cosine
+from layerjax.transport.statistical.variance import bounded_refracted_cosine
 
 POINTS = 97
 """Cosines of a table, uniform in the angle above the horizon."""
@@ -180,8 +180,8 @@ def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tu
         return [], []
     below, reference = index_below(stack), reference_index(stack)
     enters, leaves = (below, jnp.ones_like(below)) if upward else (jnp.ones_like(below), below)
-    here, _ = refracted_cosine(cosine, reference / enters, 1.0 - GRAZING)
-    behind, _ = refracted_cosine(cosine, leaves / enters, STEEPEST)
+    here, _ = bounded_refracted_cosine(cosine, reference / enters, 1.0 - GRAZING)
+    behind, _ = bounded_refracted_cosine(cosine, leaves / enters, STEEPEST)
     widening = leaves * behind / (reference * here)  # variance in the reference medium of a unit of it behind
     met = any(isinstance(layer, Interface) for layer in stack.layers)
     lobes: list[_ShapedLobe] = []

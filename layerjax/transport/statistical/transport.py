@@ -14,15 +14,15 @@ from jax import Array
 from layerjax import channels
 from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
-from layerjax.directions import Vector, add, dot, half_vector, reflect, sanitised, select
-from layerjax.normals.facets import facet_density
-from layerjax.normals.sggx import ggx_density, ggx_sample, sggx_area
+from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitised, select
+from layerjax.microsurface import Microfacets
+from layerjax.normals.facets import reflection_pdf
+from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
-from layerjax.surfaces.microfacet import interface_reflection
+from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.first_order import mirror
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
 from layerjax.transport.statistical.drawing import (
@@ -47,12 +47,11 @@ from layerjax.transport.statistical.tables import (
     unfolded,
 )
 
-Microfacets = Literal["single", "multiple"]
 Diffuse = Literal["exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
 
-class Statistics(eqx.Module):
+class LobeTables(eqx.Module):
     """A stack made ready: tables for light from above and from below (None over a base), and the diffuse part."""
 
     top: Table
@@ -117,7 +116,7 @@ class Statistical(DeterministicTransport):
             if reason is not None:
                 raise ValueError(f'{reason}; Statistical(diffuse="exact") takes any')
 
-    def prepare(self, stack: Stack) -> Statistics:
+    def prepare(self, stack: Stack) -> LobeTables:
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side)
         diffuse: DiffusePart | None = None
         if stack.base is not None and _is_diffuse(stack.base):
@@ -127,7 +126,7 @@ class Statistical(DeterministicTransport):
                 diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
                 diffuse = make_diffuse_lobe(stack)
-        return Statistics(
+        return LobeTables(
             top=make_table(stack, options, upward=False),
             bottom=None if stack.base is not None else make_table(stack, options, upward=True),
             diffuse=diffuse,
@@ -135,33 +134,33 @@ class Statistical(DeterministicTransport):
             reference=reference_index(stack),
         )
 
-    def evaluate(self, state: Statistics, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: LobeTables, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
             parts += self._reflections(state.top, wi, wo)
             if state.diffuse is not None:
                 parts.append(diffuse_part(state.diffuse, wi, wo))
             if side == "all" and state.bottom is not None:
-                parts += self._reflections(state.bottom, mirror(wi), mirror(wo))
+                parts += self._reflections(state.bottom, flip(wi), flip(wo))
         if side != "reflection" and state.bottom is not None:
             parts += self._transmissions(state, wi, wo)
         return channels.total(parts)
 
-    def sample(self, state: Statistics, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+    def sample(self, state: LobeTables, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         down = draw(state.top, state.diffuse, wi, uniforms, 1.0 / state.reference, state.below / state.reference)
         if state.bottom is None:
             return down
-        up = draw(state.bottom, None, mirror(wi), uniforms, state.below / state.reference, 1.0 / state.reference)
-        return select(wi[2] > 0, down, mirror(up))
+        up = draw(state.bottom, None, flip(wi), uniforms, state.below / state.reference, 1.0 / state.reference)
+        return select(wi[2] > 0, down, flip(up))
 
-    def pdf(self, state: Statistics, wi: Vector, wo: Vector) -> Array:
+    def pdf(self, state: LobeTables, wi: Vector, wo: Vector) -> Array:
         down = density(state.top, state.diffuse, wi, wo, 1.0 / state.reference, state.below / state.reference)
         if state.bottom is None:
             return down
         ratios = state.below / state.reference, 1.0 / state.reference
-        return jnp.where(wi[2] > 0, down, density(state.bottom, None, mirror(wi), mirror(wo), *ratios))
+        return jnp.where(wi[2] > 0, down, density(state.bottom, None, flip(wi), flip(wo), *ratios))
 
-    def albedo(self, state: Statistics, wi: Vector, nodes: int) -> Energies:
+    def albedo(self, state: LobeTables, wi: Vector, nodes: int) -> Energies:
         """Forward: the energies of the lobes. Symmetric: by quadrature, 2 nodes^2 points a lobe."""
         above = wi[2] > horizon(wi[2].dtype)
         near, far = self._energies(state, state.top, sanitised(wi, above), nodes, upward=False)
@@ -170,13 +169,13 @@ class Statistical(DeterministicTransport):
         if state.bottom is None:
             return channels.select(above, near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
-        other = self._energies(state, state.bottom, sanitised(mirror(wi), below), nodes, upward=True)
+        other = self._energies(state, state.bottom, sanitised(flip(wi), below), nodes, upward=True)
         sides = []
         for down, up in zip((near, far), other, strict=True):
             sides.append(channels.select(above, down, channels.select(below, up)))
         return sides[0], sides[1]
 
-    def _energies(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _energies(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
         if self.symmetric:
             return self._integrated(state, table, wi, nodes, upward)
         return read_energies(table, wi)
@@ -200,12 +199,12 @@ class Statistical(DeterministicTransport):
             lobes.append(_product(scale, shape, valid))
         return lobes
 
-    def _transmissions(self, state: Statistics, wi: Vector, wo: Vector) -> list[Channels]:
+    def _transmissions(self, state: LobeTables, wi: Vector, wo: Vector) -> list[Channels]:
         """Every lobe that passes, for light and viewer on different sides: lobes of a reflection, folded over."""
         assert state.bottom is not None
         edge = horizon(wi[2].dtype)
         downward = wi[2] > 0
-        over, under = select(downward, wi, wo), mirror(select(downward, wo, wi))
+        over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
         valid = (over[2] > edge) & (under[2] > edge)
         over, under = sanitised(over, valid), sanitised(under, valid)
         ratio_over, ratio_under = 1.0 / state.reference, state.below / state.reference
@@ -232,7 +231,7 @@ class Statistical(DeterministicTransport):
             lobes.append(_product(scales, shape, valid))
         return lobes
 
-    def _integrated(self, state: Statistics, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _integrated(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
         """Energy of every lobe by a quadrature over the facets seen from wi, above (`upward`: turned up)."""
         s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
         turn = (jnp.arange(2 * nodes, dtype=s.dtype) + 0.5) / (2 * nodes)
@@ -247,18 +246,18 @@ class Statistical(DeterministicTransport):
             alpha = width[..., None]
             m = ggx_sample(wi, alpha, u1, u2)
             wo = reflect(wi, m)
-            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), facet_density(m, wi, alpha))
+            share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), reflection_pdf(m, wi, alpha))
             lobe = self._reflections(table, wi, wo)[j]
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         ratios = 1.0 / state.reference, state.below / state.reference
         entry, exit = ratios[::-1] if upward else ratios
-        turned = mirror if upward else _same
+        turned = flip if upward else _same
         for j, width in enumerate(transmitted):
             alpha = width[..., None]
             a = folded(wi, entry)
             m = ggx_sample(a, alpha, u1, u2)
             b = reflect(a, m)
-            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * facet_density(m, a, alpha))
+            share = weight * safe_div(jnp.where(b[2] > edge, b[2], 0.0), exit * exit * reflection_pdf(m, a, alpha))
             lobe = self._transmissions(state, turned(wi), turned(unfolded(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         return channels.total(near), channels.total(far)
@@ -281,7 +280,7 @@ def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
     alpha = bounded(alpha)  # a cubic may leave the range of its points
-    area_i, area_o = sggx_area(wi, "surface", alpha, None), sggx_area(wo, "surface", alpha, None)
+    area_i, area_o = ggx_area(wi, alpha), ggx_area(wo, alpha)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 
 

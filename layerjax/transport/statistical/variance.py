@@ -54,7 +54,7 @@ def transmission_scale(cosine: Array, ior: Array, refracted: Array) -> Array:
     return 0.5 * safe_sqrt(difference * difference + 1e-12)  # |.|, smooth where an interface vanishes
 
 
-def refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tuple[Array, Array]:
+def bounded_refracted_cosine(cosine: Array, ior: Array, steepest: float) -> tuple[Array, Array]:
     """Cosine behind an interface, and whether there is one.
 
     Where ior < 1 `steepest` is the largest sine, which stands in beyond the critical angle; elsewhere every cosine has

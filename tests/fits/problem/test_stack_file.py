@@ -127,6 +127,12 @@ def test_dictionary_round_trip(stack):
     _same(stack_from_dict(stack_to_dict(stack)), stack)
 
 
+def test_a_file_with_the_former_name_of_a_form_opens():
+    written = {"kind": "VMFDiffuse", "albedo": 0.5, "roughness": 0.3, "form": "transport"}
+    stack = stack_from_dict({"base": written})
+    assert stack_to_dict(stack) == {"base": written | {"form": "all_orders"}}
+
+
 def test_single_precision_numbers_stay_short():
     stack = lj.Stack([], base=lj.Lambertian(albedo=np.float32(0.9)))
     stack = jax.tree.map(lambda leaf: leaf.astype("float32"), stack)

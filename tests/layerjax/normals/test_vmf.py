@@ -104,14 +104,14 @@ def test_density_and_draws():
     random = np.random.default_rng(2)
     for kappa in (1e-2, 1.0, 40.0, 1e8):
         u = jnp.asarray(random.random((2, 100_000)))
-        x, y, z = vmf.facet_sample(jnp.asarray(kappa), u[0], u[1])
+        x, y, z = vmf.hemisphere_sample(jnp.asarray(kappa), u[0], u[1])
         np.testing.assert_allclose(x * x + y * y + z * z, 1.0, rtol=1e-12)
         # 1 - z is exponential, cut at 1; the azimuth is uniform
         drop = (x * x + y * y) / (1.0 + z)
         share = np.expm1(-kappa * np.asarray(drop)) / np.expm1(-kappa)
         assert scipy.stats.kstest(share, "uniform").pvalue > 1e-3
         assert scipy.stats.kstest(np.arctan2(y, x) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
-        density = vmf.facet_density((x, y, z), jnp.asarray(kappa)) * vmf.hemisphere_norm(jnp.asarray(kappa))
+        density = vmf.hemisphere_density((x, y, z), jnp.asarray(kappa)) * vmf.hemisphere_norm(jnp.asarray(kappa))
         expected = np.exp(-kappa * drop) * kappa / (2 * np.pi * -np.expm1(-2 * kappa))
         np.testing.assert_allclose(density, expected, rtol=1e-10)
     np.testing.assert_allclose(vmf.upper_share(jnp.asarray(1.0)), 1 / (1 + np.exp(-1)), rtol=1e-14)
@@ -125,7 +125,7 @@ def test_gradients_are_finite_and_right(dtype):
 
     def values(c, k):
         turned = vmf.convolved(vmf.resultant(k), vmf.resultant(0.5 * k))
-        found = (vmf.masking(c, k), vmf.masking(c, k, "paper"), sum(vmf.facet_sample(k, 0.999999 * c, c)))
+        found = (vmf.masking(c, k), vmf.masking(c, k, "paper"), sum(vmf.hemisphere_sample(k, 0.999999 * c, c)))
         return jnp.stack([*found, vmf.projected_area(c, k), vmf.hemisphere_norm(k), vmf.concentration_of(*turned)])
 
     value, slopes = jax.jit(jax.vmap(lambda c, k: (values(c, k), jax.jacfwd(values, (0, 1))(c, k))))(cosine, kappa)

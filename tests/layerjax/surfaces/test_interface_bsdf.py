@@ -9,7 +9,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.directions import split
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 
 DRAWS = 400_000
 

@@ -12,7 +12,7 @@ import layerjax as lj
 from layerjax.directions import split
 from layerjax.surfaces.vmf_diffuse.coefficients import first_order, second_order, third_order
 from layerjax.surfaces.vmf_diffuse.flakes import areas, concentration
-from layerjax.surfaces.vmf_diffuse.surface import scattering_orders
+from layerjax.surfaces.vmf_diffuse.paper import scattering_orders
 from tests.helpers.cases import haze
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 
@@ -281,6 +281,14 @@ def test_diffuse_albedo_as_printed():
     small = lj.VMFDiffuse.from_diffuse_albedo(np.float32(1e-4), np.float32(1.0)).albedo
     assert small.dtype == jnp.float32
     np.testing.assert_allclose(small, printed_mapping(1e-4, 1.0), rtol=1e-6)
+
+
+def test_the_former_name_of_a_form_stands_for_its_present_one():
+    former, present = (lj.VMFDiffuse(0.5, 0.3, form) for form in ("transport", "all_orders"))
+    assert former.form == "all_orders"
+    assert repr(former) == repr(present)
+    assert jax.tree.structure(former) == jax.tree.structure(present)
+    assert lj.VMFDiffuse.from_diffuse_albedo(0.5, 0.3, "transport").form == "all_orders"
 
 
 def test_diffuse_albedo_comes_back_when_it_is_solved_for():

@@ -9,11 +9,11 @@ import pytest
 
 from layerjax.precompute.vmf_diffuse import maker as vmf_diffuse
 from layerjax.precompute.vmf_diffuse.half_space import all_orders, half_space, orders
-from layerjax.surfaces.vmf_diffuse import all_orders as vmf_transport
-from layerjax.surfaces.vmf_diffuse.all_orders import transport_brdf
+from layerjax.surfaces.vmf_diffuse import all_orders as tabulated
+from layerjax.surfaces.vmf_diffuse.all_orders import all_orders_brdf
 from layerjax.tables import load
 
-brdf = jax.jit(transport_brdf)
+brdf = jax.jit(all_orders_brdf)
 
 # converged solutions of the half-space by another program, to their digits: roughness, cosines, azimuth between them;
 # f1, f2, f3, and all further orders at albedo 0.9
@@ -165,7 +165,7 @@ def test_values_and_derivatives_are_finite(dtype):
     shades = jnp.asarray([0.0, 1e-6, 0.5, 0.999, 1 - 6e-8, 1.0], dtype)
 
     def one(wi, wo, albedo, roughness):
-        return transport_brdf(wi, wo, (albedo,), roughness)[0]
+        return all_orders_brdf(wi, wo, (albedo,), roughness)[0]
 
     derivatives = jax.vmap(jax.value_and_grad(one, argnums=(0, 1, 2, 3)), in_axes=(0, 0, None, None))
     over = jax.jit(lambda r: jax.lax.map(lambda c: derivatives(wi, wo, c, r), shades))
@@ -181,7 +181,7 @@ def test_derivatives_agree_with_differences():
     wi, wo = vector(jnp.asarray([0.8, 0.3]), 0.2), vector(jnp.asarray([0.5, 0.1]), 2.0)
 
     def total(cosine, albedo, roughness):
-        return jnp.sum(transport_brdf(vector(cosine, 0.2), wo, (albedo,), roughness)[0])
+        return jnp.sum(all_orders_brdf(vector(cosine, 0.2), wo, (albedo,), roughness)[0])
 
     slope, step = jax.jit(jax.grad(total, argnums=(1, 2))), 1e-6
     run = jax.jit(total)
@@ -263,11 +263,11 @@ def test_a_coarse_table_equals_the_one_that_ships(monkeypatch):
     weight = (u * w)[:, None, None] * (u * w)[:, None] * np.ones_like(phi)
     found = []
     for table in (fine, coarse):
-        monkeypatch.setattr(vmf_transport, "load", {"vmf_diffuse": table}.get)
-        vmf_transport._table.cache_clear()
-        run = jax.jit(lambda r: transport_brdf(wi, wo, channels(0.9), r)[0])
+        monkeypatch.setattr(tabulated, "load", {"vmf_diffuse": table}.get)
+        tabulated._table.cache_clear()
+        run = jax.jit(lambda r: all_orders_brdf(wi, wo, channels(0.9), r)[0])
         found.append([run(r) for r in (0.01, 0.2, 0.7, 1.0)])
-    vmf_transport._table.cache_clear()
+    tabulated._table.cache_clear()
     for f, g in zip(*found, strict=True):
         # with half the cosines 1.2e-5
         difference = np.sqrt(np.sum(weight * (f - g) ** 2) / np.sum(weight * f**2))
@@ -284,7 +284,7 @@ def test_the_table_is_made_again_to_rounding():
 @pytest.mark.parametrize("roughness", [1e-3, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 0.99, 1.0])
 def test_error_over_the_hemispheres_beside_the_paper_s_fit(roughness):
     # the fit's error by an independent program: 1 to 8 %
-    from layerjax.surfaces.vmf_diffuse.surface import VMFDiffuse
+    from layerjax.surfaces import VMFDiffuse
 
     space, modes = half_space(width(roughness), 32, 12), np.arange(12)
     u, phi = space.cosines, (np.arange(24) + 0.5) / 24 * np.pi

@@ -9,7 +9,7 @@ import fits
 import layerjax as lj
 from fits.problem.stack_file import stack_from_dict, stack_to_dict
 from layerjax.directions import split
-from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
+from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.automatic import automatic
 from tests.helpers.vmf_walks import Face, coated_energies, mean_and_error
 from tests.layerjax.test_samplers import chi_square

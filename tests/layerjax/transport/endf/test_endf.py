@@ -8,7 +8,7 @@ import pytest
 import layerjax as lj
 from benchmarks.measuring.operations import count
 from benchmarks.peers import endf_walk as endf_truth
-from layerjax.transport.endf.chains import Coat, Face, Mirror, Options, reflections
+from layerjax.transport.endf.chains import Coat, LowerSide, Options, UpperSide, reflections
 from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
 
 RECIPROCAL, PAPER, SURFACE = lj.ENDF(), lj.ENDF(form="paper"), lj.ENDF(bounces=0)
@@ -141,8 +141,8 @@ def test_energy_and_shape_of_one_bounce_everywhere(case):
 @jax.jit
 def chain_over_a_mirror(below, wi, wo):
     """One bounce under a smooth coat, without masking, over a mirror that reflects all."""
-    ideal = Mirror(below, (jnp.asarray(1e-3),), (jnp.asarray(1e9),))
-    coat = Coat(Face(jnp.asarray(1.5), jnp.asarray(1e15)), (), ideal)
+    ideal = LowerSide(below, (jnp.asarray(1e-3),), (jnp.asarray(1e9),))
+    coat = Coat(UpperSide(jnp.asarray(1.5), jnp.asarray(1e15)), (), ideal)
     options = Options(1, "reciprocal", None)
     return reflections(coat, options, tuple(wi), tuple(jnp.moveaxis(wo, -1, 0)))[1][0]
 

@@ -10,7 +10,7 @@ from layerjax import fresnel
 from layerjax.directions import direction, frame, join, normalize, reflect, refract, split
 from layerjax.normals import vmf
 from layerjax.transport.endf import warping as warping
-from layerjax.transport.endf.chains import Face, Mirror, chain_concentration, inner_concentration
+from layerjax.transport.endf.chains import LowerSide, UpperSide, chain_concentration, inner_concentration
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration
 
 IOR = 1.5
@@ -155,7 +155,7 @@ CHAINS = {
 
 @jax.jit
 def concentrations(ior, theta, above, below):
-    top, base = Face(ior, above), Mirror(below, (), None)
+    top, base = UpperSide(ior, above), LowerSide(below, (), None)
     cosine = jnp.cos(theta)
     inside, _ = warping.refracted_cosine(cosine, top.ior)
     coats = [(chain_concentration(k, cosine, top, base), inner_concentration(k, inside, top, base)) for k in (1, 3)]

@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.directions import split
-from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.surfaces.interface import interface_reflection, interface_transmission
 from tests.helpers.cases import HEMISPHERES, fig7, flakes, haze, surface_3
 
 KEY = jax.random.key(20)

@@ -8,7 +8,7 @@ import scipy.special
 
 import layerjax as lj
 from layerjax.directions import split
-from layerjax.surfaces.microfacet import interface_reflection, interface_transmission
+from layerjax.surfaces.interface import interface_reflection, interface_transmission
 from layerjax.transport.random_walk.lanes import follow
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene

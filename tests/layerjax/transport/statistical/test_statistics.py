@@ -7,8 +7,8 @@ import pytest
 
 from layerjax.transport.statistical.adding import Element, add_element, nothing, plus, retain, times
 from layerjax.transport.statistical.variance import (
+    bounded_refracted_cosine,
     phase_variance,
-    refracted_cosine,
     roughness,
     transmission_scale,
     variance,
@@ -27,7 +27,7 @@ def test_roughness_as_a_variance() -> None:
 def test_refraction_at_sixty_degrees() -> None:
     """n = 1.5: cosine, both scales (Eq. 10 with its sign put right), and the factors of variance."""
     cosine, ior = jnp.asarray(0.5), jnp.asarray(1.5)
-    refracted, exists = refracted_cosine(cosine, ior, 0.999)
+    refracted, exists = bounded_refracted_cosine(cosine, ior, 0.999)
     assert exists
     found = [refracted, transmission_scale(cosine, ior, refracted), transmission_scale(refracted, 1 / ior, cosine)]
     np.testing.assert_allclose(found, [0.8164966, 0.2958759, 0.7247449], atol=5e-8)

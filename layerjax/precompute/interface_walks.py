@@ -1,9 +1,6 @@
 """Multiply scattered light on a rough dielectric interface: the walk of Heitz et al. 2016, past its first collision.
 
-Under the Smith assumption a rough surface is a medium of facets in the coordinate height = -log C1(h) >= 0, C1 the
-distribution of heights: a ray along w meets a facet at the rate A(w) / |w_z|, A(w) the projected area of those facing
-it. Passing through a facet turns the surface over, C1 -> 1 - C1, and so are directions: z always points away from the
-surface on the side that the ray is on.
+Heights and directions are those of `layerjax.microsurface.heitz_walk`.
 """
 
 from functools import partial
@@ -14,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax.directions import Vector, dot, reflect, refract, scale, select
-from layerjax.normals.sggx import ggx_sample
+from layerjax.directions import Vector, reflect, scale, select
+from layerjax.microsurface.heitz_walk import meet_facet, next_height, optical_depth, pass_through
 
 EVENTS = 100
 """Collisions followed at most: near index 1 light goes through facet after facet."""
@@ -28,7 +25,7 @@ STRATIFIED = 12
 
 
 @partial(jax.jit, static_argnums=3)
-def shares(points: Array, keys: Array, taus: Array, paths: int) -> Array:
+def multiply_scattered(points: Array, keys: Array, taus: Array, paths: int) -> Array:
     """Where light ends up that a rough dielectric interface keeps at the first collision, with absorption on the way.
 
     Args:
@@ -63,21 +60,20 @@ def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, pa
         random = jax.random.uniform(jax.random.fold_in(rest, number), (4, paths), jnp.float32)
         even = lattice[jnp.minimum(number, len(lattice) - 1)]
         u1, u2, u3, u4 = jnp.clip(jnp.where(number < len(lattice), even, random), 1e-7, 1.0 - 1e-7)
-        staying = -jnp.expm1(-_free(travel, height, alpha))
-        height = height + travel[2] * jnp.log1p(-u4 * staying) / _facing(travel, alpha)
+        staying = -jnp.expm1(-optical_depth(travel, height, alpha))
+        height = next_height(travel, height, alpha, -jnp.log1p(-u4 * staying))
         height = jnp.where(height > 1e-30, height, 1e-30)
         wi = scale(-1.0, travel)
-        m = ggx_sample(wi, alpha, u1, u2)
-        at_facet, n = jnp.clip(dot(wi, m), 0.0, 1.0), jnp.where(far, 1.0 / ior, ior)
-        refracted, exists = refract(wi, m, n)
+        (m, at_facet), n = meet_facet(wi, alpha, u1, u2), jnp.where(far, 1.0 / ior, ior)
+        refracted, below, exists = pass_through(wi, m, n, height)
         reflectance = jnp.where(exists, fresnel.dielectric(at_facet, n), 1.0)
         ways: list[tuple[Vector, Array, Array]] = [
             (reflect(wi, m), height, weight * reflectance),
-            ((refracted[0], refracted[1], -refracted[2]), _overturned(height), weight * (1.0 - reflectance)),
+            (refracted, below, weight * (1.0 - reflectance)),
         ]
         kept, sums = [], []
         for w, h, energy in ways:
-            free = _free(w, h, alpha)
+            free = optical_depth(w, h, alpha)
             powers = jnp.exp(-depths / jnp.where(w[2] > 1e-6, w[2], 1e-6))
             out = jnp.where(first, 0.0, energy * jnp.exp(-free))
             sums.append((powers @ jnp.where(far, 0.0, out), powers @ jnp.where(far, out, 0.0)))
@@ -102,24 +98,6 @@ def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, pa
     straight = jnp.stack([jnp.zeros_like(depths), jnp.exp(-depths / cosine)])[..., 0]  # where all leaves at once
     total = jnp.sum(energy[:, -1])
     return jnp.where(total > 0, energy / total, straight)
-
-
-def _free(w: Vector, height: Array, alpha: Array) -> Array:
-    """Collisions, on average, on the way out of the surface: none of light that goes down escapes."""
-    up = w[2] > 0
-    return jnp.where(up, height * _facing(w, alpha) / jnp.where(up, w[2], 1.0), jnp.inf)
-
-
-def _facing(w: Vector, alpha: Array) -> Array:
-    """Projected area of the facets that face a ray along w, above 0."""
-    spread = alpha * alpha * (w[0] * w[0] + w[1] * w[1])
-    sigma = jnp.sqrt(spread + w[2] * w[2])
-    return 0.5 * jnp.where(w[2] > 0, spread / (sigma + jnp.abs(w[2])), sigma - w[2]) + 1e-20
-
-
-def _overturned(height: Array) -> Array:
-    """Height counted from the other side of the surface, -log(1 - exp(-height))."""
-    return -jnp.where(height < 0.6931, jnp.log(-jnp.expm1(-height)), jnp.log1p(-jnp.exp(-height)))
 
 
 def _lattice(paths: int) -> np.ndarray:
