@@ -103,8 +103,8 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     return tuple(sum((pick(part, c) for part in parts), zero) for c in range(max(1, count(*parts))))
 
 
-def caught(state: FirstOrder, w: Vector) -> Channels | None:
-    """Share of light along w that meets an event at all, per channel; None: all of it. See `share_met`."""
+def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
+    """Probability that light along w meets an event at all, per channel; None: it is 1. See `share_met`."""
     if state.layered or state.opaque:
         return None
     edge = horizon(w[2].dtype)

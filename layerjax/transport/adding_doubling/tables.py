@@ -54,9 +54,13 @@ class Tables(eqx.Module):
 
 
 def make_tables(
-    grid: Grid, whole: Layer, azimuths: int | None, opaque: bool, caught: Callable[[Vector], Channels | None]
+    grid: Grid,
+    whole: Layer,
+    azimuths: int | None,
+    opaque: bool,
+    interaction_probability: Callable[[Vector], Channels | None],
 ) -> Tables:
-    """Tables of a solved stack. caught: share of light along a direction that meets an event at all (None: all)."""
+    """Tables of a solved stack. interaction_probability: that light along a direction meets an event (None: 1)."""
     top, bottom = grid.regions[0], grid.regions[-1]
     count = 1 if azimuths is None else azimuths
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
@@ -98,7 +102,7 @@ def make_tables(
     far: list[Array] = []
     for reflect, transmit, region in rows[: 1 if opaque else 2]:
         lift = lifts[id(region)][0]
-        met = caught(_node_directions(region, azimuths, 1.0 if region is top and not near else -1.0))
+        met = interaction_probability(_node_directions(region, azimuths, 1.0 if region is top and not near else -1.0))
         share = jnp.ones((1, lift.shape[-1]), lift.dtype) if met is None else jnp.stack(met)
         for energies, flux in ((near, reflect.total), (far, transmit.total)):
             sums = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
