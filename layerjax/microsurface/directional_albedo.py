@@ -36,7 +36,7 @@ from jax.typing import ArrayLike
 
 from layerjax import fresnel
 from layerjax._numerics import at_least, at_most
-from layerjax.microsurface.multiple_bounces import conductor_return, interface_returns
+from layerjax.microsurface.multiple_bounces import conductor_multiple_reflectance, interface_multiple_reflectance
 from layerjax.microsurface.visible_facets import (
     Cap,
     Facets,
@@ -77,7 +77,7 @@ def interface_energies(
         cap = make_cap(cosine, alpha)
         return _reflected(cap, ior, points), _passing(cap, ior, points)[1]
     first, kept, stuck = first_event(cosine, alpha, ior, points=points)
-    returned = interface_returns(cosine, alpha, ior)
+    returned = interface_multiple_reflectance(cosine, alpha, ior)
     reflected = _share(first + kept * returned[0] + stuck * returned[1])
     return reflected, 1.0 - reflected
 
@@ -105,7 +105,7 @@ def conductor_energy(
         reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
         return upper.mean(reflectance * _masking(upper.reflected(), upper.alpha))
     first, kept = first_mirror(cosine, alpha, ior, k, points=points)
-    return _share(first + kept * conductor_return(cosine, alpha, ior, k))
+    return _share(first + kept * conductor_multiple_reflectance(cosine, alpha, ior, k))
 
 
 @partial(jax.jit, static_argnames="points")

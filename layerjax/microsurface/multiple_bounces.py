@@ -18,7 +18,7 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.tables import load
 
 
-def interface_returns(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, Array]:
+def interface_multiple_reflectance(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, Array]:
     """Shares that end on the near side, of light first reflected, and first refracted, to other facets.
 
     They are to be multiplied by the amounts of `layerjax.microsurface.directional_albedo.first_event`, one of which is
@@ -34,14 +34,14 @@ def interface_returns(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, A
     return reflected, refracted
 
 
-def conductor_return(cosine: Array, alpha: Array, ior: Array, k: Array) -> Array:
+def conductor_multiple_reflectance(cosine: Array, alpha: Array, ior: Array, k: Array) -> Array:
     """Share that a conductor gives back, all facets after the first together; 1 for perfect mirrors."""
     basis, mean = conductor_basis(cosine, alpha, ior, k)
     return mean + basis @ jnp.asarray(load("microsurface")["conductor"], basis.dtype)
 
 
 def interface_bases(cosine: Array, alpha: Array, ior: Array) -> dict[str, Array]:
-    """Functions of which `interface_returns` is made, "reflected" and "refracted", on a new last axis."""
+    """Functions of which `interface_multiple_reflectance` is made, "reflected" and "refracted", on a new last axis."""
     lower = jnp.where(ior < 1.0, ior, 1.0 / ior)
     critical = (1.0 - lower) * (1.0 + lower)  # cosine of the critical angle, squared
     # near equal indices light goes on straight, facet after facet: it turns back where they differ by this much
@@ -57,7 +57,10 @@ def interface_bases(cosine: Array, alpha: Array, ior: Array) -> dict[str, Array]
 
 
 def conductor_basis(cosine: Array, alpha: Array, ior: Array, k: Array) -> tuple[Array, Array]:
-    """Functions of which `conductor_return` is made, on a new last axis, and its leading part, the mean reflectance."""
+    """Functions of which `conductor_multiple_reflectance` is made, on a new last axis, and its leading part.
+
+    That part is the mean reflectance of a facet.
+    """
     s, w = (jnp.asarray(array, cosine.dtype) for array in gauss_legendre(16))
     mean = fresnel.conductor(s, ior[..., None], k[..., None]) @ (2.0 * s * w)
     slope = fresnel.conductor(jnp.ones_like(ior), ior, k) - mean

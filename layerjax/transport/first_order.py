@@ -102,8 +102,8 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
     return total(parts, zero)
 
 
-def caught(state: FirstOrder, w: Vector) -> Channels | None:
-    """Share of light along w that meets an event at all, per channel; None: all of it. See `share_met`."""
+def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
+    """Probability that light along w meets an event at all, per channel; None: it is 1. See `share_met`."""
     if state.layered or state.opaque:
         return None
     return share_met(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))

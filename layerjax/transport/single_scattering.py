@@ -92,7 +92,7 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
     opaque = slab.base is not None
     if opaque and side == "transmission":
         return {}
-    valid = answered(wi, wo, side, opaque)
+    valid = is_valid_pair(wi, wo, side, opaque)
     if opaque or side == "reflection":
         lobes = _from_above(slab, sanitised(wi), sanitised(wo))
     else:
@@ -102,7 +102,7 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
     return {k: channels.select(valid, lobe) for k, lobe in lobes.items()}
 
 
-def answered(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
+def is_valid_pair(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
     """Whether a pair is one that is asked for: no direction in the tangent plane, and none below an opaque base."""
     edge = horizon(wi[2].dtype)
     if opaque or side == "reflection":

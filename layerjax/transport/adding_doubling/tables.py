@@ -62,7 +62,11 @@ class _End(NamedTuple):
 
 
 def make_tables(
-    grid: Grid, whole: Layer, azimuths: int | None, opaque: bool, interacting: Callable[[Vector], Channels | None]
+    grid: Grid,
+    whole: Layer,
+    azimuths: int | None,
+    opaque: bool,
+    interaction_probability: Callable[[Vector], Channels | None],
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -71,7 +75,7 @@ def make_tables(
         whole: the operators of all its layers together.
         azimuths: ordinates in azimuth; None: Fourier modes.
         opaque: only light from above, and what is reflected.
-        interacting: share of light along a direction that meets an event at all, per channel (None: all).
+        interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
@@ -83,7 +87,7 @@ def make_tables(
         lit.append((bottom, whole.reflect_bottom, whole.transmit_up, -1.0))
     near, far = [], []
     for end, reflect, transmit, side in lit:
-        share = interacting(_node_directions(end.region, azimuths, side))
+        share = interaction_probability(_node_directions(end.region, azimuths, side))
         near.append(_energy(reflect.total, share, end))
         far.append(_energy(transmit.total, share, end))
     shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])

@@ -25,7 +25,7 @@ from layerjax.transport.adding_doubling.proposals import proposal_density, propo
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.first_order import FirstOrder, caught, evaluate_first, first_order
+from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
@@ -137,7 +137,7 @@ class AddingDoubling(DeterministicTransport):
         Of single orders by quadrature with `nodes` points, where no interface is.
         """
         if state.tables is not None and self.orders == "all":
-            met = caught(state.first, wi)
+            met = interaction_probability(state.first, wi)
             near, far = read_energy(state.tables, wi)
             return (near, far) if met is None else (times(near, met), times(far, met))
         if state.first.layered:
@@ -192,7 +192,7 @@ class AddingDoubling(DeterministicTransport):
 @eqx.filter_jit
 def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
     grid, whole = solve(stack, plan)
-    return make_tables(grid, whole, plan.azimuths, stack.base is not None, partial(caught, first))
+    return make_tables(grid, whole, plan.azimuths, stack.base is not None, partial(interaction_probability, first))
 
 
 @eqx.filter_jit

@@ -129,7 +129,7 @@ def _reflected(coat: Coat, wi: Vector, lobes: list[Proposal], u: Array, u1: Arra
     leaves = is_above(out)
     if below:
         assert coat.top is not None
-        outer, escapes = _left(coat.top, sanitised(out))
+        outer, escapes = _refracted_out(coat.top, sanitised(out))
         out, leaves = select(inside, outer, out), leaves & (~inside | (enters & escapes))
     return select(through, flip(out), out), leaves
 
@@ -210,7 +210,7 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
     if not any(lobe.place == "inside" for lobe in lobes):
         return wo, weight
     assert coat.top is not None
-    outer, leaves = _left(coat.top, wo)
+    outer, leaves = _refracted_out(coat.top, wo)
     inside = jnp.asarray([lobe.place == "inside" for lobe in lobes])[:, None] & (coat.top.ior < 1.0)
     slope = jnp.where(leaves, coat.top.ior * coat.top.ior, 0.0)
     return select(inside, outer, wo), weight * jnp.where(inside, slope, 1.0)
@@ -234,7 +234,7 @@ def _is_interface(coat: Coat) -> bool:
     return coat.top is not None and coat.base is None
 
 
-def _left(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
+def _refracted_out(top: UpperSide, inner: Vector) -> tuple[Vector, Array]:
     """Where light inside goes outside a level facet (both upward), and whether it does."""
     x, y = top.ior * inner[0], top.ior * inner[1]
     squared = 1.0 - x * x - y * y

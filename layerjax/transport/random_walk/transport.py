@@ -1,7 +1,8 @@
 """Monte Carlo reference: unbiased random walks through anything that a `Stack` holds.
 
-See `layerjax.transport.random_walk.walk` for the estimator, `layerjax.transport.random_walk.lanes` for how paths share
-the lanes, and `layerjax.transport.random_walk.random_numbers` for the random numbers.
+See `layerjax.transport.random_walk.walk` for the path of light, `layerjax.transport.random_walk.next_event` for what it
+adds to a BSDF value, `layerjax.transport.random_walk.lanes` for how paths share the lanes, and
+`layerjax.transport.random_walk.random_numbers` for the random numbers.
 """
 
 from collections.abc import Sequence

@@ -27,7 +27,7 @@ from layerjax.phase import SGGX, HenyeyGreenstein, PhaseFunction
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Medium
 from layerjax.transport.contract import Side
-from layerjax.transport.single_scattering import Media, answered, layer_lobes
+from layerjax.transport.single_scattering import Media, is_valid_pair, layer_lobes
 from layerjax.transport.spongecake.bending import Bend, coefficients_of, factors, share_of
 from layerjax.transport.spongecake.mapping import Numbers, Weights, shape_of, weights_of
 
@@ -117,7 +117,7 @@ def _of_type(net: eqx.nn.MLP, dtype: Any) -> eqx.nn.MLP:
 
 
 def evaluate_second(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
-    """BSDF of what several collisions leave. opaque: there is a base, and light from above alone is answered."""
+    """BSDF of what several collisions leave. opaque: there is a base, and light from above alone is is_valid_pair."""
     terms = [_level(second, wi, wo, side, opaque), *_lobes(second, wi, wo, side, opaque).values()]
     values = tuple(sum((term[c] for term in terms[1:]), terms[0][c]) for c in range(len(terms[0])))
     if second.bend is None:
@@ -146,7 +146,7 @@ def _lobes(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool)
 
 def _level(second: SecondLobe, wi: Vector, wo: Vector, side: Side, opaque: bool) -> Channels:
     """The Lambertian term, for all channels."""
-    valid = answered(wi, wo, side, opaque)
+    valid = is_valid_pair(wi, wo, side, opaque)
     rises = _rises(wi, wo)
     values = []
     for c in range(_channels(second)):
