@@ -14,7 +14,7 @@ from layerjax.surfaces.vmf_diffuse.coefficients import first_order, second_order
 from layerjax.surfaces.vmf_diffuse.flakes import areas, concentration
 from layerjax.surfaces.vmf_diffuse.surface import scattering_orders
 from tests.helpers.cases import haze
-from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 
 POINTS = 8_000
 

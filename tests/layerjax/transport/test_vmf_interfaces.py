@@ -11,8 +11,8 @@ from fits.problem.stack_file import stack_from_dict, stack_to_dict
 from layerjax.directions import split
 from layerjax.surfaces.microfacet import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.automatic import automatic
+from tests.helpers.sampling import chi_square
 from tests.helpers.vmf_walks import Face, coated_energies, mean_and_error
-from tests.layerjax.test_samplers import chi_square
 
 DRAWS = 200_000
 STEP = 1e-6  # short, for the facets that a change takes across the critical angle, where the slope is infinite

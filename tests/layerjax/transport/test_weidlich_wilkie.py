@@ -8,7 +8,7 @@ import pytest
 
 import layerjax as lj
 from benchmarks.measuring.operations import count
-from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 
 WW = lj.WeidlichWilkie()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from tests.layerjax.transport.endf.test_endf import OUTSIDE, PAPER, RECIPROCAL
+from tests.helpers.endf import OUTSIDE, PAPER, RECIPROCAL
 
 POINTS = 10_000
 CLEAR = lj.Medium(1.0, 0.0)  # made outside jit, where the albedo stays a known 0
