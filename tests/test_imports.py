@@ -115,6 +115,13 @@ def test_no_two_modules_need_each_other(package):
     graphlib.TopologicalSorter({name: set(imported(path)) & own.keys() for name, path in own.items()}).prepare()
 
 
+@pytest.mark.parametrize("path", sources("tests"), ids=module_name)
+def test_what_tests_share_lies_in_helpers(path):
+    for other in imported(path):
+        if other.split(".")[0] == "tests":
+            assert other.startswith("tests.helpers"), f"{path} imports {other}"
+
+
 def loaded_by(statement):
     code = f"import sys; {statement}; print(*sorted(name.split('.')[0] for name in sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout

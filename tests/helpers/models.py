@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.parameters import Free
 
 
 def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:
@@ -41,6 +44,22 @@ def design(count: int) -> np.ndarray:
     return np.stack([np.ones(count), directions(count, 2)[:, 2]], axis=-1)
 
 
+COUNT = 100
+LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
+TRUTH = np.array([1.0, 0.5])
+
+
+def line_data(sigma: float = 0.05, seed: int = 0) -> Measurements:
+    """COUNT readings of the line with the parameters TRUTH, with noise."""
+    noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
+    return measured((design(COUNT) @ TRUTH)[:, None] + sigma * noise, sigma)
+
+
+def line_fit(seed: int = 0) -> Fit:
+    """The fit of a line to `line_data`."""
+    return fit(LINE, line_data(seed=seed), transport=line, starts=2)
+
+
 def lobe(stack: Any, wi: Any, wo: Any) -> Any:
     """Six parameters: a GGX coat, a diffuse base seen through an absorber, and single scattering in it."""
     xp = np if isinstance(wi, np.ndarray) else jnp
@@ -62,3 +81,18 @@ def lobe(stack: Any, wi: Any, wo: Any) -> Any:
 
 
 LOBE = {"alpha": 0.2, "gain": 0.9, "ior": 1.5, "albedo": 0.3, "depth": 0.3, "g": 0.4}
+LOBE_STACK = {
+    "alpha": Free(0.4, 0.05, 1.0),
+    "gain": Free(0.5, 0.0, 2.0),
+    "ior": Free(1.7, 1.2, 2.5),
+    "albedo": Free(0.5, 0.0, 1.0),
+    "depth": Free(0.5, 0.0, 3.0),
+    "g": Free(0.0, -0.9, 0.9),
+}
+
+
+def noisy_lobe(seed: int, count: int = 600) -> Measurements:
+    """Readings of the lobe with the parameters LOBE, with an error of 5 in 100."""
+    exact = lobe(LOBE, directions(count, 1), directions(count, 2))
+    sigma = 0.05 * exact
+    return measured(exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape), sigma)

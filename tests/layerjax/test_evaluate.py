@@ -43,10 +43,11 @@ def test_an_empty_stack_is_nothing_at_all():
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_large_batches_run_in_chunks_with_the_same_result(dtype):
     chunk = CHUNK_BYTES // np.dtype(dtype).itemsize
-    count = 2 * chunk + chunk // 3  # two whole chunks and a rest
+    part = (2 * chunk + chunk // 3) // 14 * 2
+    count = 7 * part  # two whole chunks and a rest
     wi, wo = directions(count, 2, dtype), directions(count, 3, dtype)
     whole = lj.evaluate(STACK, wi, wo)
-    parts = [lj.evaluate(STACK, wi[i : i + 1000], wo[i : i + 1000]) for i in range(0, count, 1000)]
+    parts = [lj.evaluate(STACK, wi[i : i + part], wo[i : i + part]) for i in range(0, count, part)]
     np.testing.assert_allclose(whole, np.concatenate(parts), rtol=50 * np.finfo(dtype).eps, atol=1e-30)
     assert whole.dtype == dtype
 

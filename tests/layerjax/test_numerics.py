@@ -28,14 +28,15 @@ def test_gradients_of_exponential_ratios():
     # d exprel/dx = (exp(-x) (1 + x) - 1) / x^2, by its series below 0.1
     series = sum((-1) ** k * k * x ** (k - 1) / np.prod(np.arange(1.0, k + 2)) for k in range(1, 20))
     exact = np.where(x < 0.1, series, (np.exp(-x) * (1 + x) - 1) / x**2)
-    np.testing.assert_allclose(jax.vmap(jax.grad(n.exprel))(x), exact, rtol=2e-13)
-    np.testing.assert_allclose(jax.vmap(jax.grad(n.one_minus_exp))(x), np.exp(-x), rtol=1e-13)
-    assert np.isfinite(jax.vmap(jax.grad(n.exprel))(jnp.array([0.0, 1e30, 1e300]))).all()
+    ratio, rest = (jax.jit(jax.vmap(jax.grad(function))) for function in (n.exprel, n.one_minus_exp))
+    np.testing.assert_allclose(ratio(x), exact, rtol=2e-13)
+    np.testing.assert_allclose(rest(x), np.exp(-x), rtol=1e-13)
+    assert np.isfinite(ratio(jnp.array([0.0, 1e30, 1e300]))).all()
 
 
 def test_safe_root_and_quotient():
     x = jnp.array([-1.0, 0.0, 4.0])
     np.testing.assert_array_equal(n.safe_sqrt(x), [0.0, 0.0, 2.0])
-    np.testing.assert_array_equal(jax.vmap(jax.grad(n.safe_sqrt))(x), [0.0, 0.0, 0.25])
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(n.safe_sqrt)))(x), [0.0, 0.0, 0.25])
     np.testing.assert_array_equal(n.safe_div(jnp.ones(2), jnp.array([0.0, 4.0]), 7.0), [7.0, 0.25])
     assert jax.grad(n.safe_div, 1)(1.0, 0.0) == 0.0

@@ -4,15 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.stats
 
 import layerjax as lj
 from layerjax.directions import join, split
 from layerjax.normals.ggx import ggx_density, ggx_masking, ggx_sample
 from tests.helpers.cases import haze, tilt3
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square, density_of
 
-DRAWS = 200_000
-SIGNIFICANCE = 1e-4  # with 18 cases a correct sampler fails this file once in 500 seeds
 ABOVE, BELOW, GRAZING = (0.7, 0.4), (2.3, 1.0), (1.45, 2.0)
 
 STACKS = {
@@ -38,35 +36,6 @@ CASES += [(name, OPAQUE[name], GRAZING) for name in ("oren-nayar", "conductor")]
 IDS = [f"{name}, theta {wi[0]}" for name, _, wi in CASES]
 
 
-def cell_probabilities(density, cosines, azimuths, points=8):
-    """Integral of the density over cells of a (cos theta, phi) grid, by Gauss quadrature in each."""
-    x, w = np.polynomial.legendre.leggauss(points)
-
-    def spread(edges):
-        width = np.diff(edges)[:, None]
-        return edges[:-1, None] + width * 0.5 * (x + 1), width * 0.5 * w
-
-    (z, wz), (phi, wp) = spread(cosines), spread(azimuths)
-    wo = lj.direction(jnp.arccos(z)[:, None, :, None], jnp.asarray(phi)[None, :, None, :])
-    values = density(wo)
-    return np.einsum("ijkl,ik,jl->ij", np.asarray(values), wz, wp)
-
-
-def chi_square(drawn, density):
-    cosines, azimuths = np.linspace(-1, 1, 41), np.linspace(-np.pi, np.pi, 41)
-    expected = cell_probabilities(density, cosines, azimuths)
-    theta, phi = lj.angles(drawn)
-    counts, _, _ = np.histogram2d(np.cos(theta), np.asarray(phi), bins=(cosines, azimuths))
-    expected, counts = expected.ravel() * DRAWS, counts.ravel()
-    order = np.argsort(-expected)
-    large = order[expected[order] >= 10]
-    statistic = np.sum((counts[large] - expected[large]) ** 2 / expected[large])
-    rest = DRAWS - expected[large].sum()  # all other cells, and directions without a density, pooled
-    if rest > 10:
-        statistic += (DRAWS - counts[large].sum() - rest) ** 2 / rest
-    return scipy.stats.chi2.sf(statistic, len(large)), expected.sum() / DRAWS
-
-
 @pytest.mark.parametrize(("name", "stack", "wi"), CASES, ids=IDS)
 def test_samples_follow_their_density(name, stack, wi):
     wi = lj.direction(*wi)
@@ -81,7 +50,8 @@ def test_samples_follow_their_density(name, stack, wi):
     probability, total = chi_square(wo[keep], cells)
     assert probability > SIGNIFICANCE
     np.testing.assert_allclose(total, 1.0 if not above_only else np.mean(wo[:, 2] > 0), atol=4e-3)
-    np.testing.assert_allclose(density[:100], lj.pdf(stack, towards[:100], wo[:100]), rtol=1e-9)
+    found = density_of(wo, lambda w: lj.pdf(stack, wi, w))
+    np.testing.assert_allclose(density[:100], found[:100], rtol=1e-9)
 
     mean, error = np.mean(weight, axis=0), np.std(weight, axis=0) / np.sqrt(DRAWS)
     reflected, transmitted = lj.albedo(stack, wi)

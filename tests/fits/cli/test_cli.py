@@ -17,15 +17,12 @@ from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.problem.problem import Problem
 from fits.reporting.results import load_fit, load_posterior, save_fit
+from tests.helpers.files import contents
 from tests.helpers.places import ROOT
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6  # of the stack behind coat_data
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf\n"
 ROWS = "10,180,20,0,0.1\n10,180,30,0,0.1\n10,180,40,0,0.1\n"
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def refused(words: list[str], capsys: pytest.CaptureFixture[str], folder: Path) -> str:

@@ -1,7 +1,6 @@
 """Disks that fill up, processes that are killed or that meet, and damaged files: what was kept stays, and is seen."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -27,27 +25,12 @@ from fits.problem.likelihood import Noise
 from fits.problem.problem import Problem
 from fits.reporting.plots.data import data_picture
 from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
-from tests.fits.cli.test_cli import ROOT, contents
-from tests.fits.inference.test_posterior import LINE, line_data, line_fit
-from tests.helpers.models import line
+from tests.helpers.files import contents, largest_file
+from tests.helpers.models import LINE, line, line_data, line_fit
+from tests.helpers.places import ROOT
 
 MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
 BOUNDED = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "12", "--solver", "bounded"]
-
-
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """No file can grow beyond this, in bytes: a full disk for those who may not mount a small one."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    setting = "jax_persistent_cache_min_compile_time_secs"
-    usual = jax.config.values[setting]
-    jax.config.update(setting, float("inf"))  # compiled programs that other tests share are not to be cut off
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores the signal, so that `write` fails
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        jax.config.update(setting, usual)
 
 
 @contextmanager

@@ -19,29 +19,14 @@ from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reporting import verdicts
-from tests.helpers.models import LOBE, design, directions, line, lobe, measured
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
 
 COUNT = 300
-LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
-LOBE_STACK = {
-    "alpha": Free(0.4, 0.05, 1.0),
-    "gain": Free(0.5, 0.0, 2.0),
-    "ior": Free(1.7, 1.2, 2.5),
-    "albedo": Free(0.5, 0.0, 1.0),
-    "depth": Free(0.5, 0.0, 3.0),
-    "g": Free(0.0, -0.9, 0.9),
-}
 
 
 def noisy_line(a: float, b: float, sigma: float = 0.05, seed: int = 0):
     noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
     return measured((design(COUNT) @ [a, b])[:, None] + sigma * noise, sigma)
-
-
-def noisy_lobe(seed: int, count: int = 600):
-    exact = lobe(LOBE, directions(count, 1), directions(count, 2))
-    sigma = 0.05 * exact
-    return measured(exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape), sigma)
 
 
 def named(result) -> dict[str, float]:

@@ -20,21 +20,8 @@ from fits.inference.optimise import fit
 from fits.inference.posterior import _adapted, _identity, _sampler, load, sample
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
-from tests.helpers.models import design, line, measured
+from tests.helpers.models import COUNT, LINE, design, line, line_data, line_fit, measured
 from tests.helpers.places import ROOT
-
-COUNT = 100
-LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
-TRUTH = np.array([1.0, 0.5])
-
-
-def line_data(sigma: float = 0.05, seed: int = 0):
-    noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
-    return measured((design(COUNT) @ TRUTH)[:, None] + sigma * noise, sigma)
-
-
-def line_fit(seed: int = 0) -> Fit:
-    return fit(LINE, line_data(seed=seed), transport=line, starts=2)
 
 
 @pytest.fixture(scope="module")
@@ -209,9 +196,9 @@ import sys, time
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-import tests.fits.inference.test_posterior as this
 from fits.inference.posterior import sample
-result = this.line_fit()
+from tests.helpers.models import line_fit
+result = line_fit()
 print("ready", flush=True)
 posterior = sample(result, walkers=16, seed=1, path=sys.argv[1], progress=lambda *a: time.sleep(0.02))
 np.save(sys.argv[2], posterior.chain)

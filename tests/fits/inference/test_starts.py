@@ -12,8 +12,7 @@ from fits.inference.optimise import fit
 from fits.inference.starts import WORTH
 from fits.problem.problem import Problem
 from fits.problem.stack_file import read_problem
-from tests.fits.inference.test_optimise import LOBE_STACK, noisy_lobe
-from tests.helpers.models import LOBE, directions, lobe, measured
+from tests.helpers.models import LOBE, LOBE_STACK, directions, lobe, measured, noisy_lobe
 from tests.helpers.places import EXAMPLES
 
 COATINGS = EXAMPLES / "arizona_black_coatings"

@@ -14,8 +14,8 @@ from fits.inference.posterior import load, sample
 from fits.inference.starts import start_points
 from fits.inference.starts_file import End, StartsFile
 from fits.reporting.results import load_fit, save_fit
-from tests.fits.cli.test_interrupted import largest_file
-from tests.fits.inference.test_posterior import line_fit
+from tests.helpers.files import largest_file
+from tests.helpers.models import line_fit
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from layerjax.surfaces.vmf_diffuse.coefficients import first_order, second_order
 from layerjax.surfaces.vmf_diffuse.flakes import areas, concentration
 from layerjax.surfaces.vmf_diffuse.paper import scattering_orders
 from tests.helpers.cases import haze
-from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
+from tests.helpers.derivatives import with_slopes
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 
 POINTS = 8_000
 
@@ -165,7 +166,7 @@ def test_approach_to_full_roughness():
     # from 0.1104 to 0.1012 between r = 0.99 and 1: the logarithm of 1 - r
     r = jnp.array([0.99, 0.999, 0.9999, 1 - 1e-6, 1.0])
     up = tuple(jnp.full(5, x) for x in (0.0, 0.0, 1.0))
-    f1, _, _ = jax.vmap(scattering_orders)(up, up, r)
+    f1, _, _ = jax.jit(jax.vmap(scattering_orders))(up, up, r)
     np.testing.assert_allclose(f1, [0.110439, 0.105899, 0.103995, 0.102514, 0.101227], atol=5e-7)
 
 
@@ -204,8 +205,7 @@ def value(parameters, wi, wo, form="paper"):
 )
 def test_values_and_gradients_are_finite(dtype, mode):
     where = jax.tree.map(lambda x: x.astype(dtype), draw(3))
-    derivative = jax.grad if mode == "reverse" else jax.jacfwd
-    found, gradients = jax.jit(jax.vmap(lambda *x: (value(*x), derivative(value, (0, 1, 2))(*x))))(*where)
+    found, gradients = jax.jit(jax.vmap(with_slopes(value, (0, 1, 2), mode)))(*where)
     assert found.dtype == dtype
     for leaf in (found, *jax.tree.leaves(gradients)):
         assert np.isfinite(leaf).all()

@@ -10,8 +10,8 @@ import layerjax as lj
 from benchmarks.measuring.operations import count
 from layerjax.tables import load
 from layerjax.transport.spongecake.layers import pair_of
-from tests.layerjax.test_box import POINTS, draw
-from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
+from tests.helpers.box import POINTS, draw
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 
 FLAKES = lj.Medium(2.0, [0.95, 0.8, 0.4], lj.SGGX("surface", 0.4, (0.3, 0.1, 0.9)), f0=0.6)
 FIBERS = lj.Medium(1.5, 0.9, lj.SGGX("fiber", 0.3, (1.0, 0.2, 0.0)))

@@ -9,11 +9,12 @@ import layerjax as lj
 from benchmarks.measuring.operations import count
 from benchmarks.peers import endf_walk as endf_truth
 from layerjax.transport.endf.chains import Coat, LowerSide, Options, UpperSide, reflections
-from tests.layerjax.test_samplers import DRAWS, SIGNIFICANCE, chi_square
+from tests.helpers.endf import OUTSIDE, PAPER, RECIPROCAL
+from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square
 
-RECIPROCAL, PAPER, SURFACE = lj.ENDF(), lj.ENDF(form="paper"), lj.ENDF(bounces=0)
+SURFACE = lj.ENDF(bounces=0)
 MIRROR = 0.01, 20.0  # reflects all but 1e-4
-GLAZE, OUTSIDE = lj.Medium([0.1, 0.4, 1.0], 0.0), lj.Interface(1.0, 0.4, distribution="vmf")
+GLAZE = lj.Medium([0.1, 0.4, 1.0], 0.0)
 METAL = lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.5, 2.4], 0.25)
 STACKS = {
     "coat": lj.Stack([lj.Interface(1.5, 0.3), GLAZE], METAL),

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from tests.layerjax.transport.endf.test_endf import OUTSIDE, PAPER, RECIPROCAL
+from tests.helpers.derivatives import with_slopes
+from tests.helpers.endf import OUTSIDE, PAPER, RECIPROCAL
 
 POINTS = 10_000
 CLEAR = lj.Medium(1.0, 0.0)  # made outside jit, where the albedo stays a known 0
@@ -63,16 +64,10 @@ def values_and_gradients_are_finite(name, transport, dtype, mode):
     make = BOX[name]
     parameters, wi, wo = jax.tree.map(lambda x: x.astype(dtype), draw(11))
 
-    @jax.jit
-    @jax.vmap
-    def everything(parameters, wi, wo):
-        def value(parameters, wi, wo):
-            return jnp.sum(lj.evaluate(make(parameters), wi, wo, transport))
+    def total(parameters, wi, wo):
+        return jnp.sum(lj.evaluate(make(parameters), wi, wo, transport))
 
-        derivative = jax.grad if mode == "reverse" else jax.jacfwd
-        return value(parameters, wi, wo), derivative(value, (0, 1, 2))(parameters, wi, wo)
-
-    value, gradients = everything(parameters, wi, wo)
+    value, gradients = jax.jit(jax.vmap(with_slopes(total, (0, 1, 2), mode)))(parameters, wi, wo)
     assert value.dtype == dtype
     assert (value >= 0).all()
     for leaf in jax.tree.leaves((value, gradients)):

@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.transport.statistical.lobes import Options, lobe_roughness, statistics
-from tests.layerjax.test_samplers import chi_square
+from tests.helpers.sampling import chi_square
 
 ANGLES = np.radians([0.0, 30.0, 60.0, 75.0])
 LIGHT = np.asarray(lj.direction(ANGLES, np.zeros(4)))
