@@ -35,6 +35,11 @@ CASES = {
 }
 
 
+def rounded(stack):
+    """Parameters that single precision has too: both precisions are asked for the same material."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), stack)
+
+
 DRAWN = {
     "SingleScattering": "haze over metal",
     "SpongeCake": "fibers",
@@ -48,7 +53,7 @@ WALKED = ("haze over metal", "fibers", "varnish, vmf", "plate")
 
 def numbers(name, kind, dtype):
     """Values of the first channel at eight pairs, and the gradient of the sum of v / (1 + v) by all parameters."""
-    stack, transport = STACKS[kind], CASES[name][0]
+    stack, transport = rounded(STACKS[kind]), CASES[name][0]
     start, build = vector_and_build(stack, asked_to_be_known(name, kind))
     wi, wo = (w.astype(dtype) for w in pairs(stack))
 
@@ -66,7 +71,7 @@ def numbers(name, kind, dtype):
 
 def drawn(name, kind, dtype):
     """Directions drawn, their densities and weights, and the albedo."""
-    stack, transport = STACKS[kind], CASES[name][0]
+    stack, transport = rounded(STACKS[kind]), CASES[name][0]
     wi = pairs(stack)[0].astype(dtype)
     return *lj.sample(stack, wi, jax.random.key(5), transport), *lj.albedo(stack, wi[:1], transport, nodes=8)
 
@@ -75,7 +80,7 @@ def walked(kind, dtype):
     """Values of the random walk, and their errors."""
     wi, wo = (w.astype(dtype) for w in pairs(STACKS[kind]))
     walk = lj.RandomWalk(paths=1 << 10)
-    return lj.evaluate_with_error(STACKS[kind], wi, wo, walk, key=jax.random.key(3))
+    return lj.evaluate_with_error(rounded(STACKS[kind]), wi, wo, walk, key=jax.random.key(3))
 
 
 ALL = {f"{name}: {kind}": partial(numbers, name, kind) for name, (_, kinds) in CASES.items() for kind in kinds}

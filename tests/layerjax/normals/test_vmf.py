@@ -11,7 +11,7 @@ from layerjax.normals import vmf
 # compiled whole: outside `jit` every operation is a program of its own
 resultant, convolved, concentration_of = (jax.jit(f) for f in (vmf.resultant, vmf.convolved, vmf.concentration_of))
 projected_area, masking = (jax.jit(f, static_argnums=2) for f in (vmf.projected_area, vmf.masking))
-hemisphere_norm, facet_sample, facet_density = map(
+hemisphere_norm, hemisphere_sample, hemisphere_density = map(
     jax.jit, (vmf.hemisphere_norm, vmf.hemisphere_sample, vmf.hemisphere_density)
 )
 
