@@ -54,7 +54,7 @@ from layerjax import gallery
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
 _BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.VMFDiffuse, lj.Conductor)}
-_PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.SGGX)}
+_PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.Rayleigh, lj.SGGX)}
 _TRANSPORTS: _Kinds = {
     name: kind
     for name, kind in vars(lj).items()
@@ -281,7 +281,7 @@ def _to_plain(value: Any) -> Any:
         return {key: entry for key, entry in table.items() if value.prior != Uniform() or key != "prior"}
     if isinstance(value, str | bool | int):
         return value
-    if isinstance(value, lj.HenyeyGreenstein | lj.SGGX | Prior):
+    if isinstance(value, lj.PhaseFunction | Prior):
         return _module_to_dict(value)
     array = np.asarray(value)
     if array.dtype.kind == "i":

@@ -216,6 +216,9 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
         raise header.error(
             f"columns {', '.join(columns.values())}: one without a channel name cannot stand beside others"
         )
+    for channel, column in columns.items():
+        if _kind_and_channel(f"brdf_{channel}")[1] != channel:  # nothing that is saved later would be read back
+            raise header.error(f"no channel may be called {channel!r}; products with the cosine are brdf_cos", column)
     return kinds[0], columns
 
 

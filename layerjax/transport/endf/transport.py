@@ -2,7 +2,7 @@
 
 What a beam becomes that is refracted, reflected and refracted again at rough surfaces is one microfacet lobe of wider
 normals, which follow from the roughnesses in closed form: see `layerjax.transport.endf.warping` for one event,
-`endf_chains` for the coat, `endf_slab` for light that passes, and `endf_drawing` for the sampler.
+`chains` for the coat, `slab` for light that passes, and `drawing` for the sampler.
 """
 
 from collections.abc import Sequence

@@ -158,6 +158,7 @@ GOOD = "10,180,20,0,0.5\n"
             HEADER + ",brdf_red\n10,180,20,0,1,1\n",
             "columns brdf, brdf_red: one without a channel name cannot stand beside others",
         ),
+        ("theta_i,theta_o,brf_cos\n10,20,1\n", "column 'brf_cos': no channel may be called 'cos'; products with the"),
         (HEADER + "\n" + GOOD + "10,180,20,0,abc\n", "line 3, column 'brdf': 'abc' is not a number, must be a finite"),
         (HEADER + "\n# x\n\n10,180,20,0,\n", "line 4, column 'brdf': '' is not a number"),
         (HEADER + "\n10,180,20,0,nan\n", "line 2, column 'brdf': nan is not allowed, must be a finite number"),

@@ -117,6 +117,7 @@ def test_options_of_a_transport(tmp_path):
     [
         lj.Stack([], base=lj.Conductor(ior=[0.2, 0.9, 1.1], k=3.9, alpha=0.1)),
         lj.Stack([], base=lj.VMFDiffuse(Free(0.4, 0.0, [0.8, 0.9, 1.0]), Free(0.3, 0.0, 1.0), form="transport")),
+        lj.Stack([lj.Medium(thickness=Free(0.2, 0.0, 2.0), phase=lj.Rayleigh())]),
         lj.Stack([lj.Medium(thickness=1 / 3, phase=lj.HenyeyGreenstein(g=Free(0.1, -0.9, 0.9)), f0=0.04)]),
         lj.Stack(
             [lj.Medium(thickness=Free(1.0, 0.1, 10.0, LogUniform()))], base=lj.OrenNayar(0.5, 0.3, form="classic")
