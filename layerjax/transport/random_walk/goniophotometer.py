@@ -18,7 +18,7 @@ from layerjax._parameters import in_precision
 from layerjax.directions import read_directions, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, channel_count, require_numbers, simplify
-from layerjax.transport.random_walk.lanes import follow, quotas, standard_error, upright
+from layerjax.transport.random_walk.lanes import Record, follow, quotas, standard_error, upright
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -115,23 +115,7 @@ def _measure(
     scene = Scene(stack, channels, dtype)
     words = key_words(key)
     bins = 2 * polar * azimuth
-    owed = quotas(paths, lanes)
-
-    def record(result: Any, step: Step, owes: Array) -> Any:
-        by_direction, by_order = result
-        counted = step.escapes & owes
-        x, y, z = step.direction
-        side = (z < 0).astype(jnp.int32)
-        ring = jnp.minimum((jnp.abs(z) * polar).astype(jnp.int32), polar - 1)
-        turn = jnp.arctan2(y, x) / (2.0 * jnp.pi)
-        sector = jnp.minimum((jnp.where(turn < 0, turn + 1.0, turn) * azimuth).astype(jnp.int32), azimuth - 1)
-        assert step.order is not None
-        order = jnp.minimum(step.order, orders)
-        rows = jnp.stack([value for w in step.weight for value in (w, w * w)], axis=-1)
-        # what is not counted falls outside, and is dropped; so does light without an event, among the directions
-        cell = jnp.where(counted & (order > 0), (side * polar + ring) * azimuth + sector, bins)
-        slot = jnp.where(counted, side * (orders + 1) + order, 2 * (orders + 1))
-        return by_direction.at[cell].add(rows, mode="drop"), by_order.at[slot].add(rows, mode="drop")
+    owed, record = quotas(paths, lanes), _recorder(polar, azimuth, orders)
 
     def one(question: tuple[Array, Array]) -> tuple[Array, Array]:
         index, direction = question
@@ -164,3 +148,26 @@ def _measure(
     cosines = jnp.linspace(0.0, 1.0, polar + 1, dtype=dtype)
     azimuths = jnp.linspace(0.0, 2.0 * jnp.pi, azimuth + 1, dtype=dtype)
     return Goniogram(*energy, *by_order, *albedo, *straight, cosines, azimuths)
+
+
+def _recorder(polar: int, azimuth: int, orders: int) -> Record:
+    """What adds light that leaves to sums of it and of its square, by direction and by number of events."""
+    bins = 2 * polar * azimuth
+
+    def record(result: Any, step: Step, owes: Array) -> Any:
+        by_direction, by_order = result
+        counted = step.escapes & owes
+        x, y, z = step.direction
+        side = (z < 0).astype(jnp.int32)
+        ring = jnp.minimum((jnp.abs(z) * polar).astype(jnp.int32), polar - 1)
+        turn = jnp.arctan2(y, x) / (2.0 * jnp.pi)
+        sector = jnp.minimum((jnp.where(turn < 0, turn + 1.0, turn) * azimuth).astype(jnp.int32), azimuth - 1)
+        assert step.order is not None
+        order = jnp.minimum(step.order, orders)
+        rows = jnp.stack([value for w in step.weight for value in (w, w * w)], axis=-1)
+        # what is not counted falls outside, and is dropped; so does light without an event, among the directions
+        cell = jnp.where(counted & (order > 0), (side * polar + ring) * azimuth + sector, bins)
+        slot = jnp.where(counted, side * (orders + 1) + order, 2 * (orders + 1))
+        return by_direction.at[cell].add(rows, mode="drop"), by_order.at[slot].add(rows, mode="drop")
+
+    return record
