@@ -11,6 +11,8 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
+from fits.cli.interrupts import raised_again
+
 OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
 FORMATS = ("csv", "merl", "zemax", "fred")
@@ -20,10 +22,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; bad usage leaves through `SystemExit` as argparse does."""
     arguments = build_parser().parse_args(argv)
 
-    from fits.cli import commands
-
     try:
-        code = int(getattr(commands, arguments.command)(arguments))
+        from fits.cli import commands
+
+        with raised_again():
+            code = int(getattr(commands, arguments.command)(arguments))
         sys.stdout.flush()  # here, where a full disk or a reader that has gone can still be told
         return code
     except KeyboardInterrupt as interrupt:

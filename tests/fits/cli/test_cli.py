@@ -1,16 +1,19 @@
 """The `layerjax` command: bad input is one line and exit code 2 with nothing written; good input does the work."""
 
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fits.cli.interrupts import raised_again
 from fits.cli.parser import main
 from fits.data.formats import read
 from fits.data.measurements import Measurements
@@ -271,6 +274,25 @@ def test_help_imports_no_jax() -> None:
     assert "simulate" in done.stdout
 
 
+def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
+    def dropped(phase: str, info: dict[str, int]) -> None:
+        gc.callbacks.remove(dropped)
+        raise KeyboardInterrupt
+
+    def collect_and_wait() -> None:
+        gc.callbacks.append(dropped)
+        with raised_again():
+            gc.collect()
+            time.sleep(30)
+
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            collect_and_wait()
+    finally:
+        signal.signal(signal.SIGINT, ours)
+
+
 def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Path, coat_fit: Fit) -> None:
     before = contents(work)
     command = [sys.executable, "-m", "fits.cli", "fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
@@ -283,7 +305,10 @@ def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Pat
     assert process.stderr is not None
     first = process.stderr.readline()
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    try:
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert first.startswith("layerjax: fit ")
     assert process.returncode == 130
     assert error.splitlines()[-1] == (
