@@ -13,7 +13,7 @@ os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 
 import jax  # noqa: E402 (the flags must be set before)
 
-pytest_plugins = ["tests.helpers.compilations"]
+pytest_plugins = ["tests.helpers.compilations", "tests.helpers.memory"]
 
 jax.config.update("jax_enable_x64", True)
 if not jax.config.jax_compilation_cache_dir:  # JAX_COMPILATION_CACHE_DIR names another
