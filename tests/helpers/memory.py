@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-MOST = 3e9
+MOST = 6e9
 """Bytes that a process may hold before it forgets its programs."""
 
 
