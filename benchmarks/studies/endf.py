@@ -13,7 +13,7 @@ from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, table, write
 from benchmarks.peers import endf_walk as endf_truth
 from layerjax.normals.vmf import concentration_of, sphere_density
-from layerjax.transport.endf import warping as warping
+from layerjax.transport.endf import warping
 from layerjax.transport.endf.chains import Form
 
 PATHS, QUICK_PATHS = 1_000_000, 100_000

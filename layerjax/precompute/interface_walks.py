@@ -64,7 +64,8 @@ def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, pa
         height = next_height(travel, height, alpha, -jnp.log1p(-u4 * staying))
         height = jnp.where(height > 1e-30, height, 1e-30)
         wi = scale(-1.0, travel)
-        (m, at_facet), n = meet_facet(wi, alpha, u1, u2), jnp.where(far, 1.0 / ior, ior)
+        m, at_facet = meet_facet(wi, alpha, u1, u2)
+        n = jnp.where(far, 1.0 / ior, ior)
         refracted, below, exists = pass_through(wi, m, n, height)
         reflectance = jnp.where(exists, fresnel.dielectric(at_facet, n), 1.0)
         ways: list[tuple[Vector, Array, Array]] = [

@@ -26,7 +26,7 @@ from benchmarks.studies.spongecake.tables import Errors, Figure, Findings, Fitte
 from layerjax.normals.sggx import Kind
 from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import data as materials
-from layerjax.precompute.spongecake import training as training
+from layerjax.precompute.spongecake import training
 from layerjax.precompute.spongecake.maker import PLANS, SEED
 from layerjax.precompute.spongecake.training import ENERGY, Parts
 

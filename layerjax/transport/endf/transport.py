@@ -21,7 +21,7 @@ from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
 from layerjax.transport.contract import DeterministicTransport, Side
-from layerjax.transport.endf import drawing as drawing
+from layerjax.transport.endf import drawing
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
 

@@ -14,7 +14,7 @@ from jax import Array
 
 from layerjax.channels import Channels, pick
 from layerjax.directions import Vector, scale, select
-from layerjax.transport.random_walk import surfaces as surfaces
+from layerjax.transport.random_walk import surfaces
 from layerjax.transport.random_walk.scene import Scene, choose
 from layerjax.transport.random_walk.state import Aim, Arrival, Event, PathState, Target, weights
 

@@ -22,8 +22,7 @@ from jax import Array
 from layerjax.channels import Channels, largest, pick
 from layerjax.directions import Vector, scale, select
 from layerjax.microsurface import Microfacets
-from layerjax.transport.random_walk import microsurface as microsurface
-from layerjax.transport.random_walk import surfaces as surfaces
+from layerjax.transport.random_walk import microsurface, surfaces
 from layerjax.transport.random_walk.flight import boundary, fly
 from layerjax.transport.random_walk.next_event import (
     contribution,

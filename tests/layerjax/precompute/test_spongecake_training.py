@@ -10,10 +10,8 @@ import pytest
 
 import layerjax as lj
 from layerjax.precompute.learning import Schedule
-from layerjax.precompute.spongecake import bending as bending
-from layerjax.precompute.spongecake import data as data
+from layerjax.precompute.spongecake import bending, data, training
 from layerjax.precompute.spongecake import maker as spongecake
-from layerjax.precompute.spongecake import training as training
 from layerjax.tables import load
 from layerjax.transport.spongecake.lobes import evaluate_second, second_lobe
 from layerjax.transport.spongecake.mapping import network, pack, unpack

@@ -9,7 +9,7 @@ from benchmarks.peers import endf_walk as endf_truth
 from layerjax import fresnel
 from layerjax.directions import direction, frame, join, normalize, reflect, refract, split
 from layerjax.normals import vmf
-from layerjax.transport.endf import warping as warping
+from layerjax.transport.endf import warping
 from layerjax.transport.endf.chains import LowerSide, UpperSide, chain_concentration, inner_concentration
 from layerjax.transport.endf.slab import inner_slab_concentration, slab_concentration
 
