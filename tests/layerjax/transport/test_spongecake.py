@@ -24,11 +24,14 @@ STACKS = {
     "flakes over fibers": lj.Stack([FLAKES, FIBERS]),
 }
 CAKE, FIRST, TRUTH = lj.SpongeCake(), lj.SingleScattering(), lj.AddingDoubling()
+PAIRS = 600
+"""Of directions, as many wherever it does not matter how many: a program serves every test of a stack."""
+
 OFF = {1: 0.02, 2: 0.06}
 """By how much albedos of lossless slabs are off for 5 in 100 materials never seen, as SpongeCake's docstring has it."""
 
 
-def pairs(n=400, seed=3):
+def pairs(n=PAIRS, seed=3):
     random = np.random.default_rng(seed)
     theta, phi = np.arccos(random.uniform(-1, 1, (2, n))), random.uniform(-np.pi, np.pi, (2, n))
     return lj.direction(theta[0], phi[0]), lj.direction(theta[1], phi[1])
@@ -82,7 +85,7 @@ def test_white_where_nothing_absorbs(name):
     for light in (lj.direction(theta, 0.4), lj.direction(np.pi - theta, 2.0)):
         energy = sum(lj.albedo(white, light, CAKE, nodes=16)) + lj.unscattered(white, light)
         np.testing.assert_allclose(energy, 1.0, atol=OFF[len(medium)])
-    wi, wo = pairs(50)
+    wi, wo = pairs()
     np.testing.assert_allclose(lj.evaluate(white, wi, wo, CAKE), lj.evaluate(white, wo, wi, CAKE), rtol=1e-10)
     ready = lj.prepare(lj.Stack([lj.Medium(m.thickness, 0.2, m.phase) for m in medium]), CAKE)
     lobes = eqx.tree_at(lambda ready: ready.state.second.bend, ready, None)
@@ -91,9 +94,9 @@ def test_white_where_nothing_absorbs(name):
 
 def test_upright_axes_are_no_axes():
     """Terms that turn with an axis vanish with its tilt: 1e-9 is its sine."""
-    wi, wo = pairs(50)
+    wi, wo = pairs()
     level, upright, tilted = (
-        lj.evaluate(lj.Stack([lj.Medium(2.0, 1.0, lj.SGGX("fiber", 0.3, axis)), HAZE]), wi, wo, CAKE)
+        lj.evaluate(lj.Stack([lj.Medium(2.0, 0.9, lj.SGGX("fiber", 0.3, axis)), HAZE]), wi, wo, CAKE)
         for axis in (None, np.array([0.0, 0.0, 1.0]), np.array([1e-9, 0.0, 1.0]))
     )
     np.testing.assert_allclose(upright, level, rtol=1e-10)
@@ -131,8 +134,8 @@ def test_error_is_what_the_tables_say(name):
     """Within the 95th percentile of the held-out materials of the record, and well below the first order alone."""
     record = load("spongecake")[f"{len(STACKS[name].layers)}-error"]
     random = np.random.default_rng(1)
-    cosines = np.sqrt(random.uniform(0.01, 1.0, (2, 600))) * [[1.0], [1.0]]
-    theta, phi = np.arccos(cosines * np.where(np.arange(600) % 2, 1, [[1], [-1]])), random.uniform(0, 6.3, (2, 600))
+    cosines = np.sqrt(random.uniform(0.01, 1.0, (2, PAIRS)))
+    theta, phi = np.arccos(cosines * np.where(np.arange(PAIRS) % 2, 1, [[1], [-1]])), random.uniform(0, 6.3, (2, PAIRS))
     wi, wo = lj.direction(theta[0], phi[0]), lj.direction(theta[1], phi[1])
     values, truth, first = (np.asarray(lj.evaluate(STACKS[name], wi, wo, how)) for how in (CAKE, TRUTH, FIRST))
 
@@ -154,7 +157,8 @@ def test_samples(name, theta, proposal):
     assert probability > SIGNIFICANCE
     np.testing.assert_allclose(total, 1.0, atol=4e-3)
     mean, error = np.mean(weight, axis=0), np.std(weight, axis=0) / np.sqrt(DRAWS)
-    np.testing.assert_array_less(np.abs(mean - sum(lj.albedo(stack, wi, how))), 4.5 * error + 3e-3)
+    # the albedo is the same however it is sampled
+    np.testing.assert_array_less(np.abs(mean - sum(lj.albedo(stack, wi, CAKE))), 4.5 * error + 3e-3)
 
 
 BOXES = {
