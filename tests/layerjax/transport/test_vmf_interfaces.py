@@ -330,14 +330,17 @@ def test_references_are_finite_over_the_box(dtype):
                 assert np.isfinite(leaf).all(), (ior, kappas)
 
 
-def test_reverse_mode_of_a_varnish():
+@pytest.mark.parametrize(
+    "transport", [lj.AddingDoubling(nodes=8, modes=8), pytest.param("auto", marks=pytest.mark.slow)], ids=["8", "auto"]
+)
+def test_reverse_mode_of_a_varnish(transport):
     """Against central differences: half of their step changes them by less than 1e-4."""
 
     @jax.jit
     def both(x, wi, wo):
         def value(x):
             stack = lj.Stack([lj.Interface(x[0], x[1], "vmf")], lj.Lambertian(0.5))
-            return lj.evaluate(stack, wi, wo)[0]
+            return lj.evaluate(stack, wi, wo, transport)[0]
 
         return jax.value_and_grad(value)(x)
 
