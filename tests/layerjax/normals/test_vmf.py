@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 from layerjax.normals import vmf
+from tests.helpers.derivatives import with_slopes
 
 # compiled whole: outside `jit` every operation is a program of its own
 resultant, convolved, concentration_of = (jax.jit(f) for f in (vmf.resultant, vmf.convolved, vmf.concentration_of))
@@ -135,7 +136,7 @@ def test_gradients_are_finite_and_right(dtype):
         found = (vmf.masking(c, k), vmf.masking(c, k, "paper"), sum(vmf.hemisphere_sample(k, 0.999999 * c, c)))
         return jnp.stack([*found, vmf.projected_area(c, k), vmf.hemisphere_norm(k), vmf.concentration_of(*turned)])
 
-    value, slopes = jax.jit(jax.vmap(lambda c, k: (values(c, k), jax.jacfwd(values, (0, 1))(c, k))))(cosine, kappa)
+    value, slopes = jax.jit(jax.vmap(with_slopes(values, (0, 1), "forward")))(cosine, kappa)
     for index, name in enumerate(names):
         assert np.isfinite(value[:, index]).all(), name
         assert all(np.isfinite(slope[:, index]).all() for slope in slopes), name

@@ -112,8 +112,9 @@ def solved(request):
 
 def test_agrees_with_the_walk(solved):
     stack, prepared = solved
-    wi, wo = (directions(10, stack.base is None, seed) for seed in (1, 2))
-    values = lj.evaluate(prepared, wi, wo)
+    wi, wo = (directions(60, stack.base is None, seed) for seed in (1, 2))  # of one shape in all tests
+    values = lj.evaluate(prepared, wi, wo)[:10]
+    wi, wo = wi[:10], wo[:10]
     walked, errors = lj.evaluate_with_error(stack, wi, wo, lj.RandomWalk(paths=8192), key=jax.random.key(3))
     # ordinates at their default leave 1 % of a typical value
     allowed = np.maximum(4 * errors, 0.01 * np.maximum(walked, jnp.mean(walked)))

@@ -7,6 +7,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.transport.statistical.lobes import Options, statistics
+from tests.helpers.derivatives import with_slopes
 
 INTERFACES, COUNT = 10, 24
 BASES = {
@@ -75,7 +76,7 @@ def test_energies_of_smooth_interfaces(dtype):
 
     axes = np.meshgrid([0.25, 0.6, 0.8, 1.0, 4.0], [0.25, 1.0, 1.5], [0.01, 0.8, 1.0], [0.0, 20.0])
     p = jnp.asarray(np.stack(axes, -1).reshape(-1, 4), dtype)
-    values, slopes = jax.jit(jax.vmap(lambda q: (energies(q), jax.jacfwd(energies)(q))))(p)
+    values, slopes = jax.jit(jax.vmap(with_slopes(energies, 0, "forward")))(p)
     assert values.dtype == dtype
     assert jnp.all(jnp.isfinite(values) & (values >= 0) & (values <= 1 + 1e-6))
     assert jnp.all(jnp.isfinite(slopes))
