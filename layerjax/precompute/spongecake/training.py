@@ -1,7 +1,7 @@
 """Teaches the networks of `layerjax.transport.spongecake.mapping` what `layerjax.precompute.spongecake.data` holds.
 
-Media of all kinds are trained together, so their kind is a number here, and the lobes are written out once more for
-that; a test holds them against those of the transport.
+Media of all kinds are trained together, so their kind is a number here: the lobes are those of the transport, of a
+phase function that picks its kind by that number.
 
 Loss of a material: the relative L2 error of its BSDF, first order included (weighted with both cosines; all sides
 together, and half of each side by itself), a fifth of that of its multiple scattering alone, and `ENERGY` times the
@@ -12,7 +12,7 @@ the materials, so that a channel may differ from it.
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -21,9 +21,16 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from layerjax.channels import Channels
+from layerjax.directions import Vector, split
+from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.precompute.learning import Schedule, learn
 from layerjax.precompute.spongecake.data import KINDS, Layers, Samples
-from layerjax.transport.spongecake.mapping import Numbers, Shape, Weights, network, shape_of, weights_of
+from layerjax.stack import Medium
+from layerjax.transport.contract import Side
+from layerjax.transport.single_scattering import Media, SingleScattering
+from layerjax.transport.spongecake.lobes import BlurredSGGX, SecondLobe, evaluate_second
+from layerjax.transport.spongecake.mapping import Numbers, Weights, network, shape_of, weights_of
 
 HG = KINDS.index("hg")
 ENERGY = 0.5
@@ -124,8 +131,9 @@ def predict(
         weights = weights._replace(slopes=jnp.zeros_like(weights.slopes), rims=jnp.zeros_like(weights.rims))
     if not parts.apart:  # those of reflection above for all
         weights = Weights(*(jnp.broadcast_to(part[:1], part.shape) for part in weights))
-    sides = sides_of(len(media.thickness))
-    return jnp.stack([_second(media, shape, weights, side, wi[n], wo[n]) for n, side in enumerate(sides)])
+    slab = _slab(media, shape.alpha, shape.thickness, shape.blur, jnp.ones_like(media.albedo), None)
+    second = SecondLobe(slab, jax.tree.map(lambda part: part[None], weights))
+    return _values(lambda wi, wo, side: evaluate_second(second, wi, wo, side, False), len(slab.media), wi, wo)
 
 
 def errors(net: eqx.nn.MLP, batch: Batch, parts: Parts = ALL_PARTS) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -192,71 +200,62 @@ def _means(random: np.random.Generator, media: Numbers) -> tuple[Array, Array]:
     return jnp.asarray(albedo, jnp.float32), jnp.asarray(f0, jnp.float32)
 
 
+class PhaseOfKind(PhaseFunction):
+    """Any of `KINDS`, by a number. kind: 1 at its place, 0 elsewhere. alpha: roughness, or g; blur: see `BlurredSGGX`.
+
+    Its kernel is all that lobes need: nothing is drawn from it.
+    """
+
+    uses_half_vector: ClassVar[bool] = True
+
+    kind: Array
+    alpha: Array
+    axis: Array
+    blur: Array
+
+    def cross_section(self, w: Vector) -> Array:
+        return self._chosen([phase.cross_section(w) for phase in self._phases()])
+
+    def kernel(self, wi: Vector, wo: Vector, h: Vector | None) -> Array:
+        return self._chosen([phase.kernel(wi, wo, h) for phase in self._phases()])
+
+    def pdf(self, wi: Vector, wo: Vector) -> Array:
+        return self.kernel(wi, wo, None) / self.cross_section(wi)
+
+    def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
+        raise NotImplementedError
+
+    def _phases(self) -> list[PhaseFunction]:
+        """In the order of `KINDS`; those that are not chosen are isotropic, and finite with their derivatives."""
+        hg = self.kind[HG] > 0
+        width, g = jnp.where(hg, 1.0, self.alpha), jnp.where(hg, self.alpha, 0.0)
+        flakes = (BlurredSGGX(kind, width, self.axis, self.blur) for kind in ("surface", "fiber"))
+        return [*flakes, HenyeyGreenstein(g)]
+
+    def _chosen(self, values: list[Array]) -> Array:
+        return functools.reduce(lambda other, k: jnp.where(self.kind[k] > 0, values[k], other), range(HG), values[HG])
+
+
 def _first(media: Numbers, wi: Array, wo: Array) -> Array:
     """Single scattering of one material, (s, i, o)."""
-    kind_alpha = jnp.where(media.kind[:, HG] > 0, media.g, media.alpha)
-    shape = Shape(kind_alpha, media.thickness, jnp.zeros_like(media.thickness))
-    strength = media.albedo[:, None] * jnp.stack([media.f0, 1.0 - media.f0], -1)
-    weights = Weights(jnp.stack([strength] * 3), jnp.zeros(3), *[jnp.zeros((2, 2))] * 2)
-    sides = sides_of(len(media.thickness))
-    return jnp.stack([_second(media, shape, weights, side, wi[n], wo[n]) for n, side in enumerate(sides)])
+    alpha = jnp.where(media.kind[:, HG] > 0, media.g, media.alpha)
+    slab = _slab(media, alpha, media.thickness, jnp.zeros_like(alpha), media.albedo, media.f0)
+    first = SingleScattering()
+    return _values(lambda wi, wo, side: first.evaluate(slab, wi, wo, side), len(slab.media), wi, wo)
 
 
-def _second(media: Numbers, shape: Shape, weights: Weights, side: int, wi: Array, wo: Array) -> Array:
-    """The lobes and the level for one pair of sides; wi (i, 3), wo (i, o, 3)."""
-    wi = jnp.broadcast_to(wi[:, None], wo.shape)
-    ci, co = jnp.abs(wi[..., 2]), jnp.abs(wo[..., 2])
-    total = wi + wo
-    squared = jnp.sum(total * total, -1)
-    schlick = (1.0 - 0.5 * jnp.sqrt(squared + 1e-9)) ** 5
-    depths = [
-        [_area(media, shape, k, w) * shape.thickness[k] / jnp.abs(w[..., 2]) for w in (wi, wo)] for k in _media(media)
-    ]
-    way = int(side == 2)
-    ends = [(weights.slopes[way, end], weights.rims[way, end]) for end in ((0, 0), (1, 1), (0, 1))[side]]
-    value, rim = weights.levels[side], jnp.ones_like(ci)
-    for (slope, steep), cosine in zip(ends, (ci, co), strict=True):
-        value = value * (1.0 + slope * (1.0 - cosine))
-        rim = rim * (1.0 + steep * (1.0 - cosine) ** 4)
-    for k in _media(media):
-        over_i, over_o = (
-            sum((depths[j][which] for j in _media(media) if (j < k if up else j > k)), jnp.zeros_like(ci))
-            for which, up in ((0, side != 1), (1, side == 0))
-        )
-        into, out = depths[k]
-        same, apart = into + out, jnp.abs(into - out)
-        y = jnp.maximum(apart if side == 2 else same, 1e-4)
-        start = jnp.minimum(into, out) if side == 2 else 0.0
-        gain = shape.thickness[k] / (ci * co) * jnp.exp(-start - over_i - over_o) * -jnp.expm1(-y) / y
-        plain, edge = weights.lobes[side, k]
-        value = value + rim * (plain + edge * schlick) * gain * _kernel(media, shape, k, total, squared, wi, wo)
-    return value
+def _slab(media: Numbers, alpha: Array, thickness: Array, blur: Array, albedo: Array, f0: Array | None) -> Media:
+    """Media of the same kinds and axes, with other numbers; f0 None: no Fresnel term."""
+    phases = [PhaseOfKind(*numbers) for numbers in zip(media.kind, alpha, media.axis, blur, strict=True)]
+    levels = [None] * len(phases) if f0 is None else list(f0)
+    return Media(tuple(map(Medium, thickness, albedo, phases, levels)), None)
 
 
-def _media(media: Numbers) -> range:
-    return range(len(media.thickness))
-
-
-def _radii(media: Numbers, shape: Shape, k: int) -> tuple[Array, Array]:
-    kind, alpha = media.kind[k], shape.alpha[k]
-    return 1.0 + kind[0] * (alpha - 1.0), 1.0 + kind[1] * (alpha - 1.0)
-
-
-def _area(media: Numbers, shape: Shape, k: int, w: Array) -> Array:
-    radial, axial = _radii(media, shape, k)
-    along = (w @ media.axis[k]) ** 2
-    return jnp.sqrt(radial**2 * jnp.maximum(1.0 - along, 0.0) + axial**2 * along + 1e-12)
-
-
-def _kernel(media: Numbers, shape: Shape, k: int, total: Array, squared: Array, wi: Array, wo: Array) -> Array:
-    radial, axial = _radii(media, shape, k)
-    along = (total @ media.axis[k]) ** 2
-    blur = shape.blur[k] + 1e-12
-    stretched = jnp.maximum(squared - along, 0.0) / radial**2 + along / axial**2
-    flakes = 0.25 / (jnp.pi * radial**2 * axial * ((stretched + blur) / (squared + blur)) ** 2)
-    g = media.kind[k, HG] * shape.alpha[k]
-    hg = (1.0 - g * g) / (4.0 * jnp.pi * (1.0 + g * g + 2.0 * g * jnp.sum(wi * wo, -1)) ** 1.5)
-    return jnp.where(media.kind[k, HG] > 0, hg, flakes)
+def _values(values: Callable[[Vector, Vector, Side], Channels], media: int, wi: Array, wo: Array) -> Array:
+    """Values of the only channel for each pair of sides, (s, i, o). wi: (s, i, 3). wo: (s, i, o, 3)."""
+    asked: tuple[Side, ...] = ("reflection", "all", "transmission")  # from below there is nothing less than all
+    pairs = [(split(wi[n, :, None]), split(wo[n]), asked[side]) for n, side in enumerate(sides_of(media))]
+    return jnp.stack([values(*pair)[0] for pair in pairs])
 
 
 def _in_parts(work: Callable[..., Any], arguments: tuple[Any, ...], size: int = 256) -> Any:

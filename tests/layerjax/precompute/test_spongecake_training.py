@@ -13,7 +13,7 @@ from layerjax.precompute.learning import Schedule
 from layerjax.precompute.spongecake import bending, data, training
 from layerjax.precompute.spongecake import maker as spongecake
 from layerjax.tables import load
-from layerjax.transport.spongecake.lobes import evaluate_second, second_lobe
+from layerjax.transport.spongecake.lobes import BlurredSGGX, evaluate_second, second_lobe
 from layerjax.transport.spongecake.mapping import network, pack, unpack
 from layerjax.transport.spongecake.transport import networks
 
@@ -26,6 +26,17 @@ def drawn(media, shards=3, seed=1):
     wi, wo = data.draw_directions(random, len(layers.alpha))
     values = 0.05 * random.uniform(size=wo.shape[:-1])
     return data.Samples(layers, *(array.astype(np.float32) for array in (wi, wo, values)))
+
+
+def test_a_kind_by_its_number_is_the_phase_function_itself():
+    axis, alpha, blur = jnp.array([0.36, 0.48, 0.8]), jnp.asarray(0.3), jnp.asarray(0.2)
+    wi, wo = np.random.default_rng(5).normal(size=(2, 3, 200))
+    wi, wo = (tuple(jnp.asarray(w / np.linalg.norm(w, axis=0))) for w in (wi, wo))
+    phases = [BlurredSGGX("surface", alpha, axis, blur), BlurredSGGX("fiber", alpha, axis, blur)]
+    for kind, phase in zip(np.eye(3), [*phases, lj.HenyeyGreenstein(alpha)], strict=True):
+        numbered = training.PhaseOfKind(jnp.asarray(kind), alpha, axis, blur)
+        np.testing.assert_array_equal(numbered.cross_section(wi), phase.cross_section(wi))
+        np.testing.assert_array_equal(numbered.kernel(wi, wo, None), phase.kernel(wi, wo, None))
 
 
 @pytest.mark.parametrize("media", [1, pytest.param(2, marks=pytest.mark.slow)])
