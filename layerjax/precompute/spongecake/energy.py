@@ -92,9 +92,9 @@ def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule:
 
 def _white(medium: Medium) -> Medium:
     """The same without absorption, and with lobes no narrower than any that the networks know."""
-    phase = medium.phase
-    if isinstance(phase, SGGX):
-        phase = SGGX(phase.kind, at_least(jnp.asarray(phase.alpha), LEAST_ALPHA), phase.axis)
+    phase, flakes = medium.phase, medium.phase.flakes
+    if flakes is not None:
+        phase = SGGX(flakes.kind, at_least(jnp.asarray(flakes.alpha), LEAST_ALPHA), flakes.axis)
     white = Medium(medium.thickness, 1.0, phase)
     return eqx.tree_at(lambda m: m.albedo, white, 1.0)  # known: nothing to multiply by
 
@@ -103,8 +103,9 @@ def _azimuth(media: tuple[Medium, ...]) -> Array:
     """Azimuth of the axes, modulo half a turn: what turns with them gives the same wherever they point."""
     across, along = jnp.zeros(()), jnp.zeros(())
     for k, medium in enumerate(media):
-        if isinstance(medium.phase, SGGX) and medium.phase.axis is not None:
-            x, y, _ = medium.phase.axis
+        flakes = medium.phase.flakes
+        if flakes is not None and flakes.axis is not None:
+            x, y, _ = flakes.axis
             share = 0.5**k  # so that two at right angles do not cancel
             across, along = across + share * 2.0 * x * y, along + share * (x * x - y * y)
     return 0.5 * jnp.arctan2(across, along)
