@@ -106,10 +106,12 @@ def evaluate_with_error(
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
     prepared = _prepared(stack, transport, wi.dtype)
-    values, errors = _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate_with_error"))
-    if errors is None:
-        coarser = _coarser(stack, prepared.transport)
-        errors = jnp.abs(values - evaluate(coarser, wi, wo, side=side))
+    key = prepared.transport.needed(key, "evaluate_with_error")
+    other = _compared(stack, prepared.transport)  # refuses before anything is evaluated
+    values, errors = _evaluate(prepared, wi, wo, side, key)
+    if other is not None:
+        errors = jnp.abs(values - evaluate(other, wi, wo, side=side))
+    assert errors is not None
     return values, errors
 
 
@@ -204,16 +206,17 @@ def _check_side(side: Side) -> None:
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
-def _coarser(stack: Stack | Prepared, transport: Transport) -> Prepared:
-    """The stack prepared for the next coarser resolution."""
-    name, coarser = type(transport).__name__, transport.coarser()
-    if coarser is None:
-        raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
+def _compared(stack: Stack | Prepared, transport: Transport) -> Prepared | None:
+    """The stack prepared for the transport that errors are told by; None, if it knows them itself."""
+    other = transport.compared()
+    if other is None:
+        return None
     if isinstance(stack, Prepared):
+        name = type(transport).__name__
         raise ValueError(
             f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
         )
-    return prepare(stack, coarser)
+    return prepare(stack, other)
 
 
 def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:

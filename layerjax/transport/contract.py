@@ -64,6 +64,10 @@ class Transport(eqx.Module):
         """The key; None, if it draws nothing. If one is missing, a ValueError for the public function of that name."""
 
     @abc.abstractmethod
+    def compared(self) -> "Transport | None":
+        """The transport that errors are told by; None, if `measured` knows them. If there is neither, a ValueError."""
+
+    @abc.abstractmethod
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array | None]:
@@ -107,6 +111,13 @@ class DeterministicTransport(Transport):
 
     def needed(self, key: Array | None, function: str) -> None:
         return None
+
+    def compared(self) -> Transport:
+        coarser = self.coarser()
+        if coarser is None:
+            name = type(self).__name__
+            raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
+        return coarser
 
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
@@ -160,6 +171,9 @@ class RandomTransport(Transport):
             name = type(self).__name__
             raise ValueError(f"key: {name} draws random numbers: {function}(..., key=jax.random.key(seed))")
         return key
+
+    def compared(self) -> None:
+        return None
 
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None

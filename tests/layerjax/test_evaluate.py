@@ -1,5 +1,6 @@
 """The public calls: shapes, types, chunks, preparation, compilation."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +11,21 @@ from layerjax._batching import CHUNK_BYTES
 from tests.helpers.cases import tilt3
 
 STACK = lj.Stack(tilt3(), lj.Lambertian([0.2, 0.5, 0.8]))
+
+
 OPEN = lj.Stack(tilt3())
+
+
+class Unevaluated(lj.SingleScattering):
+    """Says when it is asked for values. resolutions: whether it has another one."""
+
+    resolutions: bool = eqx.field(static=True, default=False)
+
+    def coarser(self):
+        return self if self.resolutions else None
+
+    def measured(self, *_):
+        raise AssertionError("evaluated")
 
 
 def directions(count, seed, dtype=np.float64):
@@ -97,6 +112,16 @@ def test_sides_agree_where_they_are_asked_for():
         np.testing.assert_allclose(values, jnp.where(asked, everything, 0.0), rtol=1e-12)
     with pytest.raises(ValueError, match="side: 'up' is not one of"):
         lj.evaluate(OPEN, wi, wo, side="up")
+
+
+def test_errors_are_refused_before_anything_is_evaluated():
+    wi, single, double = lj.direction(0.3, 0.0), Unevaluated(), Unevaluated(resolutions=True)
+    with pytest.raises(ValueError, match="transport: Unevaluated has no resolution to vary and no standard error"):
+        lj.evaluate_with_error(STACK, wi, wi, single)
+    with pytest.raises(ValueError, match=r"stack: Unevaluated .* needs the Stack, not a Prepared"):
+        lj.evaluate_with_error(lj.prepare(STACK, double), wi, wi)
+    with pytest.raises(AssertionError, match="evaluated"):
+        lj.evaluate_with_error(STACK, wi, wi, double)
 
 
 def test_what_is_known_to_be_absent_changes_no_value():
