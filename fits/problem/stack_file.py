@@ -120,8 +120,9 @@ def write_problem(
         force: replace a file that is there.
 
     Raises:
-        ValueError: the file exists and `force` is False.
+        ValueError: the file exists and `force` is False; or a part is of a class of one's own, which no file names.
     """
+    _require_known(stack, transport)
     tables: dict[str, Any] = {}
     if not isinstance(transport, str):
         table = _module_to_dict(transport)
@@ -138,6 +139,22 @@ def write_problem(
     if scale is not None:
         tables["scale"] = _to_plain(scale)
     write_text(path, tomli_w.dumps(tables), force)
+
+
+def _require_known(stack: lj.Stack, transport: lj.Transport | str) -> None:
+    """Refuse what `read_problem` could not make again."""
+    parts: list[tuple[str, Any, _Kinds]] = []
+    for index, layer in enumerate(stack.layers):
+        parts.append((f"layers[{index}]", layer, _LAYERS))
+        if isinstance(layer, lj.Medium):
+            parts.append((f"layers[{index}].phase", layer.phase, _PHASES))
+    if stack.base is not None:
+        parts.append(("base", stack.base, _BASES))
+    if not isinstance(transport, str):
+        parts.append(("transport", transport, _TRANSPORTS))
+    for where, part, kinds in parts:
+        if type(part) not in kinds.values():
+            raise ValueError(f"{where}.kind is {shown(type(part).__name__)}, must be one of {', '.join(kinds)}")
 
 
 def stack_from_dict(tables: Mapping[str, Any]) -> lj.Stack:

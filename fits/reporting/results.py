@@ -65,7 +65,8 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
 
     Raises:
         ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
-            callable, which a file cannot name; or a channel cannot be written (see `write_csv`).
+            callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
+            cannot be written (see `write_csv`).
     """
     with reserved(directory, force), replacing(directory, force) as folder:
         write_fit(fit, folder)

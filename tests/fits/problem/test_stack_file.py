@@ -102,6 +102,38 @@ def test_file_round_trip(tmp_path):
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["again.toml", "problem.toml"]
 
 
+class Ghost(lj.Rayleigh):
+    """A phase function of one's own: a file could name it, but nothing could read it back."""
+
+
+class Painted(lj.Lambertian):
+    """A base of one's own."""
+
+
+class Careful(lj.SingleScattering):
+    """A transport of one's own."""
+
+
+@pytest.mark.parametrize(
+    ("stack", "transport", "message"),
+    [
+        (
+            lj.Stack([lj.Interface(1.5, 0.1), lj.Medium(1.0, phase=Ghost())]),
+            "auto",
+            r"layers\[1\]\.phase\.kind is 'Ghost', must be one of HenyeyGreenstein, Rayleigh, SGGX",
+        ),
+        (lj.Stack([], Painted(0.5)), "auto", r"base\.kind is 'Painted', must be one of Lambertian, "),
+        (lj.Stack([], lj.Lambertian(0.5)), Careful(), r"transport\.kind is 'Careful', must be one of "),
+    ],
+    ids=["phase", "base", "transport"],
+)
+def test_what_could_not_be_read_back_is_not_written(tmp_path, stack, transport, message):
+    path = tmp_path / "problem.toml"
+    with pytest.raises(ValueError, match=message):
+        write_problem(path, stack, transport=transport)
+    assert not path.exists()
+
+
 def test_options_of_a_transport(tmp_path):
     problem = _read(
         tmp_path, "transport = { kind = 'AddingDoubling', nodes = 16, ordinates = [8, 12], tolerance = 0.01 }\n" + BASE
