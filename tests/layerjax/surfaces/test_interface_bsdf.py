@@ -10,8 +10,10 @@ import pytest
 import layerjax as lj
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
+from tests.helpers.interfaces import integrated_energies, pairs
 
 DRAWS = 400_000
+ALPHAS = 10.0 ** np.array([-4, -2.5, -1, 0])
 
 
 def sampled_energies(wi, ior, alpha, seed):
@@ -42,24 +44,6 @@ def sampled_energies(wi, ior, alpha, seed):
     return [(np.mean(x), np.std(x) / np.sqrt(DRAWS)) for x in (reflected, passed)]
 
 
-@jax.jit
-def integrated_energies(wi, ior, alpha):
-    """The same by a fine product rule over both hemispheres, in cos(theta) and azimuth."""
-    x, w = np.polynomial.legendre.leggauss(300)
-    cosine, weight = 0.5 * (x + 1), 0.5 * w
-    phi = 2 * np.pi * (np.arange(600) + 0.5) / 600
-    z = jnp.asarray(cosine)[:, None] + 0 * phi
-    sine = jnp.sqrt(1 - z * z)
-    above = (sine * np.cos(phi), sine * np.sin(phi), z)
-    below = (above[0], above[1], -z)
-    total = weight[:, None] * z * (2 * np.pi / 600)
-    wi = split(wi)
-    return (
-        jnp.sum(interface_reflection(wi, above, ior, alpha) * total),
-        jnp.sum(interface_transmission(wi, below, ior, alpha) * total),
-    )
-
-
 @pytest.mark.parametrize("ior", [1.5, 1 / 1.5, 4.0, 0.25, 1.1])
 def test_energies(ior):
     for theta, alpha in itertools.product((0.0, 0.6, 1.2), (0.3, 0.8)):
@@ -69,26 +53,8 @@ def test_energies(ior):
             assert abs(value - mean) < 4 * error + 2e-4
 
 
-def pairs(count, seed, dtype=np.float64):
-    random = np.random.default_rng(seed)
-
-    def hemisphere():
-        z = random.choice([1.0, 1e-6, 1e-3, 0.3], count) * random.random(count)
-        sine, phi = np.sqrt(1 - z * z), random.choice([0.0, 1.0], count) * random.uniform(-np.pi, np.pi, count)
-        return np.stack([sine * np.cos(phi), sine * np.sin(phi), z])
-
-    wi, wo = hemisphere(), hemisphere()
-    wo[:, ::7] = wi[:, ::7] * np.array([[-1], [-1], [1]])
-    wo[:, 1::7] = wi[:, 1::7]
-    wi[:, 2::31] = np.array([[0], [0], [1]])
-    wo[:, 2::62] = np.array([[0], [0], [1]])
-    ior = random.choice([0.25, 0.67, 1 - 1e-6, 1.0, 1 + 1e-9, 1.001, 1.5, 4.0], count)
-    alpha = 10.0 ** random.choice([-4, -2.5, -1, 0], count)
-    return tuple(wi.astype(dtype)), tuple(wo.astype(dtype)), ior.astype(dtype), alpha.astype(dtype)
-
-
 def test_reciprocity():
-    wi, wo, ior, alpha = pairs(20_000, 3)
+    wi, wo, ior, alpha = pairs(np.random.default_rng(3), 20_000, ALPHAS)
     forth, back = interface_reflection(wi, wo, ior, alpha), interface_reflection(wo, wi, ior, alpha)
     np.testing.assert_allclose(forth, back, rtol=1e-12)
     below = (wo[0], wo[1], -wo[2])
@@ -102,7 +68,7 @@ def test_reciprocity():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_values_and_gradients_are_finite(dtype):
-    wi, wo, ior, alpha = pairs(20_000, 8, dtype)
+    wi, wo, ior, alpha = pairs(np.random.default_rng(8), 20_000, ALPHAS, dtype)
     below = (wo[0], wo[1], -wo[2])
     for function, towards in ((interface_reflection, wo), (interface_transmission, below)):
         one = jax.value_and_grad(function, argnums=(0, 1, 2, 3))

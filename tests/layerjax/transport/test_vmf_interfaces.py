@@ -11,6 +11,7 @@ from fits.problem.stack_file import stack_from_dict, stack_to_dict
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.automatic import automatic
+from tests.helpers.interfaces import integrated_energies, pairs
 from tests.helpers.sampling import chi_square
 from tests.helpers.vmf_walks import Face, coated_energies, mean_and_error
 
@@ -23,6 +24,9 @@ def width(kappa):
     return (2.0 / kappa) ** 0.5
 
 
+ALPHAS = [width(1e8), width(1e4), width(30.0), 1.0, width(1e-2)]
+
+
 def face(ior, kappa):
     return lj.Interface(ior, width(kappa), distribution="vmf")
 
@@ -31,24 +35,10 @@ def metal(kappa, index=MIRROR):
     return lj.Conductor(*index, width(kappa), distribution="vmf")
 
 
-@jax.jit
-def integrated_energies(wi, ior, alpha):
-    """Reflected and transmitted energy, by a fine product rule over both hemispheres, in cos(theta) and azimuth."""
-    x, w = np.polynomial.legendre.leggauss(200)
-    phi = 2 * np.pi * (np.arange(400) + 0.5) / 400
-    z = jnp.asarray(0.5 * (x + 1))[:, None] + 0 * phi
-    sine = jnp.sqrt(1 - z * z)
-    above = (sine * np.cos(phi), sine * np.sin(phi), z)
-    total = 0.5 * w[:, None] * z * (2 * np.pi / 400)
-    reflected = interface_reflection(split(wi), above, ior, alpha, "vmf")
-    passed = interface_transmission(split(wi), (above[0], above[1], -z), ior, alpha, "vmf")
-    return jnp.sum(reflected * total), jnp.sum(passed * total)
-
-
 @pytest.mark.parametrize("ior", [1.5, 1 / 1.5])
 def test_energies_of_an_interface(ior):
     for index, (theta, kappa) in enumerate([(0.0, 20.0), (0.6, 2.0), (1.2, 20.0), (1.2, 0.05), (1.5, 5.0)]):
-        found = integrated_energies(lj.direction(theta, 0.4), jnp.asarray(ior), jnp.asarray(width(kappa)))
+        found = integrated_energies(lj.direction(theta, 0.4), jnp.asarray(ior), jnp.asarray(width(kappa)), "vmf", 200)
         facets = Face(kappa, np.random.default_rng(index))
         w = np.broadcast_to([np.sin(theta), 0.0, np.cos(theta)], (DRAWS, 3))
         truth = [mean_and_error(facets.reflects(w, ior)[1]), mean_and_error(facets.crosses(w, ior)[1])]
@@ -101,7 +91,7 @@ def test_an_interface_is_sampled_as_it_says(ior):
 
     f, density = values(wi, wo)
     weight = jnp.where(leaves & (density > 0), f * jnp.abs(wo[2]) / jnp.where(density > 0, density, 1.0), 0.0)
-    expected = integrated_energies(direction, ior, alpha)
+    expected = integrated_energies(direction, ior, alpha, "vmf", 200)
     for side, value in zip((wo[2] > 0, wo[2] < 0), expected, strict=True):
         x = jnp.where(side, weight, 0.0)
         assert abs(x.mean() - value) < 4.5 * x.std() / np.sqrt(DRAWS) + 1e-4
@@ -111,33 +101,8 @@ def test_an_interface_is_sampled_as_it_says(ior):
     np.testing.assert_allclose(total, np.mean(leaves), atol=5e-3)
 
 
-def pairs(count, seed, dtype=np.float64):
-    random = np.random.default_rng(seed)
-
-    def hemisphere():
-        z = random.choice([1.0, 1e-6, 1e-3, 0.3], count) * random.random(count)
-        sine, phi = np.sqrt(1 - z * z), random.choice([0.0, 1.0], count) * random.uniform(-np.pi, np.pi, count)
-        return np.stack([sine * np.cos(phi), sine * np.sin(phi), z])
-
-    wi, wo = hemisphere(), hemisphere()
-    wo[:, ::7] = wi[:, ::7] * np.array([[-1], [-1], [1]])
-    wo[:, 1::7] = wi[:, 1::7]
-    wi[:, 2::31] = np.array([[0], [0], [1]])
-    wo[:, 2::62] = np.array([[0], [0], [1]])
-    ior = random.choice([0.25, 0.67, 1 - 1e-6, 1.0, 1 + 1e-9, 1.001, 1.5, 4.0], count)
-    alpha = random.choice([width(1e8), width(1e4), width(30.0), 1.0, width(1e-2)], count)
-    u = random.random((3, count))
-    return (
-        tuple(wi.astype(dtype)),
-        tuple(wo.astype(dtype)),
-        ior.astype(dtype),
-        alpha.astype(dtype),
-        tuple(u.astype(dtype)),
-    )
-
-
 def test_reciprocity():
-    wi, wo, ior, alpha, _ = pairs(20_000, 3)
+    wi, wo, ior, alpha = pairs(np.random.default_rng(3), 20_000, ALPHAS)
     forth = interface_reflection(wi, wo, ior, alpha, "vmf")
     np.testing.assert_allclose(forth, interface_reflection(wo, wi, ior, alpha, "vmf"), rtol=1e-12)
     below, turned = (wo[0], wo[1], -wo[2]), (wi[0], wi[1], -wi[2])
@@ -160,7 +125,9 @@ def test_reciprocity():
 )
 def test_values_and_gradients_are_finite(dtype, what):
     """From both sides of the critical angle (ior < 1 is light from inside), kappa from 1e-2 to 1e8."""
-    wi, wo, ior, alpha, u = pairs(10_000, 8, dtype)
+    random = np.random.default_rng(8)
+    wi, wo, ior, alpha = pairs(random, 10_000, ALPHAS, dtype)
+    u = tuple(random.random((3, 10_000)).astype(dtype))
 
     def everything(wi, wo, ior, alpha, u):
         below = (wo[0], wo[1], -wo[2])
