@@ -24,6 +24,13 @@ TRANSPORTS = {
     "Statistical, forward": lj.Statistical(symmetric=False),
     "Statistical, single": lj.Statistical(microfacets="single"),
 }
+SINGLE = 1e-2
+"""Share of a slope that single precision may be off by, beside the rounding of values."""
+
+ILL_CONDITIONED = ("AddingDoubling", "Statistical")
+"""Transports not held against double precision where there is an `Interface`: they balance it on their nodes
+by quotients of energies that nearly cancel. Slopes of `Statistical` over a hazy varnish are off by 2 to 5 %."""
+
 TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 """Where ends of integrals coincide, and which of them moves depends on rounding: modes agree less well."""
 
@@ -85,6 +92,8 @@ def test_derivatives(name, kind):
     def reverse(vector):
         return jax.grad(lambda v: jnp.vdot(weight.astype(v.dtype), reflected(v)))(vector)
 
+    faces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
+    compared = not (faces and name.startswith(ILL_CONDITIONED))
     wrong = []
     for point in points_of(stack, fixed):
         vector = start.at[point.place].set(point.value)
@@ -111,4 +120,6 @@ def test_derivatives(name, kind):
             wrong.append(f"{where}: not finite in single precision")
         elif abs(back[point.place] - float(weight @ ahead)) > 1e-3 * size + rounding:
             wrong.append(f"{where}: in single precision reverse {back[point.place]:.4g}, forward {weight @ ahead:.4g}")
+        elif compared and weight @ np.abs(ahead - slope) > SINGLE * size + rounding:
+            wrong.append(f"{where}: in single precision off by {weight @ np.abs(ahead - slope):.2g} of {size:.2g}")
     assert not wrong, "\n".join(wrong)
