@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fits._files import write_bytes, write_text, write_together
 from fits.data.formats import read
 from fits.data.measurements import Measurements
@@ -78,7 +80,7 @@ def sample(arguments: Namespace) -> int:
 
 
 def _sample(directory: Path, arguments: Namespace) -> int:
-    from fits.inference.posterior import sample as run_sampler
+    from fits.inference.sampling import sample as run_sampler
     from fits.reporting import results, tables, verdicts
 
     result = results.load_fit(directory)
@@ -90,6 +92,7 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         posterior = run_sampler(
             result,
             walkers=walkers,
+            ess=arguments.ess,
             max_steps=arguments.max_steps,
             seed=seed,
             path=directory / results.CHAIN,
@@ -108,9 +111,12 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         tables.print_table(tables.posterior_table(posterior), sys.stdout)
     for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
         print(sentence)
-    if not posterior.converged:
-        print(f"To go on: layerjax sample {directory} --max-steps {2 * len(posterior.chain)}")
-    return DONE if posterior.converged else DOUBTFUL
+    reached = float(np.min(posterior.effective_samples))
+    enough = posterior.converged and (arguments.ess is None or reached >= arguments.ess)
+    if not enough:
+        asked = "" if arguments.ess is None else f" --ess {arguments.ess}"
+        print(f"To go on: layerjax sample {directory}{asked} --max-steps {2 * len(posterior.chain)}")
+    return DONE if enough else DOUBTFUL
 
 
 def _chain_settings(path: Path, arguments: Namespace) -> tuple[int, int]:

@@ -190,7 +190,7 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     Raises:
         ValueError: on one line, for a damaged file.
     """
-    from fits.inference.posterior import NoSteps, load
+    from fits.inference.sampling import NoSteps, load
 
     directory = Path(directory)
     if not (directory / CHAIN).is_file():

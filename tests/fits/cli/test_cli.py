@@ -235,7 +235,7 @@ def test_an_interrupted_sampler_says_how_to_go_on(
         raise KeyboardInterrupt
 
     save_fit(coat_fit, "result")
-    monkeypatch.setattr("fits.inference.posterior.sample", interrupted)
+    monkeypatch.setattr("fits.inference.sampling.sample", interrupted)
     assert main(["sample", "result"]) == 130
     assert "`layerjax sample result` goes on with it" in capsys.readouterr().err
 

@@ -18,7 +18,8 @@ from fits.inference import starts
 from fits.inference.chain import FileChain
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
-from fits.inference.posterior import Posterior, _identity, load, sample
+from fits.inference.posterior import Posterior
+from fits.inference.sampling import identity_of, load, sample
 from fits.inference.starts import start_points
 from fits.inference.starts_file import StartsFile
 from fits.problem.likelihood import Noise
@@ -283,7 +284,7 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path: Path) -> None:
 def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     path = tmp_path / "result" / "chain.h5"
-    FileChain(path, 16, 2, _identity(coat_fit.problem, 16, 0)).close()
+    FileChain(path, 16, 2, identity_of(coat_fit.problem, 16, 0)).close()
     assert load_posterior(tmp_path / "result") is None
     with pytest.raises(ValueError, match="no steps yet"):
         load(coat_fit, path)

@@ -1,0 +1,112 @@
+"""Sampling the posterior about a fit, until the chain is long enough to be believed.
+
+Chains move in unconstrained coordinates, where the box has no walls; everything that is reported is physical.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.special import logit
+from scipy.stats import qmc
+
+from fits.inference.chain import FileChain, MemoryChain, stored_chain
+from fits.inference.ensemble import Ensemble, log_posteriors
+from fits.inference.fit_result import Fit
+from fits.inference.length import FIRST_CHECK, Outlook, finished, next_check
+from fits.inference.posterior import Posterior, posterior_of
+from fits.problem.problem import Problem
+from fits.progress import Progress
+
+
+def sample(
+    fit: Fit,
+    *,
+    walkers: int = 32,
+    seed: int = 0,
+    path: str | Path | None = None,
+    ess: float | None = None,
+    max_steps: int = 20_000,
+    resume: bool = True,
+    allow_short: bool = False,
+    progress: Progress | None = None,
+) -> Posterior:
+    """Sample the posterior of a fit until its chain is long enough, or `max_steps` steps.
+
+    Args:
+        fit: made with a likelihood.
+        walkers: even, at least twice the number of parameters plus 2.
+        seed: of starts and moves; the same seed gives the same chain.
+        path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
+            again goes on from its last whole step and ends as it would have. One process at a time writes it, any
+            number may read it. None keeps it in memory.
+        ess: effective samples of the worst parameter that are asked for, above 0: sampling goes on until the chain has
+            them, and is 50 autocorrelation times long. None asks for the latter alone. A chain may be gone on with for
+            more of them.
+        max_steps: hard limit; a chain that reaches it may not be `converged`.
+        resume: False replaces what `path` holds.
+        allow_short: let the result report estimates though the chain has not converged.
+        progress: called with ("sample", steps, None, note).
+
+    Raises:
+        ValueError: the fit's objective is no likelihood; too few walkers; `path` holds a chain of something else, or is
+            in use by another process; no start with a finite posterior near the optimum.
+        OSError: the disk is full, say. What was sampled is kept.
+    """
+    problem = fit.problem
+    if not fit.is_posterior:
+        raise ValueError(f"objective {problem.objective!r} is no likelihood, so there is no posterior to sample")
+    count = len(problem.names)
+    if walkers % 2 or walkers < 2 * count + 2:
+        raise ValueError(f"walkers is {walkers}; it must be even and at least {2 * count + 2} for {count} parameters")
+    if max_steps < FIRST_CHECK:
+        raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
+    if ess is not None and not ess > 0:
+        raise ValueError(f"ess is {ess}; it must be above 0")
+    if path is not None and not Path(path).parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
+    identity = identity_of(problem, walkers, seed)
+    chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
+    try:
+        sampler = Ensemble(fit, chain, seed)
+        outlook = Outlook(chain, max_steps, ess)
+        while not finished(chain, max_steps, ess):
+            sampler.advance(min(next_check(chain.iteration), max_steps))
+            chain.checkpoint()
+            if progress is not None:
+                progress("sample", chain.iteration, None, outlook.note())
+        chain.checkpoint()  # what a killed run left in the journal alone
+    finally:
+        chain.close()
+    return posterior_of(fit, chain, allow_short)
+
+
+class NoSteps(ValueError):
+    """A chain that has not begun."""
+
+
+def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
+    """The posterior kept in a file by `sample`, as far as it got. ValueError if the file is not a chain of this fit."""
+    if not Path(path).is_file():
+        raise ValueError(f"{path}: there is no chain")
+
+    def expected(stored: dict[str, Any]) -> dict[str, Any]:
+        return identity_of(fit.problem, int(stored["walkers"]), int(stored["seed"]))
+
+    chain = stored_chain(path, expected)
+    if not chain.iteration:
+        raise NoSteps(f"{path}: the chain has no steps yet")
+    return posterior_of(fit, chain, allow_short)
+
+
+def identity_of(problem: Problem, walkers: int, seed: int) -> dict[str, Any]:
+    """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points."""
+    points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
+    posteriors = problem.call(log_posteriors, logit(points))
+    return {
+        "names": "\n".join(problem.names),
+        "bounds": np.stack([problem.low, problem.high]),
+        "posterior": np.asarray(posteriors, float),
+        "walkers": walkers,
+        "seed": seed,
+    }
