@@ -92,6 +92,7 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         posterior = run_sampler(
             result,
             walkers=walkers,
+            surrogate=arguments.surrogate,
             ess=arguments.ess,
             max_steps=arguments.max_steps,
             seed=seed,

@@ -228,6 +228,11 @@ def _add_sampling(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="go on until the worst parameter has N effective samples (default: until the chain is long enough)",
     )
+    group.add_argument(
+        "--surrogate",
+        action=argparse.BooleanOptionalAction,
+        help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
+    )
     group.add_argument("--max-steps", type=_count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
     group.add_argument(
         "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"

@@ -1,8 +1,11 @@
-"""An ensemble of walkers moved by emcee: half stretch moves, half independent proposals from an approximation.
+"""An ensemble of walkers moved by emcee, in unconstrained coordinates, where the box has no walls.
 
-The approximation is the fit's own or one learned from the chain (`laplace`). The ensemble moves in unconstrained
-coordinates, where the box has no walls.
+Where an evaluation is cheap, half the steps are stretch moves, and half independent proposals from an approximation,
+the fit's own or one learned from the chain (`laplace`). Where it is costly, most are delayed acceptance by a surrogate.
 """
+
+import time
+from typing import Any
 
 import emcee
 import jax
@@ -11,13 +14,21 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.inference.chain import MemoryChain
+from fits.inference.delayed_acceptance import DelayedAcceptance
+from fits.inference.design import Design, Kept
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.length import last_checks
 from fits.inference.mixture import Mixture
+from fits.inference.surrogate import evaluate, with_polynomials
 from fits.problem.model import Model
+from fits.problem.problem import Problem
+from fits.progress import Progress
 
 INDEPENDENT = 0.5
+BY_SURROGATE, BESIDE = 0.8, 0.1  # share of its moves, and of each of the other two beside them
+COSTLY = 200e-6  # seconds an evaluation: below, walks of a surrogate and their compilation take longer than they save
+TIMED = 3
 
 Floats = NDArray[np.float64]
 Proposals = Approximation | Mixture
@@ -29,6 +40,25 @@ class Ensemble:
     def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self.initial: Proposals = Mixture.of(fit) or Approximation.of(fit)
+        self._delayed: DelayedAcceptance | None = None
+        self._read_moves()
+
+    def decide(self, surrogate: bool, kept: Kept, progress: Progress | None) -> None:
+        """Before the first step, and for all: whether proposals come from a surrogate, which is built if so."""
+        moves: dict[str, Any] = {"surrogate": surrogate, "words": ""}
+        if surrogate:
+            built = Design(self.problem, self.chain.shape[0], self.seed, kept, progress).build(self.initial)
+            moves["words"] = built.words
+            if built.surrogate is not None:
+                moves |= {"root": built.root, **built.surrogate.arrays()}
+        self.chain.decide(moves)
+        self._read_moves()
+        kept.remove()
+
+    def _read_moves(self) -> None:
+        moves = self.chain.moves
+        if "root" in moves:
+            self._delayed = DelayedAcceptance(with_polynomials(self.problem.model, moves), moves["root"])
 
     def advance(self, step: int) -> None:
         """Append steps to the chain until it has `step` of them."""
@@ -39,17 +69,19 @@ class Ensemble:
 
     def sampler(self) -> emcee.EnsembleSampler:
         """emcee with the moves of the steps up to the next check."""
-        approximation = adapted(self.chain, self.initial)
-        moves = [
-            (emcee.moves.MHMove(approximation.propose), INDEPENDENT),
-            (emcee.moves.StretchMove(), 1.0 - INDEPENDENT),
-        ]
+        independent = emcee.moves.MHMove(adapted(self.chain, self.initial).propose)
+        moves = [(independent, INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
+        if self._delayed is not None:
+            by_surrogate = emcee.moves.MHMove(self._delayed.propose)
+            moves = [(by_surrogate, BY_SURROGATE), (independent, BESIDE), (emcee.moves.StretchMove(), BESIDE)]
         walkers, count = self.chain.shape
         return emcee.EnsembleSampler(
             walkers, count, self._log_posteriors, moves=moves, vectorize=True, backend=self.chain
         )
 
     def _log_posteriors(self, positions: Floats) -> Floats:
+        if self._delayed is not None:  # the program that the surrogate was built with: compiled already
+            return np.asarray(self.problem.call(evaluate, positions)[1], float)
         return np.asarray(self.problem.call(log_posteriors, positions), float)
 
     def _first_state(self) -> emcee.State:
@@ -81,3 +113,13 @@ def adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
 def log_posteriors(model: Model, positions: Array) -> Array:
     """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
     return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
+
+
+def seconds_an_evaluation(problem: Problem, positions: Floats) -> float:
+    """Time of one log-posterior by the clock, at its best, in a program that has been compiled before."""
+    best = np.inf
+    for _ in range(TIMED):
+        began = time.perf_counter()
+        np.asarray(problem.call(log_posteriors, positions))
+        best = min(best, time.perf_counter() - began)
+    return float(best) / len(positions)

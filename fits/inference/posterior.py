@@ -35,6 +35,7 @@ class Posterior:
         converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
             changed by less than 5 % since the last check.
         allow_short: estimates may be had from a chain that has not converged.
+        status: what is to be said of the sampler, if anything.
     """
 
     fit: Fit
@@ -44,6 +45,7 @@ class Posterior:
     acceptance: float
     converged: bool
     allow_short: bool = False
+    status: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,6 +142,7 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
         acceptance=float(np.mean(chain.accepted) / chain.iteration),
         converged=long_enough(chain),
         allow_short=allow_short,
+        status=str(chain.moves.get("words", "")),
     )
 
 

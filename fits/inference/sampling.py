@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logit
 from scipy.stats import qmc
 
-from fits.inference.chain import FileChain, MemoryChain, stored_chain
-from fits.inference.ensemble import Ensemble, log_posteriors
+from fits.inference import ensemble
+from fits.inference.chain import SURROGATE, FileChain, MemoryChain, another, stored_chain
+from fits.inference.design import Kept
+from fits.inference.ensemble import Ensemble, log_posteriors, seconds_an_evaluation
 from fits.inference.fit_result import Fit
 from fits.inference.length import FIRST_CHECK, Outlook, finished, next_check
 from fits.inference.posterior import Posterior, posterior_of
@@ -25,6 +28,7 @@ def sample(
     walkers: int = 32,
     seed: int = 0,
     path: str | Path | None = None,
+    surrogate: bool | None = None,
     ess: float | None = None,
     max_steps: int = 20_000,
     resume: bool = True,
@@ -36,17 +40,21 @@ def sample(
     Args:
         fit: made with a likelihood.
         walkers: even, at least twice the number of parameters plus 2.
-        seed: of starts and moves; the same seed gives the same chain.
+        seed: of starts and moves; the same seed gives the same chain, where `surrogate` is the same.
         path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
             again goes on from its last whole step and ends as it would have. One process at a time writes it, any
             number may read it. None keeps it in memory.
+        surrogate: whether most proposals come from a polynomial surrogate of the model, each of which takes one exact
+            evaluation and is nearly independent of the last (delayed acceptance); the posterior is the same. A
+            surrogate that does not hold is left out, which `status` of the result says. None: where one evaluation
+            takes more than about 200 microseconds, by the clock; the chain remembers it.
         ess: effective samples of the worst parameter that are asked for, above 0: sampling goes on until the chain has
             them, and is 50 autocorrelation times long. None asks for the latter alone. A chain may be gone on with for
             more of them.
         max_steps: hard limit; a chain that reaches it may not be `converged`.
         resume: False replaces what `path` holds.
         allow_short: let the result report estimates though the chain has not converged.
-        progress: called with ("sample", steps, None, note).
+        progress: called with ("sample", steps, None, note), and ("surrogate", evaluations, None, note) before.
 
     Raises:
         ValueError: the fit's objective is no likelihood; too few walkers; `path` holds a chain of something else, or is
@@ -69,6 +77,7 @@ def sample(
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
         sampler = Ensemble(fit, chain, seed)
+        _decide(sampler, surrogate, path, identity, progress)
         outlook = Outlook(chain, max_steps, ess)
         while not finished(chain, max_steps, ess):
             sampler.advance(min(next_check(chain.iteration), max_steps))
@@ -79,6 +88,25 @@ def sample(
     finally:
         chain.close()
     return posterior_of(fit, chain, allow_short)
+
+
+def _decide(
+    sampler: Ensemble,
+    surrogate: bool | None,
+    path: str | Path | None,
+    identity: dict[str, Any],
+    progress: Progress | None,
+) -> None:
+    """How the chain is moved: as it was decided before it began, or, before it begins, as is asked for."""
+    chain = sampler.chain
+    if chain.iteration or chain.moves:
+        if surrogate not in (None, bool(chain.moves.get("surrogate", False))):
+            raise ValueError(another(path or "memory", "surrogate"))
+        return
+    if surrogate is None:
+        surrogate = seconds_an_evaluation(sampler.problem, _fixed_points(sampler.problem)) > ensemble.COSTLY
+    beside = None if path is None else Path(path).with_suffix(SURROGATE)
+    sampler.decide(surrogate, Kept(beside, identity), progress)
 
 
 class NoSteps(ValueError):
@@ -101,12 +129,15 @@ def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
 
 def identity_of(problem: Problem, walkers: int, seed: int) -> dict[str, Any]:
     """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points."""
-    points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
-    posteriors = problem.call(log_posteriors, logit(points))
     return {
         "names": "\n".join(problem.names),
         "bounds": np.stack([problem.low, problem.high]),
-        "posterior": np.asarray(posteriors, float),
+        "posterior": np.asarray(problem.call(log_posteriors, _fixed_points(problem)), float),
         "walkers": walkers,
         "seed": seed,
     }
+
+
+def _fixed_points(problem: Problem) -> NDArray[np.float64]:
+    points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
+    return logit(points)

@@ -219,6 +219,7 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "walkers": posterior.chain.shape[1],
         "burn_in": posterior.burn_in,
         "acceptance": posterior.acceptance,
+        "status": posterior.status,
         "parameters": [
             {
                 "name": name,

@@ -201,7 +201,7 @@ def test_beside_a_running_sampler_others_only_read(
     for name in ("result", "other"):
         save_fit(coat_fit, name)
     directory = work / "result"
-    words = ["sample", "result", "--walkers", "32", "--seed", "3"]
+    words = ["sample", "result", "--walkers", "32", "--seed", "3", "--no-surrogate"]
 
     def seen() -> dict[str, tuple[int, int, bytes]]:
         entries = [(path, path.stat()) for path in directory.iterdir()]
@@ -223,7 +223,7 @@ def test_beside_a_running_sampler_others_only_read(
     assert posterior is not None
     loaded = load_fit(directory)
     whole = sample(loaded, walkers=32, seed=3, path=directory / "chain.h5")
-    again = sample(loaded, walkers=32, seed=3)
+    again = sample(loaded, walkers=32, seed=3, surrogate=False)
     assert 2 < len(posterior.chain) < len(again.chain)
     np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
     np.testing.assert_array_equal(whole.chain, again.chain)
