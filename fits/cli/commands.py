@@ -9,7 +9,7 @@ from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from layerjax import Stack
 
 DONE, DOUBTFUL = 0, 1
-WALKERS = 32
 
 
 def fit(arguments: Namespace) -> int:
@@ -86,16 +85,15 @@ def _sample(directory: Path, arguments: Namespace) -> int:
     result = results.load_fit(directory)
     if not result.is_posterior:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
-    walkers, seed = _chain_settings(directory / results.CHAIN, arguments)
+    settings = _chain_settings(directory / results.CHAIN, arguments)
     again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
     with show_progress() as progress, _hint(again):
         posterior = run_sampler(
             result,
-            walkers=walkers,
+            **settings,
             surrogate=arguments.surrogate,
             ess=arguments.ess,
             max_steps=arguments.max_steps,
-            seed=seed,
             path=directory / results.CHAIN,
             resume=not arguments.force,
             allow_short=arguments.allow_short,
@@ -120,18 +118,18 @@ def _sample(directory: Path, arguments: Namespace) -> int:
     return DONE if enough else DOUBTFUL
 
 
-def _chain_settings(path: Path, arguments: Namespace) -> tuple[int, int]:
-    """Walkers and seed: those of the chain that is there, which arguments must not contradict, or the defaults."""
+def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
+    """Sampler, walkers and seed: those of the chain that is there, which arguments must not contradict, or defaults."""
     from fits.inference.chain import read_chain
 
-    settings = {"walkers": arguments.walkers, "seed": arguments.seed}
     stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
-    for name, default in (("walkers", WALKERS), ("seed", 0)):
-        wanted, there = settings[name], stored.get(name)
+    settings: dict[str, Any] = {}
+    for name, kind, default in (("sampler", str, "emcee"), ("walkers", int, None), ("seed", int, 0)):
+        wanted, there = getattr(arguments, name), stored.get(name)
         if wanted is not None and there is not None and wanted != there:
             raise ValueError(f"--{name} is {wanted}, the chain in {path} has {there} (--force starts it again)")
-        settings[name] = wanted if wanted is not None else int(default if there is None else there)
-    return settings["walkers"], settings["seed"]
+        settings[name] = wanted if wanted is not None else default if there is None else kind(there)
+    return settings
 
 
 def report(arguments: Namespace) -> int:

@@ -221,7 +221,12 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 
 def _add_sampling(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sampling")
-    group.add_argument("--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32)")
+    group.add_argument(
+        "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
+    )
+    group.add_argument(
+        "--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32; 4 chains of nuts)"
+    )
     group.add_argument(
         "--ess",
         type=_count,

@@ -225,7 +225,9 @@ def read_chain(path: str | Path) -> dict[str, Any]:
                 "random_state": _native([attributes[f"random_state_{index}"] for index in range(5)]) if count else None,
                 "number": attributes[f"{IDENTITY}number"],
                 "moves": {name: _plain(part[()]) for name, part in file.get(MOVES, {}).items()},
-                "identity": {
+                # before there was a choice, it was emcee
+                "identity": {"sampler": "emcee"}
+                | {
                     name.removeprefix(IDENTITY): value
                     for name, value in attributes.items()
                     if name.startswith(IDENTITY)

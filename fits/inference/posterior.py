@@ -25,17 +25,18 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """An ensemble chain of P parameters and what it says.
+    """Chains of P parameters, an ensemble of walkers or a few of NUTS, and what they say.
 
     Attributes:
         chain: (steps, walkers, P), physical values, from the start on.
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its first tenth.
-        acceptance: mean share of proposals taken.
+        acceptance: mean share of proposals taken; of NUTS, of steps that moved.
         converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
             changed by less than 5 % since the last check.
         allow_short: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
+        divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
     """
 
     fit: Fit
@@ -46,6 +47,7 @@ class Posterior:
     converged: bool
     allow_short: bool = False
     status: str = ""
+    divergences: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,7 +133,14 @@ class Posterior:
 
 def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Posterior:
     """What a chain of a fit's posterior says."""
-    positions = chain.get_chain()
+    positions, moves = chain.get_chain(), chain.moves
+    taken = float(np.mean(chain.accepted) / chain.iteration)
+    divergences, words = 0, str(moves.get("words", ""))
+    if moves.get("sampler") == "nuts":
+        divergences = round((1.0 - taken) * positions[..., 0].size)  # what its records hold
+        taken = float(np.mean(np.any(np.diff(positions, axis=0), axis=-1))) if len(positions) > 1 else 1.0
+        words = f"NUTS, {divergences} divergent steps of {positions[..., 0].size}"
+        words += ", near which it may have missed a part of the posterior" if divergences else ""
     return Posterior(
         fit=fit,
         chain=np.asarray(fit.problem.call(_constrained, positions.reshape(-1, positions.shape[-1]))).reshape(
@@ -139,10 +148,11 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
         ),
         log_probability=chain.get_log_prob(),
         autocorrelation_time=autocorrelation_times(chain, len(positions)),
-        acceptance=float(np.mean(chain.accepted) / chain.iteration),
+        acceptance=taken,
         converged=long_enough(chain),
         allow_short=allow_short,
-        status=str(chain.moves.get("words", "")),
+        status=words,
+        divergences=divergences,
     )
 
 

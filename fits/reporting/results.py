@@ -220,6 +220,7 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "burn_in": posterior.burn_in,
         "acceptance": posterior.acceptance,
         "status": posterior.status,
+        "divergences": posterior.divergences,
         "parameters": [
             {
                 "name": name,
