@@ -46,8 +46,8 @@ def sample(
         fit: made with a likelihood.
         sampler: "emcee", an ensemble of walkers that move together, or "nuts", a few chains that follow the gradient,
             for many parameters: it needs the extra `layerjax[nuts]`.
-        walkers: of emcee, even, at least twice the number of parameters plus 2; None for 32. Of NUTS, the number of
-            chains, at least 2; None for 4.
+        walkers: of emcee, even, at least twice the number of parameters plus 2; None for 32, or for more if that is
+            too few. Of NUTS, the number of chains, at least 2; None for 4.
         seed: of starts and moves; the same seed gives the same chain, where `surrogate` is the same.
         path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
             again goes on from its last whole step and ends as it would have. One process at a time writes it, any
@@ -67,24 +67,13 @@ def sample(
 
     Raises:
         ValueError: the fit's objective is no likelihood; too few walkers; an unknown sampler, or one whose extra is not
-            installed; `path` holds a chain of something else, or is
-            in use by another process; no start with a finite posterior near the optimum.
+            installed; `path` holds a chain of something else, or is in use by another process; no start with a finite
+            posterior near the optimum.
         OSError: the disk is full, say. What was sampled is kept.
     """
     problem = fit.problem
-    if not fit.is_posterior:
-        raise ValueError(f"objective {problem.objective!r} is no likelihood, so there is no posterior to sample")
+    _require_possible(fit, sampler, surrogate, ess, max_steps, path)
     walkers = _walkers(sampler, walkers, len(problem.names))
-    if sampler == "nuts":
-        require_blackjax()
-        if surrogate:
-            raise ValueError('surrogate=True goes with sampler="emcee", whose proposals it makes')
-    if max_steps < FIRST_CHECK:
-        raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
-    if ess is not None and not ess > 0:
-        raise ValueError(f"ess is {ess}; it must be above 0")
-    if path is not None and not Path(path).parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
     identity, count = identity_of(problem, walkers, seed, sampler), len(problem.names)
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
@@ -102,17 +91,36 @@ def sample(
     return posterior_of(fit, chain, allow_short)
 
 
-def _walkers(sampler: Sampler, walkers: int | None, count: int) -> int:
-    """How many walkers, or chains; ValueError for an unknown sampler, or too few."""
+def _require_possible(
+    fit: Fit, sampler: str, surrogate: bool | None, ess: float | None, max_steps: int, path: str | Path | None
+) -> None:
+    """ValueError for what `sample` cannot do, before anything is written."""
+    if not fit.is_posterior:
+        raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
     if sampler not in get_args(Sampler):
         raise ValueError(f"sampler is {sampler!r}; it must be one of {', '.join(get_args(Sampler))}")
-    if walkers is None:
-        return CHAINS if sampler == "nuts" else WALKERS
-    if sampler == "nuts" and walkers < 2:
-        raise ValueError(f"walkers is {walkers}; it must be at least 2 for sampler='nuts'")
-    if sampler == "emcee" and (walkers % 2 or walkers < 2 * count + 2):
-        raise ValueError(f"walkers is {walkers}; it must be even and at least {2 * count + 2} for {count} parameters")
-    return walkers
+    if sampler == "nuts":
+        require_blackjax()
+        if surrogate:
+            raise ValueError('surrogate=True goes with sampler="emcee", whose proposals it makes')
+    if max_steps < FIRST_CHECK:
+        raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
+    if ess is not None and not ess > 0:
+        raise ValueError(f"ess is {ess}; it must be above 0")
+    if path is not None and not Path(path).parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
+
+
+def _walkers(sampler: Sampler, walkers: int | None, count: int) -> int:
+    """How many walkers, or chains, `count` parameters are sampled with; ValueError for too few."""
+    if sampler == "nuts":
+        if walkers is not None and walkers < 2:
+            raise ValueError(f"walkers is {walkers}; it must be at least 2 for sampler='nuts'")
+        return walkers or CHAINS
+    least = 2 * count + 2
+    if walkers is not None and (walkers % 2 or walkers < least):
+        raise ValueError(f"walkers is {walkers}; it must be even and at least {least} for {count} parameters")
+    return walkers or max(WALKERS, least)
 
 
 def _decide(

@@ -18,7 +18,7 @@ from fits.inference.ensemble import Ensemble, adapted
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
 from fits.inference.optimise import fit
-from fits.inference.sampling import identity_of, load, sample
+from fits.inference.sampling import _walkers, identity_of, load, sample
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from tests.helpers.models import COUNT, LINE, design, line, line_data, line_fit, measured
@@ -312,6 +312,12 @@ def test_free_student_noise_is_sampled() -> None:
 def test_refused(result: Fit, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         sample(result, **options)
+
+
+def test_there_are_enough_walkers_for_many_parameters() -> None:
+    assert _walkers("emcee", None, 3) == 32
+    assert _walkers("emcee", None, 20) == 42
+    assert _walkers("nuts", None, 20) == 4
 
 
 def test_a_named_objective_has_no_posterior() -> None:
