@@ -19,15 +19,13 @@ from fits.inference.optimise import fit
 from fits.inference.posterior import Posterior
 from fits.inference.sampling import load, sample
 from fits.inference.surrogate import Evaluated, affordable_degrees, evaluate, fitted, monomials, term_count
-from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from tests.helpers.files import largest_file
-from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, line_fit, lobe, measured, noisy_lobe
+from tests.helpers.models import LINE, line, line_data, line_fit
 
 SHORT = {"walkers": 16, "seed": 1, "max_steps": 200, "surrogate": True}
-QUANTILES = [0.158655, 0.5, 0.841345]
 
 
 @pytest.fixture(scope="module")
@@ -40,63 +38,8 @@ def short(result: Fit) -> Posterior:
     return sample(result, **SHORT)
 
 
-def on_a_bound() -> Fit:
-    """A line whose slope is best below its lower bound."""
-    return fit({"a": Free(0.9, -1.0, 3.0), "b": Free(2.0, 0.52, 3.0)}, line_data(), transport=line, starts=2)
-
-
-def with_a_free_level() -> Fit:
-    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
-    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
-
-
-def coated() -> Fit:
-    """Six parameters, a GGX coat among them."""
-    return fit(LOBE_STACK, noisy_lobe(0, 140), transport=lobe, starts=2)
-
-
 def effective(posterior: Posterior) -> float:
     return float(posterior.effective_samples.min())
-
-
-def assert_same_posterior(one: Posterior, other: Posterior) -> None:
-    """Quantiles within a tenth of a standard deviation, from chains of 5,000 effective samples at least."""
-    kept = [chain.chain[chain.burn_in :].reshape(-1, len(one.names)) for chain in (one, other)]
-    assert min(effective(one), effective(other)) >= 5000
-    first, second = (np.quantile(samples, QUANTILES, axis=0) for samples in kept)
-    assert np.max(np.abs(first - second) / kept[1].std(axis=0)) < 0.1
-
-
-@pytest.mark.parametrize("made", [coated, on_a_bound, with_a_free_level])
-def test_it_samples_what_emcee_samples(made) -> None:
-    fitted = made()
-    assert bool(fitted.at_bound) == (made is on_a_bound)
-    delayed, plain = (sample(fitted, seed=1, ess=10_000, surrogate=chosen) for chosen in (True, False))
-    assert "surrogate of degree" in delayed.status
-    assert plain.status == ""
-    assert_same_posterior(delayed, plain)
-    a_step = [effective(posterior) / len(posterior.chain) for posterior in (delayed, plain)]
-    assert a_step[0] > 1.2 * a_step[1]
-
-
-def test_one_parameter() -> None:
-    fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
-    x = design(COUNT)[:, 1]
-    posterior = sample(fitted, seed=2, surrogate=True)
-    mean, spread = x @ (line_data().values[:, 0] - 1.0) / (x @ x), 0.05 / np.sqrt(x @ x)
-    _, _, _, average, deviation = posterior.summary()["['b']"]
-    error = 5 / np.sqrt(effective(posterior))
-    assert average == pytest.approx(mean, abs=error * spread)
-    assert deviation == pytest.approx(spread, rel=error)
-
-
-def test_a_direction_that_is_open_fills_its_box() -> None:
-    fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
-    posterior = sample(fitted, seed=3, surrogate=True)
-    kept = posterior.chain[posterior.burn_in :, :, posterior.names.index("['c']")]
-    error = 5 / np.sqrt(effective(posterior))
-    assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
-    assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
 
 
 def test_monomials_are_all_products() -> None:

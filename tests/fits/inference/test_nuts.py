@@ -8,20 +8,16 @@ import pytest
 
 from fits.cli.parser import main
 from fits.inference.fit_result import Fit
-from fits.inference.optimise import fit
 from fits.inference.posterior import Posterior
 from fits.inference.sampling import load, sample
-from fits.problem.likelihood import Noise
-from fits.problem.parameters import Free
 from fits.reporting.results import load_posterior, save_fit
 from tests.helpers.files import largest_file
-from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, line_fit, lobe, measured, noisy_lobe
+from tests.helpers.models import line_fit
 
 pytest.importorskip("blackjax")
 
 NUTS = {"sampler": "nuts", "seed": 1}
 SHORT = {**NUTS, "max_steps": 120}
-QUANTILES = [0.158655, 0.5, 0.841345]
 
 
 @pytest.fixture(scope="module")
@@ -32,41 +28,6 @@ def result() -> Fit:
 @pytest.fixture(scope="module")
 def short(result: Fit) -> Posterior:
     return sample(result, **SHORT)
-
-
-def coated() -> Fit:
-    return fit(LOBE_STACK, noisy_lobe(0, 140), transport=lobe, starts=2)
-
-
-def on_a_bound() -> Fit:
-    return fit({"a": Free(0.9, -1.0, 3.0), "b": Free(2.0, 0.52, 3.0)}, line_data(), transport=line, starts=2)
-
-
-def with_a_free_level() -> Fit:
-    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
-    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
-
-
-@pytest.mark.parametrize("made", [coated, on_a_bound, with_a_free_level])
-def test_it_samples_what_emcee_samples(made) -> None:
-    """Quantiles within a tenth of a standard deviation, from chains of 5,000 effective samples at least."""
-    fitted = made()
-    posteriors = [sample(fitted, seed=1, ess=10_000, surrogate=False), sample(fitted, ess=10_000, **NUTS)]
-    assert min(posterior.effective_samples.min() for posterior in posteriors) >= 5000
-    kept = [posterior.chain[posterior.burn_in :].reshape(-1, len(posterior.names)) for posterior in posteriors]
-    first, second = (np.quantile(samples, QUANTILES, axis=0) for samples in kept)
-    assert np.max(np.abs(first - second) / kept[0].std(axis=0)) < 0.1
-
-
-def test_one_parameter() -> None:
-    fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
-    x = design(COUNT)[:, 1]
-    posterior = sample(fitted, **NUTS)
-    mean, spread = x @ (line_data().values[:, 0] - 1.0) / (x @ x), 0.05 / np.sqrt(x @ x)
-    _, _, _, average, deviation = posterior.summary()["['b']"]
-    error = 5 / np.sqrt(posterior.effective_samples.min())
-    assert average == pytest.approx(mean, abs=error * spread)
-    assert deviation == pytest.approx(spread, rel=error)
 
 
 def test_its_result_is_that_of_any_sampler(short: Posterior) -> None:
