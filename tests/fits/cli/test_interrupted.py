@@ -230,6 +230,29 @@ def test_beside_a_running_sampler_others_only_read(
     assert not (directory / "chain.lock").exists()
 
 
+@pytest.mark.parametrize("moment", ["chain.surrogate", "chain.journal"])
+def test_a_killed_sampler_goes_on_with_its_surrogate(
+    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, tmp_path_factory: pytest.TempPathFactory, moment: str
+) -> None:
+    """Killed while the surrogate is built, and while it is used."""
+    save_fit(coat_fit, "result")
+    words = ["sample", "result", "--walkers", "16", "--seed", "3", "--surrogate"]
+
+    def begun() -> bool:
+        return (work / "result" / moment).is_file() and (work / "result" / moment).stat().st_size > 0
+
+    with stopped(words, tmp_path_factory.getbasetemp() / "cache", begun) as process:
+        assert f"in use by another process ({process.pid})" in refusal(words, capsys)
+        posterior = load_posterior("result")
+        assert (posterior is None) == (moment == "chain.surrogate")
+    loaded = load_fit("result")
+    options = {"walkers": 16, "seed": 3, "surrogate": True}
+    whole, again = sample(loaded, path="result/chain.h5", **options), sample(loaded, **options)
+    np.testing.assert_array_equal(whole.chain, again.chain)
+    assert whole.status == again.status
+    assert not {"chain.surrogate", "chain.journal", "chain.lock"} & set(os.listdir("result"))
+
+
 def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
     work: Path,
     capsys: pytest.CaptureFixture[str],
