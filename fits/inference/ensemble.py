@@ -5,6 +5,7 @@ the fit's own or one learned from the chain (`laplace`). Where it is costly, mos
 """
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import emcee
@@ -60,12 +61,13 @@ class Ensemble:
         if "root" in moves:
             self._delayed = DelayedAcceptance(with_polynomials(self.problem.model, moves), moves["root"])
 
-    def advance(self, step: int) -> None:
-        """Append steps to the chain until it has `step` of them."""
+    def advance(self, step: int, tell: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `tell` of each."""
         chain = self.chain
         state = chain.get_last_sample() if chain.iteration else self._first_state()
         # walkers are drawn from a density of full rank: emcee need not look whether they are
-        self.sampler().run_mcmc(state, step - chain.iteration, skip_initial_state_check=True)
+        for _ in self.sampler().sample(state, iterations=step - chain.iteration, skip_initial_state_check=True):
+            tell()
 
     def sampler(self) -> emcee.EnsembleSampler:
         """emcee with the moves of the steps up to the next check."""

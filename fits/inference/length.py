@@ -16,6 +16,7 @@ FIRST_CHECK = 100
 LONG_ENOUGH = 50.0
 STEADY = 0.05
 BURN_IN = 10
+PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly
 
 Floats = NDArray[np.float64]
 
@@ -79,6 +80,11 @@ class Outlook:
     def __init__(self, chain: MemoryChain, max_steps: int, ess: float | None):
         self.chain, self.max_steps, self.ess = chain, max_steps, ess
         self._seen, self._at = chain.iteration, time.monotonic()
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the last look was long ago."""
+        return time.monotonic() - self._at > PATIENCE
 
     def note(self) -> str:
         """What is there, what is needed, and the time left."""

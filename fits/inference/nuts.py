@@ -69,8 +69,8 @@ class Nuts:
                 metric = _refined(metric, np.concatenate(visited[SETTLING:]))
         self.chain.decide({"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""})
 
-    def advance(self, step: int) -> None:
-        """Append steps to the chain until it has `step` of them."""
+    def advance(self, step: int, tell: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `tell` of each."""
         chain, moves = self.chain, self.chain.moves
         positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
         chain.grow(step - chain.iteration, None)
@@ -81,6 +81,7 @@ class Nuts:
             )
             state = emcee.State(positions, log_prob=heights, random_state=random_state)
             chain.save_step(state, ~divergent)
+            tell()
 
     def _step(self, positions: Floats, number: int, length: float, metric: Floats) -> tuple[Any, ...]:
         found = self.problem.call(_step, positions, self.seed, number, length, metric)

@@ -80,11 +80,15 @@ def sample(
         moved = Nuts(fit, chain, seed) if sampler == "nuts" else Ensemble(fit, chain, seed)
         _decide(moved, surrogate, path, identity, progress)
         outlook = Outlook(chain, max_steps, ess)
-        while not finished(chain, max_steps, ess):
-            moved.advance(min(next_check(chain.iteration), max_steps))
-            chain.checkpoint()
-            if progress is not None:
+
+        def tell(now: bool = False) -> None:
+            if progress is not None and (now or outlook.overdue):
                 progress("sample", chain.iteration, None, outlook.note())
+
+        while not finished(chain, max_steps, ess):
+            moved.advance(min(next_check(chain.iteration), max_steps), tell)
+            chain.checkpoint()
+            tell(now=True)
         chain.checkpoint()  # what a killed run left in the journal alone
     finally:
         chain.close()

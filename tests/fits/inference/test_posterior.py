@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fits.inference import length
 from fits.inference.chain import FileChain, MemoryChain
 from fits.inference.ensemble import Ensemble, adapted
 from fits.inference.fit_result import Fit
@@ -79,6 +80,14 @@ def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, po
     assert f"of {wanted:g} effective samples, needs" in notes[0]
     assert notes[0].endswith("s left")
     assert not notes[-1].endswith("left")
+
+
+def test_a_slow_chain_is_told_of_between_its_checks(result: Fit, posterior, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = []
+    monkeypatch.setattr(length, "PATIENCE", 0.0)
+    again = sample(result, walkers=16, seed=1, max_steps=120, progress=lambda *given: steps.append(given[1]))
+    assert steps == [*range(1, 101), 100, *range(101, 121), 120]
+    np.testing.assert_array_equal(again.chain, posterior.chain[:120])
 
 
 def test_the_same_seed_gives_the_same_chain_whatever_numpys_global_state(result: Fit, posterior) -> None:
