@@ -29,6 +29,7 @@ DONE, DOUBTFUL = 0, 1
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     _use_jax()
+    from fits.inference.nuts import require_blackjax
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
@@ -40,6 +41,8 @@ def fit(arguments: Namespace) -> int:
     objective = arguments.objective or given.objective
     if arguments.sample and objective != "likelihood":
         raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
+    if arguments.sample and arguments.sampler == "nuts":
+        require_blackjax()
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
     with results.reserved(directory, arguments.force), show_progress() as progress, _hint(kept):

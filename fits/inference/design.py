@@ -101,7 +101,9 @@ class Design:
             return Built(None, np.eye(dimension), f"no surrogate of {dimension} parameters: exact evaluations alone")
         first = self._batches(FIRST_POINTS * term_count(dimension, degrees[0]) / 2.0)
         points = self._evaluated(self._first_draws(initial, first), 0).finite()
-        root, share, surrogate = _root(points), 0.0, None
+        if len(points.positions) < term_count(dimension, degrees[0]):
+            return Built(None, np.eye(dimension), "no surrogate, for want of finite values about the best fit")
+        root, share = _root(points), 0.0
         for number, degree in enumerate([*degrees, *degrees[-1:] * (AT_HIGHEST - 1)], 1):
             terms = term_count(dimension, degree)
             if len(points.positions) < terms:
@@ -116,9 +118,9 @@ class Design:
             if share >= GOOD:
                 break
             points = points.joined(new.finite())
-        if surrogate is None or share < LEAST:
-            return Built(None, root, f"the surrogate does not hold ({self.note or 'no finite values'}) and is left out")
-        words = f"proposals from a surrogate of degree {degree}, built with {self.evaluations} evaluations"
+        if share < LEAST:
+            return Built(None, root, f"the surrogate does not hold ({self.note}) and is left out")
+        words = f"proposals from a surrogate of degree {surrogate.degree}, built with {self.evaluations} evaluations"
         return Built(surrogate, root, words)
 
     def _first_draws(self, initial: Approximation | Mixture, count: int) -> Floats:

@@ -108,6 +108,18 @@ def test_a_surrogate_that_does_not_hold_is_left_out(result: Fit) -> None:
     np.testing.assert_array_equal(posterior.chain, plain.chain)
 
 
+def test_a_model_that_is_finite_at_its_best_alone_has_no_surrogate(result: Fit) -> None:
+    best = result.values["['a']"]
+
+    def finite_there(stack, wi, wo):
+        return line(stack, wi, wo) + jnp.where(jnp.abs(stack["a"] - best) < 1e-4, 0.0, jnp.nan)
+
+    fitted = dataclasses.replace(result, problem=Problem(LINE, line_data(), finite_there))
+    posterior = sample(fitted, **SHORT | {"allow_short": True})
+    assert posterior.status == "no surrogate, for want of finite values about the best fit"
+    assert len(posterior.chain) == 200
+
+
 def test_more_parameters_than_a_surrogate_can_have(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surrogate, "MOST_TERMS", 3)
     posterior = sample(result, **SHORT | {"allow_short": True})
