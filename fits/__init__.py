@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fits.inference.identifiability import Combination as Combination
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
-    from fits.inference.posterior import sample as sample
+    from fits.inference.sampling import sample as sample
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -53,7 +53,7 @@ _HOMES = {
     "Normal": "problem.parameters",
     "Uniform": "problem.parameters",
     "Posterior": "inference.posterior",
-    "sample": "inference.posterior",
+    "sample": "inference.sampling",
     "Problem": "problem.problem",
     "report": "reporting.html",
     "load_fit": "reporting.results",

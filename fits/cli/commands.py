@@ -9,7 +9,9 @@ from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fits._files import write_bytes, write_text, write_together
 from fits.data.formats import read
@@ -22,12 +24,12 @@ if TYPE_CHECKING:
     from layerjax import Stack
 
 DONE, DOUBTFUL = 0, 1
-WALKERS = 32
 
 
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     _use_jax()
+    from fits.inference.nuts import require_blackjax
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
@@ -39,6 +41,8 @@ def fit(arguments: Namespace) -> int:
     objective = arguments.objective or given.objective
     if arguments.sample and objective != "likelihood":
         raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
+    if arguments.sample and arguments.sampler == "nuts":
+        require_blackjax()
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
     with results.reserved(directory, arguments.force), show_progress() as progress, _hint(kept):
@@ -78,20 +82,21 @@ def sample(arguments: Namespace) -> int:
 
 
 def _sample(directory: Path, arguments: Namespace) -> int:
-    from fits.inference.posterior import sample as run_sampler
+    from fits.inference.sampling import sample as run_sampler
     from fits.reporting import results, tables, verdicts
 
     result = results.load_fit(directory)
     if not result.is_posterior:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
-    walkers, seed = _chain_settings(directory / results.CHAIN, arguments)
+    settings = _chain_settings(directory / results.CHAIN, arguments)
     again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
     with show_progress() as progress, _hint(again):
         posterior = run_sampler(
             result,
-            walkers=walkers,
+            **settings,
+            surrogate=arguments.surrogate,
+            ess=arguments.ess,
             max_steps=arguments.max_steps,
-            seed=seed,
             path=directory / results.CHAIN,
             resume=not arguments.force,
             allow_short=arguments.allow_short,
@@ -108,23 +113,26 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         tables.print_table(tables.posterior_table(posterior), sys.stdout)
     for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
         print(sentence)
-    if not posterior.converged:
-        print(f"To go on: layerjax sample {directory} --max-steps {2 * len(posterior.chain)}")
-    return DONE if posterior.converged else DOUBTFUL
+    reached = float(np.min(posterior.effective_samples))
+    enough = posterior.converged and (arguments.ess is None or reached >= arguments.ess)
+    if not enough:
+        asked = "" if arguments.ess is None else f" --ess {arguments.ess}"
+        print(f"To go on: layerjax sample {directory}{asked} --max-steps {2 * len(posterior.chain)}")
+    return DONE if enough else DOUBTFUL
 
 
-def _chain_settings(path: Path, arguments: Namespace) -> tuple[int, int]:
-    """Walkers and seed: those of the chain that is there, which arguments must not contradict, or the defaults."""
+def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
+    """Sampler, walkers and seed: those of the chain that is there, which arguments must not contradict, or defaults."""
     from fits.inference.chain import read_chain
 
-    settings = {"walkers": arguments.walkers, "seed": arguments.seed}
     stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
-    for name, default in (("walkers", WALKERS), ("seed", 0)):
-        wanted, there = settings[name], stored.get(name)
+    settings: dict[str, Any] = {}
+    for name, kind, default in (("sampler", str, "emcee"), ("walkers", int, None), ("seed", int, 0)):
+        wanted, there = getattr(arguments, name), stored.get(name)
         if wanted is not None and there is not None and wanted != there:
             raise ValueError(f"--{name} is {wanted}, the chain in {path} has {there} (--force starts it again)")
-        settings[name] = wanted if wanted is not None else int(default if there is None else there)
-    return settings["walkers"], settings["seed"]
+        settings[name] = wanted if wanted is not None else default if there is None else kind(there)
+    return settings
 
 
 def report(arguments: Namespace) -> int:

@@ -221,7 +221,23 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 
 def _add_sampling(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("sampling")
-    group.add_argument("--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32)")
+    group.add_argument(
+        "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
+    )
+    group.add_argument(
+        "--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32; 4 chains of nuts)"
+    )
+    group.add_argument(
+        "--ess",
+        type=_count,
+        metavar="N",
+        help="go on until the worst parameter has N effective samples (default: until the chain is long enough)",
+    )
+    group.add_argument(
+        "--surrogate",
+        action=argparse.BooleanOptionalAction,
+        help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
+    )
     group.add_argument("--max-steps", type=_count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
     group.add_argument(
         "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"

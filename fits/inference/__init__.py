@@ -13,13 +13,13 @@ if TYPE_CHECKING:
     from fits.inference.identifiability import Combination as Combination
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
-    from fits.inference.posterior import sample as sample
+    from fits.inference.sampling import sample as sample
 
 _HOMES = {
     "Fit": "fit_result",
     "fit": "optimise",
     "Posterior": "posterior",
-    "sample": "posterior",
+    "sample": "sampling",
     "Comparison": "compare",
     "Combination": "identifiability",
 }

@@ -5,7 +5,8 @@ whole chain goes to an HDF5 file, written beside the old one and renamed over it
 `emcee.backends.HDFBackend`, which opens it. Opening reads the HDF5 file, then the journal's records beyond it up to the
 first that is not whole: what is lost is at most the step that was being written, and since the random state is part of
 a record, the chain goes on as if nothing had happened. One process writes, and holds a lock (``.lock``) while it does;
-others read what is there. The HDF5 file begins with a user block, which HDF5 skips, with a checksum of what follows: a
+others read what is there. How the chain is moved is decided before its first step and stored with it, so that it goes
+on in the same way. The HDF5 file begins with a user block, which HDF5 skips, with a checksum of what follows: a
 damaged file is recognised before HDF5, which may never return from one, sees it.
 """
 
@@ -27,6 +28,9 @@ from numpy.typing import NDArray
 from fits._files import locked, named, write_bytes, write_whole
 
 GROUP = "mcmc"
+MOVES = "layerjax_moves"
+SURROGATE = ".surrogate"
+"""Suffix of a file beside a chain: what is known of a surrogate that is not yet built."""
 IDENTITY = "layerjax_"
 TITLE, USER_BLOCK = b"chain of layerjax", 512
 BEFORE_CHECKSUMS = b"\x89HDF"
@@ -35,11 +39,19 @@ RandomState = tuple[str, NDArray[np.uint32], int, int, float]
 
 
 class MemoryChain(Backend):
-    """A chain in memory that grows in blocks; the same interface as `FileChain` without the files."""
+    """A chain in memory that grows in blocks; the same interface as `FileChain` without the files.
+
+    moves: how it is moved, in numbers, words and arrays; empty where that is not decided, or was before it could be.
+    """
 
     def __init__(self, walkers: int, count: int):
         super().__init__()
         self.reset(walkers, count)
+        self.moves: dict[str, Any] = {}
+
+    def decide(self, moves: Mapping[str, Any]) -> None:
+        """How the chain is moved from its first step on."""
+        self.moves = dict(moves)
 
     def grow(self, ngrow: int, blobs: Any) -> None:
         """Room for `ngrow` more steps, at least doubling, so that growing stays cheap."""
@@ -53,7 +65,7 @@ class MemoryChain(Backend):
         Returns the number of the chain, and the length of these records in bytes.
         """
         self.chain, self.log_prob, self.accepted = stored["chain"], stored["log_prob"], stored["accepted"]
-        self.iteration, self.random_state = len(self.chain), stored["random_state"]
+        self.iteration, self.random_state, self.moves = len(self.chain), stored["random_state"], stored["moves"]
         number, whole = int(stored["number"]), 0
         kind = _record_type(*self.shape)
         records = np.frombuffer(journal[: len(journal) // kind.itemsize * kind.itemsize], kind)
@@ -99,8 +111,9 @@ class FileChain(MemoryChain):
             raise
 
     def _take(self, resume: bool) -> None:
-        for left in self.path.parent.glob(f".{glob.escape(self.path.name)}.????????"):
-            left.unlink()  # what a process wrote as it was killed
+        for name in (self.path.name, self.path.with_suffix(SURROGATE).name):
+            for left in self.path.parent.glob(f".{glob.escape(name)}.????????"):
+                left.unlink()  # what a process wrote as it was killed
         if resume and self.path.exists():
             stored = read_chain(self.path)
             _refuse_others(self.path, stored["identity"], self.identity)
@@ -115,6 +128,11 @@ class FileChain(MemoryChain):
             self._journal = self._open.enter_context(os.fdopen(descriptor, "r+b", buffering=0))
             self._journal.truncate(whole)
             self._journal.seek(whole)
+
+    def decide(self, moves: Mapping[str, Any]) -> None:
+        """How the chain is moved from its first step on, kept in the file."""
+        super().decide(moves)
+        self._write_file()
 
     def save_step(self, state: emcee.State, accepted: NDArray[np.bool_]) -> None:
         """Keep a step, in memory and in the journal."""
@@ -153,6 +171,8 @@ class FileChain(MemoryChain):
                 group.attrs[f"random_state_{index}"] = part
             for name, value in self.identity.items():
                 group.attrs[IDENTITY + name] = value
+            for name, value in self.moves.items():
+                file[f"{MOVES}/{name}"] = value
             group["accepted"] = self.accepted
             group.create_dataset("chain", data=self.chain[: self.iteration], maxshape=(None, walkers, count))
             group.create_dataset("log_prob", data=self.log_prob[: self.iteration], maxshape=(None, walkers))
@@ -177,7 +197,7 @@ def stored_chain(path: str | Path, identity: Callable[[dict[str, Any]], Mapping[
 
 
 def read_chain(path: str | Path) -> dict[str, Any]:
-    """What an HDF5 chain holds: chain, log_prob, accepted, random_state, number, identity.
+    """What an HDF5 chain holds: chain, log_prob, accepted, random_state, number, moves, identity.
 
     Raises ValueError for a file that is no chain, or a damaged one.
     """
@@ -204,7 +224,10 @@ def read_chain(path: str | Path) -> dict[str, Any]:
                 "accepted": group["accepted"][...],
                 "random_state": _native([attributes[f"random_state_{index}"] for index in range(5)]) if count else None,
                 "number": attributes[f"{IDENTITY}number"],
-                "identity": {
+                "moves": {name: _plain(part[()]) for name, part in file.get(MOVES, {}).items()},
+                # before there was a choice, it was emcee
+                "identity": {"sampler": "emcee"}
+                | {
                     name.removeprefix(IDENTITY): value
                     for name, value in attributes.items()
                     if name.startswith(IDENTITY)
@@ -218,10 +241,15 @@ def read_chain(path: str | Path) -> dict[str, Any]:
 def _refuse_others(path: Path, stored: Mapping[str, Any], identity: Mapping[str, Any]) -> None:
     for name, value in identity.items():
         if not _agrees(stored.get(name), value):
-            raise ValueError(
-                f"{path} holds a chain of another problem or setting ({name} differs): "
-                "give another path, or resume=False to replace it"
-            )
+            raise ValueError(another(path, name))
+
+
+def another(path: str | Path, name: str) -> str:
+    """That a file holds a chain of something else, by what differs."""
+    return (
+        f"{path} holds a chain of another problem or setting ({name} differs): "
+        "give another path, or resume=False to replace it"
+    )
 
 
 def _content(journal: Path) -> bytes:
@@ -230,6 +258,10 @@ def _content(journal: Path) -> bytes:
 
 def _user_block(image: bytes) -> bytes:
     return (b"%b; CRC-32 of what follows these 512 bytes: %08x\n" % (TITLE, zlib.crc32(image))).ljust(USER_BLOCK, b"\0")
+
+
+def _plain(value: Any) -> Any:
+    return value.decode() if isinstance(value, bytes) else value
 
 
 def _native(state: list[Any]) -> RandomState:

@@ -16,6 +16,7 @@ from scipy.special import expit, gammaln, logit
 
 from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import Fit
+from fits.problem.problem import Problem
 
 DEGREES_OF_FREEDOM = 6.0
 WIDEST = 2.0  # in log-odds, where a uniform density over the box has a standard deviation of 1.8
@@ -47,8 +48,8 @@ class Approximation:
         box = fit.problem.model.box
         vector = jnp.asarray(fit.vector)
         unit = np.clip(np.asarray(box.to_unit(vector), float), INSIDE, 1.0 - INSIDE)
-        slope = np.abs(np.asarray(fit.problem.call(cost_and_gradient, unit)[1], float))
         held = np.isin(fit.problem.names, fit.at_bound)
+        slope = slope_at_bounds(fit.problem, unit, held)
         stretch = np.asarray(box.slope(vector), float) * unit * (1.0 - unit)  # d physical / d log-odds
         free = np.ix_(~held, ~held)
         values, directions = np.linalg.eigh((fit.covariance / np.outer(stretch, stretch))[free])
@@ -96,6 +97,16 @@ class Approximation:
         """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
         drawn = self.draw(generator, len(positions))
         return drawn, self.log_density(positions) - self.log_density(drawn)
+
+
+def slope_at_bounds(problem: Problem, unit: Floats, held: NDArray[np.bool_]) -> Floats:
+    """How steeply the log-posterior falls in the box, (P,), where a parameter is held by a bound; 0 if none is.
+
+    The gradient of a costly model is not compiled for nothing.
+    """
+    if not held.any():
+        return np.zeros(len(unit))
+    return np.abs(np.asarray(problem.call(cost_and_gradient, unit)[1], float))
 
 
 def first_positions(

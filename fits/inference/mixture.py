@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit, logit, logsumexp
 
-from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import Fit
-from fits.inference.laplace import student, student_draws
+from fits.inference.laplace import slope_at_bounds, student, student_draws
 from fits.inference.ridge import height, open_directions, ridge, vector_at
 from fits.inference.uncertainty import local_information
 
@@ -46,8 +45,8 @@ class Mixture:
         """The mixture about the points of a fit's ridge, as wide as the information there; None without a ridge."""
         problem = fit.problem
         optimum = np.asarray(problem.model.box.to_unit(jnp.asarray(fit.vector)), float)
-        slope = np.abs(np.asarray(problem.call(cost_and_gradient, optimum)[1], float))
         held = np.isin(problem.names, fit.at_bound)
+        slope = slope_at_bounds(problem, optimum, held)
         # what is hardly pressed against its bound, and open with others, lies along the ridge
         if held.any():
             part = np.sum(open_directions(problem, optimum, np.ones_like(held)) ** 2, axis=0)

@@ -1,58 +1,42 @@
-"""Sampling the posterior about a fit with emcee, until the chain is long enough to be believed.
-
-Half the steps are emcee's stretch moves, half are independent proposals from an approximation, the fit's own or one
-learned from the chain (`laplace`). The ensemble moves in unconstrained coordinates, where the box has no walls;
-everything that is reported is physical.
-"""
+"""What a chain of samples says about the parameters of a fit: estimates, predictions, and how far to trust them."""
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import emcee
 import jax
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
-from scipy.special import logit
-from scipy.stats import qmc
 
-from fits.inference.chain import FileChain, MemoryChain, stored_chain
+from fits.inference.chain import MemoryChain
 from fits.inference.fit_result import Fit
-from fits.inference.laplace import Approximation, first_positions
-from fits.inference.mixture import Mixture
+from fits.inference.length import BURN_IN, LONG_ENOUGH, STEADY, autocorrelation_times, long_enough
 from fits.problem.model import Model
-from fits.problem.problem import Problem
-from fits.progress import Progress
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
-FIRST_CHECK = 100
-LONG_ENOUGH = 50.0
-STEADY = 0.05
-BURN_IN = 10
 REPORTED_DRAWS = 2048
-INDEPENDENT = 0.5
 
 Floats = NDArray[np.float64]
-Proposals = Approximation | Mixture
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """An ensemble chain of P parameters and what it says.
+    """Chains of P parameters, an ensemble of walkers or a few of NUTS, and what they say.
 
     Attributes:
         chain: (steps, walkers, P), physical values, from the start on.
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its first tenth.
-        acceptance: mean share of proposals taken.
+        acceptance: mean share of proposals taken; of NUTS, of steps that moved.
         converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
             changed by less than 5 % since the last check.
         allow_short: estimates may be had from a chain that has not converged.
+        status: what is to be said of the sampler, if anything.
+        divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
     """
 
     fit: Fit
@@ -62,6 +46,8 @@ class Posterior:
     acceptance: float
     converged: bool
     allow_short: bool = False
+    status: str = ""
+    divergences: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -145,122 +131,29 @@ class Posterior:
         )
 
 
-def sample(
-    fit: Fit,
-    *,
-    walkers: int = 32,
-    seed: int = 0,
-    path: str | Path | None = None,
-    max_steps: int = 20_000,
-    resume: bool = True,
-    allow_short: bool = False,
-    progress: Progress | None = None,
-) -> Posterior:
-    """Sample the posterior of a fit until its chain is long enough, or `max_steps` steps.
-
-    Args:
-        fit: made with a likelihood.
-        walkers: even, at least twice the number of parameters plus 2.
-        seed: of starts and moves; the same seed gives the same chain.
-        path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
-            again goes on from its last whole step and ends as it would have. One process at a time writes it, any
-            number may read it. None keeps it in memory.
-        max_steps: hard limit; a chain that reaches it is not `converged`.
-        resume: False replaces what `path` holds.
-        allow_short: let the result report estimates though the chain has not converged.
-        progress: called with ("sample", steps, None, note).
-
-    Raises:
-        ValueError: the fit's objective is no likelihood; too few walkers; `path` holds a chain of something else, or is
-            in use by another process; no start with a finite posterior near the optimum.
-        OSError: the disk is full, say. What was sampled is kept.
-    """
-    problem = fit.problem
-    if not fit.is_posterior:
-        raise ValueError(f"objective {problem.objective!r} is no likelihood, so there is no posterior to sample")
-    count = len(problem.names)
-    if walkers % 2 or walkers < 2 * count + 2:
-        raise ValueError(f"walkers is {walkers}; it must be even and at least {2 * count + 2} for {count} parameters")
-    if max_steps < FIRST_CHECK:
-        raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
-    if path is not None and not Path(path).parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
-    identity = _identity(problem, walkers, seed)
-    chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
-    try:
-        initial = Mixture.of(fit) or Approximation.of(fit)
-        while not _finished(chain, max_steps):
-            state = chain.get_last_sample() if chain.iteration else _first_state(problem, initial, walkers, seed)
-            sampler = _sampler(problem, walkers, chain, initial)
-            target = min(_next_check(chain.iteration), max_steps)
-            # walkers are drawn from a density of full rank: emcee need not look whether they are
-            sampler.run_mcmc(state, target - chain.iteration, skip_initial_state_check=True)
-            chain.checkpoint()
-            if progress is not None:
-                progress("sample", chain.iteration, None, _note(chain))
-        chain.checkpoint()  # what a killed run left in the journal alone
-    finally:
-        chain.close()
-    return _posterior(fit, chain, allow_short)
-
-
-class NoSteps(ValueError):
-    """A chain that has not begun."""
-
-
-def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
-    """The posterior kept in a file by `sample`, as far as it got. ValueError if the file is not a chain of this fit."""
-    if not Path(path).is_file():
-        raise ValueError(f"{path}: there is no chain")
-
-    def expected(stored: dict[str, Any]) -> dict[str, Any]:
-        return _identity(fit.problem, int(stored["walkers"]), int(stored["seed"]))
-
-    chain = stored_chain(path, expected)
-    if not chain.iteration:
-        raise NoSteps(f"{path}: the chain has no steps yet")
-    return _posterior(fit, chain, allow_short)
-
-
-def _sampler(problem: Problem, walkers: int, chain: MemoryChain, initial: Proposals) -> emcee.EnsembleSampler:
-    def log_posteriors(positions: Floats) -> Floats:
-        return np.asarray(problem.call(_log_posteriors, positions), float)
-
-    approximation = _adapted(chain, initial)
-    moves = [(emcee.moves.MHMove(approximation.propose), INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
-    return emcee.EnsembleSampler(
-        walkers, len(problem.names), log_posteriors, moves=moves, vectorize=True, backend=chain
+def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Posterior:
+    """What a chain of a fit's posterior says."""
+    positions, moves = chain.get_chain(), chain.moves
+    taken = float(np.mean(chain.accepted) / chain.iteration)
+    divergences, words = 0, str(moves.get("words", ""))
+    if moves.get("sampler") == "nuts":
+        divergences = round((1.0 - taken) * positions[..., 0].size)  # what its records hold
+        taken = float(np.mean(np.any(np.diff(positions, axis=0), axis=-1))) if len(positions) > 1 else 1.0
+        words = f"NUTS, {divergences} divergent steps of {positions[..., 0].size}"
+        words += ", near which it may have missed a part of the posterior" if divergences else ""
+    return Posterior(
+        fit=fit,
+        chain=np.asarray(fit.problem.call(_constrained, positions.reshape(-1, positions.shape[-1]))).reshape(
+            positions.shape
+        ),
+        log_probability=chain.get_log_prob(),
+        autocorrelation_time=autocorrelation_times(chain, len(positions)),
+        acceptance=taken,
+        converged=long_enough(chain),
+        allow_short=allow_short,
+        status=words,
+        divergences=divergences,
     )
-
-
-def _adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
-    """The fit's approximation, or one learned from the second half of the chain up to its last check if that is closer.
-
-    As checks grow apart, so the adaptation fades; and it depends on whole checks only, so that a resumed chain is the
-    same.
-    """
-    _, check = _last_checks(chain.iteration)
-    if not check:
-        return initial
-    positions = chain.chain[check // 2 : check]
-    positions = positions.reshape(-1, positions.shape[-1])
-    candidates: list[Proposals] = [initial, Approximation.learned(positions)]
-    if isinstance(initial, Mixture):
-        candidates.append(initial.refined(positions))
-    return max(candidates, key=lambda candidate: candidate.mean_log_density(positions))
-
-
-def _first_state(problem: Problem, approximation: Proposals, walkers: int, seed: int) -> emcee.State:
-    def finite(positions: Floats) -> bool:
-        return bool(np.all(np.isfinite(problem.call(_log_posteriors, positions))))
-
-    generator = np.random.RandomState(seed)
-    positions = first_positions(approximation.draw, finite, walkers, generator)
-    return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
-
-
-def _log_posteriors(model: Model, positions: Array) -> Array:
-    return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
 
 
 def _over_samples(model: Model, vectors: Array) -> tuple[Array, Array, Array]:
@@ -272,79 +165,3 @@ def _over_samples(model: Model, vectors: Array) -> tuple[Array, Array, Array]:
 
 def _constrained(model: Model, positions: Array) -> Array:
     return jax.vmap(model.box.constrain)(positions)
-
-
-def _next_check(step: int) -> int:
-    """Checks come after 100, 200, ... steps, later a tenth further each: the same however often a run resumes."""
-    check = FIRST_CHECK
-    while check <= step:
-        check += _interval(check)
-    return check
-
-
-def _interval(check: int) -> int:
-    return FIRST_CHECK * max(1, round(check / BURN_IN / FIRST_CHECK))
-
-
-def _last_checks(step: int) -> tuple[int, int]:
-    """The last check up to this step, and the one before; 0 for none."""
-    before, check, following = 0, 0, FIRST_CHECK
-    while following <= step:
-        before, check, following = check, following, following + _interval(following)
-    return before, check
-
-
-def _times(chain: MemoryChain, steps: int) -> Floats:
-    kept = chain.chain[steps // BURN_IN : steps]
-    with np.errstate(invalid="ignore"):  # a single step has no variance to divide by
-        times = emcee.autocorr.integrated_time(kept, tol=0)
-    return np.where(np.isfinite(times), times, math.inf)
-
-
-def _converged(chain: MemoryChain) -> bool:
-    before, check = _last_checks(chain.iteration)
-    if not before:
-        return False
-    times, earlier = _times(chain, check), _times(chain, before)
-    kept = check - check // BURN_IN
-    return bool(np.all(kept > LONG_ENOUGH * times) and np.all(np.abs(times - earlier) < STEADY * times))
-
-
-def _finished(chain: MemoryChain, max_steps: int) -> bool:
-    if chain.iteration:
-        return chain.iteration >= max_steps or (chain.iteration in _last_checks(chain.iteration) and _converged(chain))
-    return False
-
-
-def _note(chain: MemoryChain) -> str:
-    longest = float(np.max(_times(chain, chain.iteration)))
-    return f"autocorrelation time {longest:.0f}, needs {LONG_ENOUGH * longest * BURN_IN / (BURN_IN - 1):.0f} steps"
-
-
-def _identity(problem: Problem, walkers: int, seed: int) -> dict[str, Any]:
-    """What tells one sampling from another: names, bounds, settings, and the posterior itself at a few points."""
-    points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
-    posteriors = problem.call(_log_posteriors, logit(points))
-    return {
-        "names": "\n".join(problem.names),
-        "bounds": np.stack([problem.low, problem.high]),
-        "posterior": np.asarray(posteriors, float),
-        "walkers": walkers,
-        "seed": seed,
-    }
-
-
-def _posterior(fit: Fit, chain: MemoryChain, allow_short: bool) -> Posterior:
-    positions = chain.get_chain()
-    times = _times(chain, len(positions))
-    return Posterior(
-        fit=fit,
-        chain=np.asarray(fit.problem.call(_constrained, positions.reshape(-1, positions.shape[-1]))).reshape(
-            positions.shape
-        ),
-        log_probability=chain.get_log_prob(),
-        autocorrelation_time=times,
-        acceptance=float(np.mean(chain.accepted) / chain.iteration),
-        converged=_converged(chain),
-        allow_short=allow_short,
-    )

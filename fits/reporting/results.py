@@ -191,7 +191,7 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     Raises:
         ValueError: on one line, for a damaged file.
     """
-    from fits.inference.posterior import NoSteps, load
+    from fits.inference.sampling import NoSteps, load
 
     directory = Path(directory)
     if not (directory / CHAIN).is_file():
@@ -220,6 +220,8 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "walkers": posterior.chain.shape[1],
         "burn_in": posterior.burn_in,
         "acceptance": posterior.acceptance,
+        "status": posterior.status,
+        "divergences": posterior.divergences,
         "parameters": [
             {
                 "name": name,

@@ -243,6 +243,8 @@ def sampled(posterior: "Posterior") -> list[str]:
         f"The effective sample size is at least {float(np.min(posterior.effective_samples)):.0f}; "
         f"{posterior.acceptance:.0%} of the proposals were accepted.",
     ]
+    if posterior.status:
+        sentences.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
         sentences.append(
             "The chain is too short (under 50 autocorrelation times, or these still change): "

@@ -202,7 +202,7 @@ def test_results_are_compared(work: Path, capsys: pytest.CaptureFixture[str], co
 def test_sampling_goes_on_until_it_is_enough(work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit) -> None:
     save_fit(coat_fit, "result")
     words = ["sample", "result", "--walkers", "8", "--seed", "3"]
-    assert main([*words, "--max-steps", "100"]) == 1
+    assert main([*words, "--max-steps", "100", "--no-surrogate"]) == 1
     assert "no estimates yet" in capsys.readouterr().out
     assert not (work / "result" / "summary.json").exists()
     posterior = load_posterior("result")
@@ -226,6 +226,20 @@ def test_sampling_goes_on_until_it_is_enough(work: Path, capsys: pytest.CaptureF
     assert text.count("data:image/png") == 7  # stack, curves, maps, residuals, correlation, corner, trace
     assert main(["sample", "result"]) == 0
     assert (work / "result" / "summary.json").read_text() == summary
+    assert main(["sample", "result", "--ess", "1000000", "--max-steps", str(len(longer.chain))]) == 1
+    assert f"layerjax sample result --ess 1000000 --max-steps {2 * len(longer.chain)}" in capsys.readouterr().out
+    assert "(surrogate differs)" in refused(["sample", "result", "--surrogate"], capsys, work)
+
+
+def test_sampling_with_a_surrogate_says_so(work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit) -> None:
+    save_fit(coat_fit, "result")
+    assert main(["sample", "result", "--walkers", "16", "--ess", "2000", "--surrogate"]) == 0
+    shown = capsys.readouterr()
+    assert "The sampler: proposals from a surrogate of degree" in shown.out
+    assert "layerjax: surrogate" in shown.err
+    assert "proposals from a surrogate" in (work / "result" / "report.html").read_text()
+    assert "proposals from a surrogate" in json.loads((work / "result" / "summary.json").read_text())["status"]
+    assert main(["sample", "result"]) == 0
 
 
 def test_an_interrupted_sampler_says_how_to_go_on(
@@ -235,7 +249,7 @@ def test_an_interrupted_sampler_says_how_to_go_on(
         raise KeyboardInterrupt
 
     save_fit(coat_fit, "result")
-    monkeypatch.setattr("fits.inference.posterior.sample", interrupted)
+    monkeypatch.setattr("fits.inference.sampling.sample", interrupted)
     assert main(["sample", "result"]) == 130
     assert "`layerjax sample result` goes on with it" in capsys.readouterr().err
 

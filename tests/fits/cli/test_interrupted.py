@@ -18,7 +18,8 @@ from fits.inference import starts
 from fits.inference.chain import FileChain
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
-from fits.inference.posterior import Posterior, _identity, load, sample
+from fits.inference.posterior import Posterior
+from fits.inference.sampling import identity_of, load, sample
 from fits.inference.starts import start_points
 from fits.inference.starts_file import StartsFile
 from fits.problem.likelihood import Noise
@@ -200,7 +201,7 @@ def test_beside_a_running_sampler_others_only_read(
     for name in ("result", "other"):
         save_fit(coat_fit, name)
     directory = work / "result"
-    words = ["sample", "result", "--walkers", "32", "--seed", "3"]
+    words = ["sample", "result", "--walkers", "32", "--seed", "3", "--no-surrogate"]
 
     def seen() -> dict[str, tuple[int, int, bytes]]:
         entries = [(path, path.stat()) for path in directory.iterdir()]
@@ -222,11 +223,34 @@ def test_beside_a_running_sampler_others_only_read(
     assert posterior is not None
     loaded = load_fit(directory)
     whole = sample(loaded, walkers=32, seed=3, path=directory / "chain.h5")
-    again = sample(loaded, walkers=32, seed=3)
+    again = sample(loaded, walkers=32, seed=3, surrogate=False)
     assert 2 < len(posterior.chain) < len(again.chain)
     np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
     np.testing.assert_array_equal(whole.chain, again.chain)
     assert not (directory / "chain.lock").exists()
+
+
+@pytest.mark.parametrize("moment", ["chain.surrogate", "chain.journal"])
+def test_a_killed_sampler_goes_on_with_its_surrogate(
+    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, tmp_path_factory: pytest.TempPathFactory, moment: str
+) -> None:
+    """Killed while the surrogate is built, and while it is used."""
+    save_fit(coat_fit, "result")
+    words = ["sample", "result", "--walkers", "16", "--seed", "3", "--surrogate"]
+
+    def begun() -> bool:
+        return (work / "result" / moment).is_file() and (work / "result" / moment).stat().st_size > 0
+
+    with stopped(words, tmp_path_factory.getbasetemp() / "cache", begun) as process:
+        assert f"in use by another process ({process.pid})" in refusal(words, capsys)
+        posterior = load_posterior("result")
+        assert (posterior is None) == (moment == "chain.surrogate")
+    loaded = load_fit("result")
+    options = {"walkers": 16, "seed": 3, "surrogate": True}
+    whole, again = sample(loaded, path="result/chain.h5", **options), sample(loaded, **options)
+    np.testing.assert_array_equal(whole.chain, again.chain)
+    assert whole.status == again.status
+    assert not {"chain.surrogate", "chain.journal", "chain.lock"} & set(os.listdir("result"))
 
 
 def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
@@ -283,7 +307,7 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path: Path) -> None:
 def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     path = tmp_path / "result" / "chain.h5"
-    FileChain(path, 16, 2, _identity(coat_fit.problem, 16, 0)).close()
+    FileChain(path, 16, 2, identity_of(coat_fit.problem, 16, 0)).close()
     assert load_posterior(tmp_path / "result") is None
     with pytest.raises(ValueError, match="no steps yet"):
         load(coat_fit, path)

@@ -8,7 +8,7 @@ from scipy import stats
 
 from fits.inference.compare import compare
 from fits.inference.optimise import fit
-from fits.inference.posterior import sample
+from fits.inference.sampling import sample
 from fits.problem.parameters import Free
 from tests.helpers.models import design, line, measured
 

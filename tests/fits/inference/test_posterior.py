@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from fits.inference import length
 from fits.inference.chain import FileChain, MemoryChain
+from fits.inference.ensemble import Ensemble, adapted
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
 from fits.inference.optimise import fit
-from fits.inference.posterior import _adapted, _identity, _sampler, load, sample
+from fits.inference.sampling import _walkers, identity_of, load, sample
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from tests.helpers.models import COUNT, LINE, design, line, line_data, line_fit, measured
@@ -63,6 +65,31 @@ def test_it_stops_when_the_chain_is_long_enough(posterior) -> None:
     assert posterior.samples.shape == (-(-kept // posterior.thin) * 16, 2)
 
 
+def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, posterior, tmp_path: Path) -> None:
+    """A chain goes on for more of them, to the same end as one that was asked for them at once, and is left as it is
+    for fewer."""
+    path, notes = tmp_path / "chain.h5", []
+    sample(result, walkers=16, seed=1, path=path)
+    wanted = 4.0 * posterior.effective_samples.min()
+    more = sample(result, walkers=16, seed=1, path=path, ess=wanted, progress=lambda *given: notes.append(given[-1]))
+    assert more.effective_samples.min() >= wanted
+    assert len(more.chain) < 6 * len(posterior.chain)
+    np.testing.assert_array_equal(more.chain[: len(posterior.chain)], posterior.chain)
+    np.testing.assert_array_equal(sample(result, walkers=16, seed=1, ess=wanted).chain, more.chain)
+    assert len(sample(result, walkers=16, seed=1, path=path, ess=1.0).chain) == len(more.chain)
+    assert f"of {wanted:g} effective samples, needs" in notes[0]
+    assert notes[0].endswith("s left")
+    assert not notes[-1].endswith("left")
+
+
+def test_a_slow_chain_is_told_of_between_its_checks(result: Fit, posterior, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = []
+    monkeypatch.setattr(length, "PATIENCE", 0.0)
+    again = sample(result, walkers=16, seed=1, max_steps=120, progress=lambda *given: steps.append(given[1]))
+    assert steps == [*range(1, 101), 100, *range(101, 121), 120]
+    np.testing.assert_array_equal(again.chain, posterior.chain[:120])
+
+
 def test_the_same_seed_gives_the_same_chain_whatever_numpys_global_state(result: Fit, posterior) -> None:
     np.random.seed(99)  # noqa: NPY002  it is this state that emcee would start from
     again = sample(result, walkers=16, seed=1)
@@ -97,7 +124,7 @@ def test_the_approximation_is_learned_where_the_fits_own_is_poor(result: Fit, of
     positions = law.rvs(1600, random_state=generator) if offset else own.draw(generator, 1600)
     chain = MemoryChain(16, 2)
     chain.chain, chain.iteration = positions.reshape(100, 16, 2), 100
-    chosen = _adapted(chain, own)
+    chosen = adapted(chain, own)
     assert (chosen is own) == (offset == 0.0)
     if offset:
         np.testing.assert_allclose(chosen.centre, law.mean, atol=5 * np.sqrt(0.5 / 800))
@@ -175,10 +202,8 @@ def test_a_torn_journal_costs_one_step(result: Fit, posterior, tmp_path: Path) -
 
     with pytest.raises(Stop):
         sample(result, walkers=16, seed=1, path=path, progress=stop)
-    chain = FileChain(path, 16, 2, _identity(result.problem, 16, 1))
-    _sampler(result.problem, 16, chain, Approximation.of(result)).run_mcmc(
-        chain.get_last_sample(), 7, skip_initial_state_check=True
-    )
+    chain = FileChain(path, 16, 2, identity_of(result.problem, 16, 1))
+    Ensemble(result, chain, 1).sampler().run_mcmc(chain.get_last_sample(), 7, skip_initial_state_check=True)
     chain.close()
     journal = path.with_suffix(".journal")
     whole = journal.read_bytes()
@@ -196,7 +221,7 @@ import sys, time
 import jax
 jax.config.update("jax_enable_x64", True)
 import numpy as np
-from fits.inference.posterior import sample
+from fits.inference.sampling import sample
 from tests.helpers.models import line_fit
 result = line_fit()
 print("ready", flush=True)
@@ -289,12 +314,19 @@ def test_free_student_noise_is_sampled() -> None:
     [
         ({"walkers": 4}, "walkers is 4; it must be even and at least 6"),
         ({"walkers": 17}, "walkers is 17"),
+        ({"ess": 0.0}, "ess is 0.0; it must be above 0"),
         ({"max_steps": 10}, "max_steps is 10; it must be at least 100"),
     ],
 )
 def test_refused(result: Fit, options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         sample(result, **options)
+
+
+def test_there_are_enough_walkers_for_many_parameters() -> None:
+    assert _walkers("emcee", None, 3) == 32
+    assert _walkers("emcee", None, 20) == 42
+    assert _walkers("nuts", None, 20) == 4
 
 
 def test_a_named_objective_has_no_posterior() -> None:

@@ -8,8 +8,8 @@ from scipy import stats
 
 import layerjax as lj
 from fits.inference.optimise import fit
-from fits.inference.posterior import sample
 from fits.inference.ridge import ridge
+from fits.inference.sampling import sample
 from fits.problem.parameters import Free, LogUniform
 from tests.helpers.models import directions, measured
 

@@ -10,7 +10,7 @@ import pytest
 
 from fits.inference.chain import USER_BLOCK, read_chain
 from fits.inference.fit_result import Fit
-from fits.inference.posterior import load, sample
+from fits.inference.sampling import load, sample
 from fits.inference.starts import start_points
 from fits.inference.starts_file import End, StartsFile
 from fits.reporting.results import load_fit, save_fit

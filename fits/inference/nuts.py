@@ -1,0 +1,122 @@
+"""A few chains of the No-U-Turn sampler (Hoffman and Gelman 2014) by blackjax: for many parameters.
+
+Its metric is the covariance of the fit's approximation, which whitens the posterior, refined once in the warm-up; the
+length of its steps is found by dual averaging. blackjax is an extra, and imported on first use.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import emcee
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from fits.inference.chain import MemoryChain
+from fits.inference.ensemble import log_posteriors
+from fits.inference.fit_result import Fit
+from fits.inference.laplace import Approximation, first_positions
+from fits.inference.mixture import Mixture
+from fits.problem.model import Model
+from fits.progress import Progress
+
+CHAINS = 4
+FIRST_STEP = 0.5  # in a whitened posterior
+TARGET = 0.95  # mean acceptance: with longer steps than that, chains diverge from narrow ridges that bend
+WARM_UP = (75, 75)  # steps before the metric is refined, and after
+SETTLING = 25  # of the former, which the metric is not learned from
+DRAWS = 4096  # of the approximation, for its covariance
+OWN_SAMPLES = 10  # that the approximation's covariance counts as, and one a parameter
+
+Floats = NDArray[np.float64]
+
+
+def require_blackjax() -> None:
+    """ValueError if the extra is not installed."""
+    try:
+        import blackjax  # noqa: F401
+    except ImportError:
+        raise ValueError('sampler="nuts" needs blackjax: pip install "layerjax[nuts]"') from None
+
+
+class Nuts:
+    """Moves the chains about the optimum of a fit. A step depends on the seed, its number, and where the chains are."""
+
+    def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
+        self.fit, self.problem, self.chain, self.seed = fit, fit.problem, chain, seed
+
+    def decide(self, progress: Progress | None) -> None:
+        """Before the first step, and for all: starts, metric and length of steps, by a warm-up that is not kept."""
+        generator = np.random.RandomState(self.seed)
+        initial = Mixture.of(self.fit) or Approximation.of(self.fit)
+        positions = first_positions(initial.draw, self._finite, self.chain.shape[0], generator)
+        metric, length, done = np.atleast_2d(np.cov(initial.draw(generator, DRAWS).T)), FIRST_STEP, 0
+        for steps in WARM_UP:
+            begin, update, end = _dual_averaging(TARGET)
+            state, visited = begin(length), []
+            for _ in range(steps):
+                done += 1
+                # before the chain's own steps, whose numbers are positive
+                positions, _, _, acceptance = self._step(positions, -done, float(np.exp(state.log_step_size)), metric)
+                state = update(state, float(np.mean(acceptance)))
+                visited.append(positions)
+                if progress is not None:
+                    progress("warm-up", done, sum(WARM_UP))
+            length = float(end(state))
+            if done < sum(WARM_UP):
+                metric = _refined(metric, np.concatenate(visited[SETTLING:]))
+        self.chain.decide({"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""})
+
+    def advance(self, step: int, tell: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `tell` of each."""
+        chain, moves = self.chain, self.chain.moves
+        positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
+        chain.grow(step - chain.iteration, None)
+        random_state = np.random.RandomState(self.seed).get_state()  # part of a record, of no use here
+        while chain.iteration < step:
+            positions, heights, divergent, _ = self._step(
+                positions, chain.iteration + 1, float(moves["length"]), np.asarray(moves["metric"])
+            )
+            state = emcee.State(positions, log_prob=heights, random_state=random_state)
+            chain.save_step(state, ~divergent)
+            tell()
+
+    def _step(self, positions: Floats, number: int, length: float, metric: Floats) -> tuple[Any, ...]:
+        found = self.problem.call(_step, positions, self.seed, number, length, metric)
+        return tuple(np.asarray(part) for part in found)
+
+    def _finite(self, positions: Floats) -> bool:
+        return bool(np.all(np.isfinite(self.problem.call(log_posteriors, positions))))
+
+
+def _dual_averaging(target: float) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
+    from blackjax.adaptation.step_size import dual_averaging_adaptation
+
+    return dual_averaging_adaptation(target)
+
+
+def _refined(metric: Floats, samples: Floats) -> Floats:
+    """The covariance of samples (n, P), of which correlated ones are few, with what was known before."""
+    own = OWN_SAMPLES + samples.shape[1]
+    return (len(samples) * np.atleast_2d(np.cov(samples.T)) + own * metric) / (len(samples) + own)
+
+
+def _step(
+    model: Model, positions: Array, seed: Array, number: Array, length: Array, metric: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Where a step takes each chain (n, P), the log-posterior there, whether it diverged, and its mean acceptance."""
+    from blackjax.mcmc import nuts
+
+    kernel, height = nuts.build_kernel(), model.log_posterior_unconstrained
+    key = jax.random.fold_in(jax.random.key(seed), number)
+
+    def one(given: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+        index, position = given
+        # the state made anew: a chain that goes on from its file is the same to the last bit
+        state = nuts.init(position, height)
+        state, info = kernel(jax.random.fold_in(key, index), state, height, length, metric)
+        return state.position, state.logdensity, info.is_divergent, info.acceptance_rate
+
+    return jax.lax.map(one, (jnp.arange(len(positions)), positions))

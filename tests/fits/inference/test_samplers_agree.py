@@ -1,0 +1,81 @@
+"""emcee by itself, delayed acceptance and NUTS sample one posterior: quantiles within a tenth of a deviation."""
+
+import numpy as np
+import pytest
+
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.inference.posterior import Posterior
+from fits.inference.sampling import sample
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
+
+SAMPLERS = {"delayed acceptance": {"surrogate": True}, "NUTS": {"sampler": "nuts"}}
+QUANTILES = [0.158655, 0.5, 0.841345]
+LEAST = 6000  # effective samples: a quantile is known to 0.04 of the deviation at worst
+
+
+def coated() -> Fit:
+    """Six parameters, a GGX coat among them."""
+    return fit(LOBE_STACK, noisy_lobe(0, 140), transport=lobe, starts=2)
+
+
+def on_a_bound() -> Fit:
+    """A line whose slope is best below its lower bound."""
+    return fit({"a": Free(0.9, -1.0, 3.0), "b": Free(2.0, 0.52, 3.0)}, line_data(), transport=line, starts=2)
+
+
+def with_a_free_level() -> Fit:
+    """A line, the level of its noise, and tails of Student's."""
+    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
+    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
+
+
+@pytest.fixture(scope="module", params=[coated, on_a_bound, with_a_free_level], ids=lambda made: made.__name__)
+def plain(request: pytest.FixtureRequest) -> Posterior:
+    fitted = request.param()
+    assert bool(fitted.at_bound) == (request.param is on_a_bound)
+    return sample(fitted, seed=1, ess=LEAST, surrogate=False)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_quantiles_are_those_of_emcee_by_itself(plain: Posterior, name: str) -> None:
+    if name == "NUTS":
+        pytest.importorskip("blackjax")
+    posterior = sample(plain.fit, seed=1, ess=LEAST, **SAMPLERS[name])
+    kept = [chain.chain[chain.burn_in :].reshape(-1, len(chain.names)) for chain in (posterior, plain)]
+    assert min(chain.effective_samples.min() for chain in (posterior, plain)) > LEAST - 1000
+    first, second = (np.quantile(samples, QUANTILES, axis=0) for samples in kept)
+    assert np.max(np.abs(first - second) / kept[1].std(axis=0)) < 0.1
+    if name == "delayed acceptance":
+        assert posterior.status.startswith("proposals from a surrogate of degree")
+        an_evaluation = [chain.effective_samples.min() / chain.chain[..., 0].size for chain in (posterior, plain)]
+        assert an_evaluation[0] > 1.2 * an_evaluation[1]
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_one_parameter(name: str) -> None:
+    """The slope of a line through a known point: mean and deviation in closed form."""
+    if name == "NUTS":
+        pytest.importorskip("blackjax")
+    fitted = fit({"a": 1.0, "b": Free(0.1, -1.0, 3.0)}, line_data(), transport=line, starts=2)
+    x = design(COUNT)[:, 1]
+    posterior = sample(fitted, seed=2, **SAMPLERS[name])
+    mean, spread = x @ (line_data().values[:, 0] - 1.0) / (x @ x), 0.05 / np.sqrt(x @ x)
+    _, _, _, average, deviation = posterior.summary()["['b']"]
+    error = 5 / np.sqrt(posterior.effective_samples.min())
+    assert average == pytest.approx(mean, abs=error * spread)
+    assert deviation == pytest.approx(spread, rel=error)
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_a_direction_that_is_open_fills_its_box(name: str) -> None:
+    if name == "NUTS":
+        pytest.importorskip("blackjax")
+    fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
+    posterior = sample(fitted, seed=3, **SAMPLERS[name])
+    kept = posterior.chain[posterior.burn_in :, :, posterior.names.index("['c']")]
+    error = 5 / np.sqrt(posterior.effective_samples.min())
+    assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
+    assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
