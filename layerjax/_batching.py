@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,27 @@ CHUNK_BYTES = 20_000
 
 BLOCK_CHUNKS = 4
 """Chunks that are transposed together."""
+
+
+def by_rows(function: Callable[[Any], Any], rows: Any, chunks: int = 2) -> Any:
+    """function over arrays that share their first axis, in chunks of it, at least two.
+
+    The loop keeps what goes in and what comes out in memory: XLA would fuse cheap consumers with dear producers, and
+    compute these again for each of the consumers.
+    """
+    count = jax.tree.leaves(rows)[0].shape[0]
+    chunks = max(2, chunks)
+    size = -(-count // chunks)
+    missing = chunks * size - count
+
+    def in_loop(array: Array) -> Array:
+        filled = (
+            jnp.concatenate([array, jnp.broadcast_to(array[-1:], (missing, *array.shape[1:]))]) if missing else array
+        )
+        return filled.reshape(chunks, size, *array.shape[1:])
+
+    found = jax.lax.map(function, jax.tree.map(in_loop, rows))
+    return jax.tree.map(lambda array: array.reshape(chunks * size, *array.shape[2:])[:count], found)
 
 
 def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Array:

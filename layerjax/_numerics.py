@@ -54,6 +54,16 @@ def at_least(x: Array, low: Array | float) -> Array:
     return jnp.where(x >= low, x, low)
 
 
+def not_negative(x: Array) -> Array:
+    """x, or 0 where it is negative; with the derivative of x where rounding alone may have made it so.
+
+    For what is a difference of numbers of the order of 1, and 0 at the end of a range.
+    """
+    rounding = 64.0 * float(jnp.finfo(x.dtype).eps)
+    inside = x >= -rounding
+    return jnp.where(inside, x - jax.lax.stop_gradient(jnp.minimum(x, 0.0)), 0.0)
+
+
 def at_most(x: Array, high: Array | float) -> Array:
     """x, or `high` (with derivative 0 in x) where x is larger; where they are equal, the derivative is that of x."""
     return jnp.where(x <= high, x, high)

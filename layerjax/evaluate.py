@@ -20,6 +20,7 @@ from layerjax.directions import Vector, read_directions, split
 from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify, simplify_and_name
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
+from layerjax.transport.known_directions import KnownDirections, known_directions
 
 
 class Prepared(eqx.Module):
@@ -44,13 +45,7 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
-    require_numbers(stack)
-    simplified, names = simplify_and_name(stack)
-    chosen = automatic(stack, simplified) if transport == "auto" else transport
-    if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
-    chosen.check(simplified, names)
-    return Prepared(chosen.prepare(simplified), chosen, channel_count(stack))
+    return _prepare(stack, transport, None)
 
 
 def evaluate(
@@ -61,6 +56,7 @@ def evaluate(
     *,
     side: Side = "all",
     key: Array | None = None,
+    known: KnownDirections | None = None,
 ) -> Array:
     """BSDF in 1/sr, without the cosine.
 
@@ -75,6 +71,8 @@ def evaluate(
         one below.
             Other pairs give 0, and what only they need is left out of the program.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
+        known: what `known_directions` says of wi and wo, where these are traced. Concrete ones are looked at here:
+            along few distinct cosines `AddingDoubling` follows light exactly, and costs less.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)`` in the floating type of the directions, the channel axis
@@ -82,7 +80,9 @@ def evaluate(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
-    prepared = _prepared(stack, transport, wi.dtype)
+    if known is None and not isinstance(stack, Prepared):
+        known = known_directions(wi, wo)
+    prepared = _prepared(stack, transport, wi.dtype, known)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
@@ -105,9 +105,10 @@ def evaluate_with_error(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
-    prepared = _prepared(stack, transport, wi.dtype)
+    known = None if isinstance(stack, Prepared) else known_directions(wi, wo)
+    prepared = _prepared(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
-    other = _compared(stack, prepared.transport)  # refuses before anything is evaluated
+    other = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
     values, errors = _evaluate(prepared, wi, wo, side, key)
     if other is not None:
         errors = jnp.abs(values - evaluate(other, wi, wo, side=side))
@@ -206,7 +207,7 @@ def _check_side(side: Side) -> None:
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
-def _compared(stack: Stack | Prepared, transport: Transport) -> Prepared | None:
+def _compared(stack: Stack | Prepared, transport: Transport, known: KnownDirections | None) -> Prepared | None:
     """The stack prepared for the transport that errors are told by; None, if it knows them itself."""
     other = transport.compared()
     if other is None:
@@ -216,9 +217,21 @@ def _compared(stack: Stack | Prepared, transport: Transport) -> Prepared | None:
         raise ValueError(
             f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
         )
-    return prepare(stack, other)
+    return _prepare(stack, other, known)
 
 
-def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype) -> Prepared:
-    prepared = stack if isinstance(stack, Prepared) else prepare(stack, transport)
+def _prepared(
+    stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: KnownDirections | None = None
+) -> Prepared:
+    prepared = stack if isinstance(stack, Prepared) else _prepare(stack, transport, known)
     return in_precision(prepared, dtype)
+
+
+def _prepare(stack: Stack, transport: Any, known: KnownDirections | None) -> Prepared:
+    require_numbers(stack)
+    simplified, names = simplify_and_name(stack)
+    chosen = automatic(stack, simplified) if transport == "auto" else transport
+    if not isinstance(chosen, Transport):
+        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
+    chosen.check(simplified, names)
+    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))

@@ -31,6 +31,7 @@ PACKAGES = [
     "layerjax.surfaces",
     "layerjax.stack",
     "layerjax.gallery",
+    "layerjax.transport.known_directions",
     "layerjax.transport.contract",
     "layerjax.transport.single_scattering",
     "layerjax.transport.first_order",

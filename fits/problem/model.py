@@ -62,6 +62,7 @@ class Model(eqx.Module):
         degrees_of_freedom: of Student-t tails.
         transport: how the values are computed.
         side: "reflection" if all directions lie above.
+        known: what is known of the directions beforehand.
         objective, tails: see `Problem` and `Noise`.
         varying: whether sigma depends on the parameters.
     """
@@ -75,6 +76,7 @@ class Model(eqx.Module):
     lowest: Array
     degrees_of_freedom: Array
     transport: Transport
+    known: lj.KnownDirections | None
     side: Side = eqx.field(static=True)
     objective: Objective = eqx.field(static=True)
     tails: Tails = eqx.field(static=True)
@@ -160,7 +162,7 @@ class Model(eqx.Module):
         return predicted, total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
     def _predict(self, parts: Parts) -> Array:
-        return parts.scale * forward(parts.stack, self.wi, self.wo, self.transport, self.side)
+        return parts.scale * forward(parts.stack, self.wi, self.wo, self.transport, self.side, self.known)
 
 
 def half_squares(residuals: tuple[Array, ...]) -> Array:
@@ -174,6 +176,7 @@ def forward(
     wo: Array | NDArray[np.float64],
     transport: Transport,
     side: Side = "all",
+    known: lj.KnownDirections | None = None,
 ) -> Array:
     """BSDF (N, C) in 1/sr along unit directions (N, 3): the one place where inference meets the forward models.
 
@@ -185,4 +188,4 @@ def forward(
     # a class is callable too, but only a transport that lacks its brackets: layerjax says so
     if callable(transport) and not isinstance(transport, lj.Transport | type):
         return transport(stack, jnp.asarray(wi), jnp.asarray(wo))
-    return lj.evaluate(stack, wi, wo, transport=cast(lj.Transport | Literal["auto"], transport), side=side)
+    return lj.evaluate(stack, wi, wo, cast(lj.Transport | Literal["auto"], transport), side=side, known=known)

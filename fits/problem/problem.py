@@ -244,6 +244,7 @@ def _model(problem: Problem, used: Measurements, levels: _Levels, template: Temp
         lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
         degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
         transport=problem.transport,
+        known=lj.known_directions(used.wi, used.wo),
         side="reflection" if above else "all",
         objective=problem.objective,
         tails=problem.noise.tails,

@@ -20,6 +20,7 @@ from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
+from layerjax.transport.known_directions import KnownDirections
 
 Side = Literal["all", "reflection", "transmission"]
 """Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
@@ -50,6 +51,10 @@ class Transport(eqx.Module):
     @abc.abstractmethod
     def prepare(self, stack: Stack) -> Any:
         """All the work that no direction is needed for, of a simplified stack."""
+
+    def prepare_for(self, stack: Stack, known: KnownDirections | None) -> Any:
+        """The same for values at known directions alone, for transports to which these are of use."""
+        return self.prepare(stack)
 
     @abc.abstractmethod
     def sample(self, state: Any, wi: Vector, uniforms: Uniforms) -> Vector:

@@ -33,6 +33,9 @@ LEAST_COSINE = 1e-6
 MERGED = 0.5
 """Of the first node of a panel: indices whose squares differ by less than its square share one panel."""
 
+UNROLLED = 8
+"""Polynomials of up to so many degrees are written out, of more a loop."""
+
 TABLE_DENSITY = 2
 """Points of the table of a panel for each of its nodes."""
 
@@ -41,7 +44,7 @@ class Region(eqx.Module):
     """The nodes as one region sees them, each (panels * nodes,).
 
     cosine and sine of theta there (stand-ins where no such direction exists), the weight of the measure n^2 mu dmu (0
-    where no such direction exists), and that of dmu.
+    where no such direction exists), that of dmu, and whether the direction exists.
     """
 
     ior: Array
@@ -49,6 +52,7 @@ class Region(eqx.Module):
     sine: Array
     weight: Array
     solid: Array
+    exists: Array
 
 
 class Grid(eqx.Module):
@@ -78,6 +82,12 @@ class Grid(eqx.Module):
         return np.arange(self.edges.shape[0])[:, None]
 
 
+def joined(first: Region, second: Region) -> Region:
+    """The directions of two regions of one index, one after the other."""
+    parts = jax.tree.map(lambda a, b: jnp.concatenate([jnp.atleast_1d(a), jnp.atleast_1d(b)]), first, second)
+    return eqx.tree_at(lambda region: region.ior, parts, first.ior)
+
+
 def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int, dtype: Any) -> Grid:
     """Grid for regions of these refractive indices.
 
@@ -104,7 +114,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
         cosine = jnp.sqrt(at_least(cosine2, COSINE_FLOOR**2))
         sine = jnp.sqrt(jnp.where(exists, (high - x2 * width) / n2, 0.75))
         here = jnp.where(exists, (x * w)[None] * width, 0.0)
-        flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel())
+        flat = (cosine.ravel(), sine.ravel(), here.ravel(), (here / (n2 * cosine)).ravel(), here.ravel() > 0)
         regions.append(Region(jnp.sqrt(n2), *flat))
     return eqx.tree_at(lambda g: g.regions, grid, tuple(regions))
 
@@ -161,8 +171,13 @@ def lagrange(x: Array, nodes: int) -> Array:
 
 
 def legendre(x: Array, count: int) -> Array:
-    """Legendre polynomials P_0 ... P_(count-1) shifted to [0, 1], along a new last axis (a loop: XLA would unroll)."""
+    """Legendre polynomials P_0 ... P_(count-1) shifted to [0, 1], along a new last axis."""
     y = 2.0 * x - 1.0
+    if count <= UNROLLED:
+        values = [jnp.ones_like(y), y]
+        for n in range(1, count - 1):
+            values.append(((2 * n + 1) / (n + 1)) * y * values[-1] - (n / (n + 1)) * values[-2])
+        return jnp.stack(values[:count], axis=-1)
 
     def step(pair: tuple[Array, Array], factors: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
         before, last = pair
@@ -224,7 +239,7 @@ def table_region(grid: Grid, region: Region) -> Region:
     exists = (high <= own) & (high > low)
     cosine = jnp.sqrt(at_least(jnp.where(exists, (own - high + rest) / own, 1.0), LEAST_COSINE**2)).ravel()
     one = jnp.ones_like(cosine)
-    return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one)
+    return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one, one > 0)
 
 
 def lifted(grid: Grid, values: Array) -> Array:

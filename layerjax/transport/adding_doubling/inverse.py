@@ -1,8 +1,8 @@
-"""Inverse of 1 - A for batches of small matrices, by products alone.
+"""Inverses of batches of small matrices, by products alone.
 
 LAPACK's triangular solves start threads for matrices of any size, and then spend most of the time on that (up to forty
-times as long where other work runs on the machine). Here A is a round trip of light between two layers: its absolute
-values have a spectral radius below 1, so that elimination needs no pivoting (1 - A is an M-matrix, or bounded by one).
+times as long where other work runs on the machine). None of these needs pivoting: 1 - A, where A is a round trip of
+light between two layers, is an M-matrix or bounded by one; others are triangular or positive definite.
 """
 
 import jax
@@ -13,21 +13,27 @@ BLOCK = 8
 """Rows that are eliminated together: the rest is a matrix product."""
 
 
-@jax.custom_jvp
 def inverse_of_one_minus(a: Array) -> Array:
     """(1 - A)^-1 for A of shape (..., n, n)."""
-    n = a.shape[-1]
+    return inverse(jnp.eye(a.shape[-1], dtype=a.dtype) - a)
+
+
+@jax.custom_jvp
+def inverse(matrix: Array) -> Array:
+    """Inverse of (..., n, n) matrices that need no pivoting: M-matrices, positive definite or triangular ones."""
+    n = matrix.shape[-1]
     missing = -n % BLOCK
-    batch = a.shape[:-2]
-    matrix = jnp.eye(n + missing, dtype=a.dtype) - jnp.pad(a.reshape(-1, n, n), ((0, 0), (0, missing), (0, missing)))
-    result = jax.lax.fori_loop(0, (n + missing) // BLOCK, _eliminate_block, matrix)
+    batch = matrix.shape[:-2]
+    padded = jnp.pad(matrix.reshape(-1, n, n), ((0, 0), (0, missing), (0, missing)))
+    padded = padded + jnp.diag((jnp.arange(n + missing) >= n).astype(matrix.dtype))
+    result = jax.lax.fori_loop(0, (n + missing) // BLOCK, _eliminate_block, padded)
     return result[:, :n, :n].reshape(*batch, n, n)
 
 
-@inverse_of_one_minus.defjvp
+@inverse.defjvp
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    result = inverse_of_one_minus(*primals)
-    return result, result @ tangents[0] @ result
+    result = inverse(*primals)
+    return result, -result @ tangents[0] @ result
 
 
 def _eliminate_block(index: Array, matrix: Array) -> Array:

@@ -1,8 +1,9 @@
-"""A homogeneous medium on the grid: its phase function at the nodes, a thin slab of it, and doubling from that.
+"""A homogeneous medium on the grid: its phase function at the nodes, and its layer by eigenvectors or by doubling.
 
-Symbols: K the kernel sigma p of a collision before albedo (Wang 2022, Eq. 4), tau the thickness, a = sigma / mu; the
-thin slab scatters once, in closed form in depth (Eqs. 12 and 16), K tau / (mu_i mu_o) exp(-m) exprel(y), and what is
-caught on its way out scatters once more and leaves: right to the order tau^2, and a lossless slab loses nothing.
+Symbols: K the kernel sigma p of a collision before albedo (Wang 2022, Eq. 4), tau the thickness, a = sigma / mu. The
+thin slab that doubling begins with scatters once, in closed form in depth (Eqs. 12 and 16), K tau / (mu_i mu_o) exp(-m)
+exprel(y), and what is caught on its way out scatters once more and leaves: right to the order tau^2, and a lossless
+slab loses nothing.
 """
 
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import fresnel
-from layerjax._numerics import decay_between, exprel
+from layerjax._numerics import decay_between, exprel, safe_div, safe_sqrt
 from layerjax.channels import per_channel
 from layerjax.directions import Vector, half_vector
 from layerjax.phase import PhaseFunction
@@ -22,6 +23,7 @@ from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
 from layerjax.transport.adding_doubling.sampling import balance, modes_at_nodes, straight_on
+from layerjax.transport.adding_doubling.slab import slab
 
 Pair = tuple[Array, Array]
 """Reflection and transmission, light from above."""
@@ -56,6 +58,10 @@ class Kernel(eqx.Module):
         """An operator lit from above to the same lit from below: the medium is its own image under inversion."""
         return turned(operator, self.azimuths)
 
+    def turn_rows(self, operator: Array) -> Array:
+        """An operator whose outgoing directions are turned by half a turn about the normal."""
+        return jnp.swapaxes(self.turn_row(jnp.swapaxes(operator, -1, -2)), -1, -2)
+
     def turn_row(self, values: Array) -> Array:
         """Values for light going down at the nodes to those for light going up."""
         if self.azimuths is None:
@@ -64,16 +70,16 @@ class Kernel(eqx.Module):
         return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
 
 
-def kernel_modes(medium: Medium, region: Region, modes: int) -> Kernel:
+def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int) -> Kernel:
     """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel."""
-    found = modes_at_nodes(lambda wi, wo: _both_sides(medium, wi, wo), region, region, modes)
-    plain, schlick = (found[0], found[1]), (found[2], found[3]) if medium.f0 is not None else None
-    area = medium.phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
+    found = modes_at_nodes(lambda wi, wo: _both_sides(phase, with_schlick, wi, wo), region, region, modes)
+    plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
+    area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
     kernel = Kernel(plain, schlick, area, region.cosine, region.solid, None)
-    return _balanced(kernel, medium.phase)
+    return _balanced(kernel, phase)
 
 
-def kernel_ordinates(medium: Medium, region: Region, azimuths: int) -> Kernel:
+def kernel_ordinates(phase: PhaseFunction, with_schlick: bool, region: Region, azimuths: int) -> Kernel:
     """Kernel of any medium, between all directions of the nodes and equally spaced azimuths."""
     phi = jnp.asarray(2.0 * np.pi * np.arange(azimuths) / azimuths, region.cosine.dtype)
     cosine, sine = (jnp.repeat(array, azimuths) for array in (region.cosine, region.sine))
@@ -81,22 +87,22 @@ def kernel_ordinates(medium: Medium, region: Region, azimuths: int) -> Kernel:
     travel = (sine * jnp.cos(azimuth), sine * jnp.sin(azimuth), cosine)
     wi = (-travel[0][None], -travel[1][None], travel[2][None])
     wo = (travel[0][:, None], travel[1][:, None], travel[2][:, None])
-    found = [value[None] for value in _both_sides(medium, wi, wo)]
-    plain, schlick = (found[0], found[1]), (found[2], found[3]) if medium.f0 is not None else None
-    area = medium.phase.cross_section((-travel[0], -travel[1], travel[2]))
+    found = [value[None] for value in _both_sides(phase, with_schlick, wi, wo)]
+    plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
+    area = phase.cross_section((-travel[0], -travel[1], travel[2]))
     solid = jnp.repeat(region.solid, azimuths) / azimuths
-    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths), medium.phase)
+    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths), phase)
 
 
-def _both_sides(medium: Medium, wi: Vector, wo: Vector) -> list[Array]:
+def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector) -> list[Array]:
     """Kernel in reflection and transmission, and if there is a Fresnel term both times (1 - |wi . h|)^5."""
     plain, schlick = [], []
     for side in (1.0, -1.0):
         out = (wo[0], wo[1], side * wo[2])
         h, cosine = half_vector(wi, out)
-        value = medium.phase.kernel(wi, out, h)
+        value = phase.kernel(wi, out, h)
         plain.append(value)
-        if medium.f0 is not None:
+        if with_schlick:
             schlick.append(value * fresnel.schlick(cosine, 0.0))
     return plain + schlick
 
@@ -125,12 +131,14 @@ def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
 
 
 def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
-    """The medium as a layer, by so many doublings (see `doublings`)."""
+    """The medium as a layer: by eigenvectors, or in single precision by so many doublings (see `doublings`)."""
     thickness = _column(medium.thickness, kernel)
     direct = _direct(kernel, thickness)
     if is_known(medium.albedo, 0.0):
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
+    if thickness.dtype == jnp.float64:
+        return _by_eigenvectors(kernel, strength, thickness, direct)
 
     @jax.checkpoint
     def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
@@ -141,8 +149,8 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
         return reflect, transmit
 
     def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
-        slab = thickness * depth
-        arguments = rest, _once(kernel, strength, slab), _direct(kernel, slab)
+        part = thickness * depth
+        arguments = rest, _once(kernel, strength, part), _direct(kernel, part)
         if steps is not None:
             return doubled(*arguments), None
         return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
@@ -156,7 +164,29 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
         first = depths[jnp.clip(most - jnp.ceil(jnp.log2(largest / THIN + 1e-30)), 0, most - 1).astype(jnp.int32)]
     start = _twice(kernel, strength, thickness * first)
     rest, _ = jax.lax.scan(step, start, depths)
+    return _layer(kernel, _once(kernel, strength, thickness), rest, direct)
+
+
+def _by_eigenvectors(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
+    """The medium by `slab`, in double precision: single precision would lose conservative media in rounding."""
+    root = safe_sqrt(kernel.solid * kernel.cosine)  # 0 for nodes that do not exist in this region
+    into = safe_div(jnp.ones_like(root), root)
+    rate = safe_sqrt(2.0 * jnp.pi * kernel.solid / kernel.cosine)
+    turn = kernel.turn_rows if kernel.azimuths is not None else lambda operator: operator
+    back, onward = (rate[:, None] * part * rate for part in (turn(strength[0]), strength[1]))
+    removed = jnp.diag(kernel.area / kernel.cosine)
+    half = jnp.broadcast_to(0.5 * thickness[..., 0], jnp.broadcast_shapes(thickness.shape[:-1], back.shape[:-2]))
+    reflect, transmit = slab(*jnp.broadcast_arrays(removed - onward + back, removed - onward - back), half)
     once = _once(kernel, strength, thickness)
+    scale = root[:, None] * into
+    rest = (
+        turn(scale * reflect) - once[0],
+        scale * (transmit - jnp.eye(root.size, dtype=root.dtype) * direct[..., None, :]) - once[1],
+    )
+    return _layer(kernel, once, rest, direct)
+
+
+def _layer(kernel: Kernel, once: Pair, rest: Pair, direct: Array) -> Layer:
     reflect, transmit = Parts(once[0], rest[0]), Parts(once[1], rest[1])
 
     def turned_parts(parts: Parts) -> Parts:

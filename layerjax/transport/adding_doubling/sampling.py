@@ -7,6 +7,7 @@ just that in the limit of a narrow lobe.
 
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -17,6 +18,9 @@ from layerjax.transport.adding_doubling.grid import Region
 
 LEAST_SAMPLES = 96
 """Azimuths, over half a turn, at which a kernel is sampled at least."""
+
+UNROLLED = 8
+"""Up to so many modes in a row, more in a loop."""
 
 BALANCING = 5
 """Rounds of `balance`; what is left after them goes straight on."""
@@ -39,6 +43,21 @@ def modes_at_nodes(
     wo: Vector = (sin_o * jnp.asarray(np.cos(phi), dtype), sin_o * jnp.asarray(np.sin(phi), dtype), mu_o)
     shape = (out.cosine.shape[0], into.cosine.shape[0], samples)
     return [jnp.moveaxis(jnp.broadcast_to(value, shape) @ cosines, -1, 0) for value in function(wi, wo)]
+
+
+def cosines(x: Array, count: int) -> Array:
+    """cos(m phi) for m below `count`, along a new first axis, from x = cos(phi) (Chebyshev polynomials)."""
+
+    def step(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
+        before, last = pair
+        return (last, 2.0 * x * last - before), before
+
+    if count <= UNROLLED:
+        waves = [jnp.ones_like(x), x]
+        while len(waves) < count:
+            waves.append(2.0 * x * waves[-1] - waves[-2])
+        return jnp.stack(waves[:count])
+    return jax.lax.scan(step, (jnp.ones_like(x), x), None, length=count)[1]
 
 
 def balance(
@@ -65,3 +84,15 @@ def balance(
 def straight_on(missing: Array, weight: Array) -> Array:
     """The kernel that sends this energy on at the same angles: a delta, the same in all modes."""
     return jnp.diag(safe_div(missing, weight))
+
+
+def scaled_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
+    """Flux operator of a face from its BRDF at the nodes and its albedo, which decides."""
+    weight = projected_weight(region)
+    scale, missing = balance([(kernel[0], lambda d: d)], weight, jnp.where(region.weight > 0, energy, 0.0))
+    return weight[:, None] * (scale[:, None] * kernel * scale + straight_on(missing, weight))
+
+
+def projected_weight(region: Region) -> Array:
+    """Weight of the measure cos dw over nodes and azimuth, in the region's own solid angle."""
+    return 2.0 * jnp.pi * region.solid * region.cosine

@@ -4,6 +4,7 @@ Layers that are symmetric about the normal are solved as Fourier modes. Where a 
 below it is turned into ordinates first, and so is every layer on top.
 """
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -13,12 +14,18 @@ import numpy as np
 from jax import Array
 
 from layerjax.microsurface import Microfacets
+from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
+from layerjax.transport.adding_doubling.asked import asked_region
+from layerjax.transport.adding_doubling.bases import base_layer
+from layerjax.transport.adding_doubling.elements import element
+from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, make_grid
-from layerjax.transport.adding_doubling.interfaces import Normals, base_layer, interface_layer
-from layerjax.transport.adding_doubling.media import doublings, kernel_modes, kernel_ordinates, medium_layer
+from layerjax.transport.adding_doubling.interfaces import interface_layer
+from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.operators import Layer, add
+from layerjax.transport.known_directions import KnownDirections
 
 
 class Plan(eqx.Module):
@@ -46,36 +53,86 @@ def is_tilted(layer: Any) -> bool:
     return isinstance(layer, Medium) and not layer.phase.is_upright
 
 
-def solve(stack: Stack, plan: Plan) -> tuple[Grid, Layer]:
-    """The grid, and the whole stack as one layer."""
+def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tuple[Grid, Layer]:
+    """The grid, and the whole stack as one layer.
+
+    asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
+    light passes it, ends) with an interface.
+    """
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
-    grid = make_grid([1.0, *(layer.ior for layer in interfaces)], plan.ranks, plan.nodes, dtype)
+    indices = tuple(jnp.asarray(n, dtype) for n in (1.0, *(layer.ior for layer in interfaces)))
+    grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
     solved: list[tuple[Layer, bool]] = []
     region, steps = 0, list(plan.steps)
-    for layer in stack.layers:
-        here = grid.regions[region]
+    for place, layer in enumerate(stack.layers):
         if isinstance(layer, Interface):
+            leaves = stack.base is None and 1 < region + 1 == len(interfaces)
+            outside = None
+            if asked is not None and (place == 0 or leaves):
+                outside = asked.above if place == 0 else asked.below
+            diffuse = stack.base is not None and not isinstance(stack.base, Conductor)
+            build = partial(_interface, plan, region, layer.distribution, not leaves, diffuse, dtype)
+            solved.append((element(build, (indices, layer.alpha), outside, dtype), False))
             region += 1
-            leaves = stack.base is None and 1 < region == len(interfaces)
-            below, alpha = grid.regions[region], jnp.asarray(layer.alpha, dtype)
-            normals = Normals(alpha, layer.distribution)
-            found = interface_layer(grid, here, below, normals, plan.modes, plan.microfacets, enters=not leaves)
-            solved.append((found, False))
-        elif plan.azimuths is not None and is_tilted(layer):
-            kernel = kernel_ordinates(layer, here, plan.azimuths)
-            solved.append((medium_layer(layer, kernel, steps.pop(0)), True))
         else:
-            solved.append((medium_layer(layer, kernel_modes(layer, here, plan.modes), steps.pop(0)), False))
+            tilted = plan.azimuths is not None and is_tilted(layer)
+            of_medium = partial(_kernel, plan, region, layer.f0 is not None, tilted, dtype)
+            kernel = element(of_medium, (indices, layer.phase), None, dtype)
+            solved.append((medium_layer(layer, kernel, steps.pop(0)), tilted))
     if stack.base is not None:
-        here = grid.regions[region]
-        solved.append((base_layer(grid, here, _relative(stack.base, here.ior), plan.modes, plan.microfacets), False))
+        build = partial(_base, plan, region, dtype)
+        solved.append((element(build, (indices, stack.base), None, dtype), False))
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     return grid, whole
+
+
+def _interface(
+    plan: Plan,
+    region: int,
+    distribution: Distribution,
+    enters: bool,
+    diffuse: bool,
+    dtype: Any,
+    numbers: Any,
+    asked: Array | None,
+) -> Layer:
+    indices, alpha = numbers
+    grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
+    above, below = grid.regions[region], grid.regions[region + 1]
+    outside = None if asked is None else asked_region(asked, (above if enters else below).ior)
+    normals = Normals(jnp.asarray(alpha, dtype), distribution)
+    return interface_layer(
+        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, asked=outside, diffuse=diffuse
+    )
+
+
+def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, numbers: Any, _: None) -> Kernel:
+    indices, phase = numbers
+    here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
+    if not tilted:
+        return kernel_modes(phase, fresnel, here, plan.modes)
+    assert plan.azimuths is not None
+    return kernel_ordinates(phase, fresnel, here, plan.azimuths)
+
+
+def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
+    indices, base = numbers
+    here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
+    return base_layer(here, _relative(base, here.ior), plan.modes, plan.microfacets)
+
+
+def carries_asked(stack: Stack, plan: Plan) -> bool:
+    """Whether directions that are asked for can stand in the place of the grid's outer ones."""
+    if plan.azimuths is not None or not stack.layers or not isinstance(stack.layers[0], Interface):
+        return False
+    if stack.base is not None:
+        return True
+    return len(stack.layers) > 1 and isinstance(stack.layers[-1], Interface)
 
 
 def expanded(layer: Layer, azimuths: int | None) -> Layer:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, horizon, safe_div
+from layerjax._numerics import horizon, not_negative, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
 from layerjax.transport.adding_doubling.grid import Grid, Region, cubic, stencil, table_matrix
@@ -181,7 +181,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         axes.append(_azimuth_points(into, out, tables.steps))
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
     found = _contracted(tables.values, start, axes)
-    return tuple(factor * at_least(value, 0.0) for value in found)
+    return tuple(factor * not_negative(value) for value in found)
 
 
 def _contracted(values: Channels, start: Array, axes: Sequence[Points]) -> Channels:
@@ -217,7 +217,7 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     energies: list[Channels] = []
     for table in (tables.near, tables.far):
         found = _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
-        energies.append(tuple(jnp.where(valid, at_least(value, 0.0), 0.0) for value in found))
+        energies.append(tuple(jnp.where(valid, not_negative(value), 0.0) for value in found))
     return energies[0], energies[1]
 
 

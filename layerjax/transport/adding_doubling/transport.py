@@ -1,9 +1,10 @@
 """Adding-doubling: every order of scattering in a stack, without noise and with derivatives.
 
-The stack is put on a grid of directions: media are doubled up from a slab thin enough to scatter at most twice (van de
-Hulst 1980, Ch. 4), interfaces and bases are added (Grant & Hunt 1969). Around the normal everything is a Fourier series
-in azimuth unless a medium has an axis of its own; then azimuths are ordinates too. Paths with one event are evaluated
-in closed form at the very directions asked for; only the smooth rest is read off tables.
+The stack is put on a grid of directions: media are solved by eigenvectors, or in single precision doubled up from a
+slab thin enough to scatter at most twice (van de Hulst 1980, Ch. 4), interfaces and bases are added (Grant & Hunt
+1969). Around the normal everything is a Fourier series in azimuth unless a medium has an axis of its own; then azimuths
+are ordinates too. Paths with one event are evaluated in closed form at the very directions asked for; only the smooth
+rest is read off tables, or, where directions are known and the stack lets them, followed along just these.
 """
 
 import dataclasses
@@ -17,15 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.channels import Channels, times, total
+from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
+from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
-from layerjax.transport.adding_doubling.interfaces import Microfacets
+from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
-from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
+from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
+from layerjax.transport.known_directions import KnownDirections
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
@@ -42,17 +45,23 @@ MOST = 1024
 
 
 class Solved(eqx.Module):
-    """A solved stack: what is evaluated in closed form, and the tables of the rest, None if there is none."""
+    """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
+
+    Both are None if there is no rest.
+    """
 
     first: FirstOrder
     tables: Tables | None
+    between: Between | None = None
 
 
 class AddingDoubling(DeterministicTransport):
     """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
 
     Carries everything that a `Stack` holds; von Mises-Fisher normals with ``microfacets="single"`` only. The work per
-    stack is done in `prepare`; a pair then costs microseconds.
+    stack is done in `prepare`; a pair then costs microseconds. `evaluate` of a stack that begins (and, if light passes
+    it, ends) with an interface, along up to 256 distinct cosines that are known beforehand, reads nothing off tables:
+    light along them is followed exactly, and half the nodes and modes give the same error or less.
 
     Args:
         nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024.
@@ -105,6 +114,24 @@ class AddingDoubling(DeterministicTransport):
         if self.tolerance is not None:
             return self._climb(stack)
         return self._solved(stack)
+
+    def prepare_for(self, stack: Stack, known: KnownDirections | None) -> Solved:
+        if known is not None and self.tolerance is None and self.orders != "first":
+            plan = make_plan(stack, self.nodes, self.modes, self.ordinates, self.microfacets)
+            if carries_asked(stack, plan):
+                return Solved(first_order(stack), None, _solve_between(stack, known, plan))
+        return self.prepare(stack)
+
+    def measured(
+        self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
+    ) -> tuple[Array, None]:
+        if state.between is None:
+            return super().measured(state, wi, wo, side, channels, key)
+        i, o = split(wi), split(wo)
+        rest = read_between(state.between, i, o, side)
+        parts = [rest] if self.orders == "multiple" else [evaluate_first(state.first, i, o, side), rest]
+        values = total(parts, jnp.zeros_like(i[2] * o[2]))
+        return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
     def coarser(self) -> "AddingDoubling":
         """The same at about two thirds of the resolution, for an estimate of the error."""
@@ -193,6 +220,12 @@ class AddingDoubling(DeterministicTransport):
 def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
     grid, whole = solve(stack, plan)
     return make_tables(grid, whole, plan.azimuths, stack.base is not None, partial(interaction_probability, first))
+
+
+@eqx.filter_jit
+def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+    grid, whole = solve(stack, plan, known)
+    return between(whole, known, grid.regions[-1].ior, stack.base is not None)
 
 
 @eqx.filter_jit

@@ -29,8 +29,8 @@ from layerjax.microsurface import Microfacets
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
+from layerjax.transport.adding_doubling.facet_light import Normals, facet_energies
 from layerjax.transport.adding_doubling.grid import Grid, Region, interpolated, lifted, table_region
-from layerjax.transport.adding_doubling.interfaces import Normals, entering_energy
 from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.first_order import share_met
@@ -116,7 +116,7 @@ def _refracted_table(bare: Stack, grid: Grid, there: Array, plan: Plan) -> Array
     top, below = grid.regions[:2]
 
     def entering(region: Region) -> Array:
-        passed, lost = entering_energy(grid, region, below, normals, plan.modes)
+        _, passed, lost = facet_energies(region, below, normals)
         return passed + lost if plan.microfacets == "multiple" else passed
 
     at_nodes, at_points = entering(top), entering(table_region(grid, top))

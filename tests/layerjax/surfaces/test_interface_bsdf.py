@@ -78,7 +78,7 @@ def test_values_and_gradients_are_finite(dtype):
 
 
 def test_an_interface_that_is_not_there():
-    wi, wo, _, alpha = pairs(1000, 2)
+    wi, wo, _, alpha = pairs(np.random.default_rng(2), 1000, ALPHAS)
     one = jnp.ones(1000)
     assert not interface_reflection(wi, wo, one, alpha).any()
     assert not interface_transmission(wi, (wo[0], wo[1], -wo[2]), one, alpha).any()

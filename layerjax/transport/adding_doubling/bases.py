@@ -1,0 +1,55 @@
+"""Opaque bases on the grid: the BRDF at the nodes, that of a metal scaled to the energy that its facets reflect."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._numerics import at_least, safe_div
+from layerjax.channels import per_channel, pick
+from layerjax.directions import Vector, reflect
+from layerjax.microsurface import Microfacets
+from layerjax.surfaces import Conductor, Surface
+from layerjax.transport.adding_doubling.facet_light import ENERGY_POINTS, Normals, of_facets, seen_share
+from layerjax.transport.adding_doubling.grid import Region
+from layerjax.transport.adding_doubling.operators import Layer, Parts
+from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projected_weight, scaled_to_energy
+
+
+def base_layer(region: Region, base: Surface, modes: int, microfacets: Microfacets) -> Layer:
+    """An opaque base under a region, as Fourier modes."""
+    weight = projected_weight(region)
+    kernels = modes_at_nodes(base.evaluate, region, region, modes)
+    if isinstance(base, Conductor):
+        return Layer(Parts(_conductor(region, base, kernels, microfacets)))
+    return Layer(Parts(jnp.stack(kernels) * weight[:, None]))
+
+
+def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Array:
+    normals = Normals(base.alpha, base.distribution)
+
+    def seen_by(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Array, Array]:
+        return facing, weight * seen_share(reflect(wi, m), normals)
+
+    cosine, seen = of_facets(seen_by, region, normals, jnp.ones((), region.cosine.dtype), "reflected", ENERGY_POINTS)
+    ior, k = per_channel(base.ior), per_channel(base.k)
+    operators = []
+    for c, kernel in enumerate(kernels):
+        energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
+        operator = scaled_to_energy(region, kernel, energy)
+        if microfacets == "multiple":
+            operator = operator.at[0].add(_coloured_return(energy, jnp.sum(seen, axis=-1), region.weight))
+        operators.append(operator)
+    return jnp.stack(operators)
+
+
+def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:
+    """What a conductor returns of the light lost to masking: it loses its Fresnel share at every further facet."""
+    lost = jnp.where(weight > 0, at_least(1.0 - lossless, 0.0), 0.0)
+    total = jnp.sum(weight * lost)
+    # mean reflectance of a facet, and mean share that escapes at each try (Kulla & Conty 2017)
+    level = safe_div(jnp.sum(weight * energy), jnp.sum(weight * lossless))
+    escapes = 1.0 - safe_div(total, jnp.sum(weight))
+    kept = level * level * escapes / (1.0 - level * (1.0 - escapes))
+    return kept * safe_div(jnp.outer(weight * lost, lost), total)

@@ -1,0 +1,84 @@
+"""Differentiation by elements: what a layer is made of is differentiated by the layer's own few numbers.
+
+An element (the operators of an interface, the kernel of a medium) is dear to compute and depends on a handful of
+scalars, while the assembly of elements to a stack is cheap and linear in each. Derivatives of an element by each of
+its scalars are therefore taken once, forward, however many parameters a Jacobian has, and its gradient is an inner
+product with them: no program has to be run backwards through quadratures.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.custom_derivatives import SymbolicZero
+
+Scalars = tuple[Array, ...]
+
+MOST_SCALARS = 12
+"""An element of more numbers is differentiated like anything else."""
+
+
+def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any, dtype: Any) -> Any:
+    """function(parameters, constants), a tree of floating arrays, differentiated by each number in the parameters.
+
+    Args:
+        function: depends on traced values through its arguments alone.
+        parameters: a tree; what is no array stays as it is.
+        constants: a tree of arrays that are not differentiated.
+        dtype: of the parameters.
+    """
+    leaves, structure = jax.tree.flatten(parameters)
+    numbers = [isinstance(leaf, Array | np.ndarray | float | int) and not isinstance(leaf, bool) for leaf in leaves]
+    arrays = [jnp.asarray(leaf, dtype) for leaf, is_number in zip(leaves, numbers, strict=True) if is_number]
+    if sum(array.size for array in arrays) > MOST_SCALARS:
+        return function(parameters, constants)
+    scalars = tuple(array.ravel()[k] if array.ndim else array for array in arrays for k in range(array.size))
+
+    def of_scalars(scalars: Scalars, constants: Any) -> Any:
+        left, filled = list(scalars), list(leaves)
+        shapes = iter(arrays)
+        for place, is_number in enumerate(numbers):
+            if is_number:
+                array = next(shapes)
+                part, left = left[: array.size], left[array.size :]
+                filled[place] = jnp.stack(part).reshape(array.shape) if array.ndim else part[0]
+        return function(jax.tree.unflatten(structure, filled), constants)
+
+    return _of_scalars(of_scalars, scalars, constants)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _of_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any) -> Any:
+    return function(scalars, constants)
+
+
+def _jvp(function: Callable[[Scalars, Any], Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
+    scalars, constants = primals
+    changing = [k for k, tangent in enumerate(tangents[0]) if not isinstance(tangent, SymbolicZero)]
+    if not changing:
+        value = function(scalars, constants)
+        return value, jax.tree.map(jnp.zeros_like, value)
+
+    def along(unit: Array) -> tuple[Any, Any]:
+        def changed(amount: Array) -> Any:
+            given = list(scalars)
+            for place, k in enumerate(changing):
+                given[k] = given[k] + amount[place]
+            return function(tuple(given), constants)
+
+        return jax.jvp(changed, (jnp.zeros_like(unit),), (unit,))
+
+    value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(changing), dtype=scalars[0].dtype))
+    rates = [tangents[0][k] for k in changing]
+
+    def combined(slopes: Array) -> Array:
+        return sum((rate * slope for rate, slope in zip(rates[1:], slopes[1:], strict=True)), rates[0] * slopes[0])
+
+    return value, jax.tree.map(combined, slopes)
+
+
+_of_scalars.defjvp(_jvp, symbolic_zeros=True)

@@ -1,0 +1,134 @@
+"""What the facets of an interface or a base do to light from every node: how much they reflect, what they let pass.
+
+Energies are sums over `seen_facets`, right to 1e-4 with few points. Light that is to be put on nodes needs points as
+dense as the nodes, unless only smooth functions are ever summed over it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax import fresnel
+from layerjax._batching import by_rows
+from layerjax._numerics import at_least, safe_sqrt
+from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
+from layerjax.normals import facets
+from layerjax.quadrature import gauss_legendre
+from layerjax.transport.adding_doubling.facet_rule import Way, polar_angles, seen_facets
+from layerjax.transport.adding_doubling.grid import Grid, Region
+
+ENERGY_POINTS = (12, 8)
+"""Points a panel, and in azimuth, of the quadrature of energies."""
+
+LEAST_FACETS = 24
+"""Points of the dense quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
+
+
+class Normals(NamedTuple):
+    """Normals of an interface or a base."""
+
+    alpha: Array
+    distribution: facets.Distribution
+
+
+def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, Array, Array]:
+    """Of light from every near node: the energy that facets reflect, that they refract, and that masking takes."""
+    reflected = reflected_energy(near, far.ior / near.ior, normals)
+    _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
+    refracted = jnp.sum(passed, axis=-1)
+    lost = at_least(1.0 - reflected - refracted, 0.0)
+    return reflected, refracted, jnp.where(near.exists, lost, 0.0)
+
+
+def reflected_energy(region: Region, ratio: Array, normals: Normals) -> Array:
+    def energy(m: Vector, facing: Array, weight: Array, wi: Vector) -> Array:
+        level = fresnel.dielectric(facing, ratio) * seen_share(reflect(wi, m), normals)
+        return jnp.sum(weight * level, axis=-1)
+
+    return of_facets(energy, region, normals, ratio, "reflected", ENERGY_POINTS)
+
+
+def refracted_rays(region: Region, ratio: Array, normals: Normals, points: tuple[int, int]) -> tuple[Vector, Array]:
+    """Of light from every node: where facets refract it to, and how much."""
+
+    def rays(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Vector, Array]:
+        return _through(wi, m, facing, weight, ratio, normals)
+
+    return of_facets(rays, region, normals, ratio, "refracted", points)
+
+
+def of_facets(
+    function: Callable[..., Any], region: Region, normals: Normals, ratio: Array, way: Way, points: tuple[int, int]
+) -> Any:
+    """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `seen_facets`."""
+    alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
+
+    def seen(rows: tuple[Array, ...]) -> Any:
+        cosine, sine, *polar = rows
+        wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
+        if normals.distribution == "vmf":
+            m, weight = facets.seen_normals(wi, alpha, 2 * points[0], 2 * points[1])
+            return function(m, dot(wi, m), weight, wi)
+        return function(*seen_facets(cosine, sine, (polar[0], polar[1]), alpha, way, points[1]), wi)
+
+    if normals.distribution == "vmf":
+        return by_rows(seen, (region.cosine, region.sine))
+    polar = polar_angles(region.cosine, region.sine, alpha, ratio, way, points[0])
+    return by_rows(seen, (region.cosine, region.sine, *polar))
+
+
+def _through(
+    wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals
+) -> tuple[Vector, Array]:
+    """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection."""
+    level = fresnel.dielectric(facing, ratio)
+    down, exists = refract(wi, m, ratio)
+    # under total reflection what `refract` gives is no direction, and one stands in
+    wo: Vector = (
+        jnp.where(exists, down[0], 0.6),
+        jnp.where(exists, down[1], 0.0),
+        jnp.where(exists, -down[2], 0.8),
+    )
+    return wo, jnp.where(exists, weight * (1.0 - level) * seen_share(wo, normals), 0.0)
+
+
+def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
+    """Of light from every near node, by facets: where to and how much is refracted."""
+    m, weight, wi = _visible_normals(grid, near, normals, modes)
+    return _through(wi, m, dot(wi, m), weight, far.ior / near.ior, normals)
+
+
+def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -> tuple[Vector, Array, Vector]:
+    """Normals visible from every node, (nodes, points), their weights, and the nodes' wi.
+
+    Of GGX a spherical cap, stretched: the cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over
+    half a turn (the other half is its mirror image). Denser than what it is put on: light that goes straight through
+    two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
+    from pole to rim.
+    """
+    polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 2), max(LEAST_FACETS, 3 * modes // 4)
+    alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
+    wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
+    if normals.distribution == "vmf":
+        return *facets.seen_normals(wi, alpha, polar_facets, azimuth_facets), wi
+    v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
+    s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(polar_facets))
+    rim = jnp.arctan2(safe_sqrt(v[0] * v[0]), -v[2])  # cosine -v_z
+    polar = (rim * s)[:, :, None]
+    phi = jnp.asarray((np.arange(azimuth_facets) + 0.5) * np.pi / azimuth_facets, alpha.dtype)
+    weight = jnp.sin(polar) * (rim * w / (1.0 + v[2]))[:, :, None] * (jnp.ones_like(phi) / azimuth_facets)
+    sine, cosine = jnp.sin(polar), jnp.cos(polar)
+    x, y = v[0][:, :, None] + sine * jnp.cos(phi), sine * jnp.sin(phi)
+    z = at_least(v[2][:, :, None] + cosine, 0.0) * jnp.ones_like(phi)
+    nodes = region.cosine.shape[0]
+    flat = tuple(jnp.reshape(part, (nodes, -1)) for part in (alpha * x, alpha * y, z))
+    return normalize((flat[0], flat[1], flat[2])), weight.reshape(nodes, -1), wi
+
+
+def seen_share(wo: Vector, normals: Normals) -> Array:
+    """Smith masking of the outgoing direction, 0 below the horizon."""
+    above = wo[2] > 0
+    return jnp.where(above, facets.masking(sanitised(wo, above), *normals), 0.0)

@@ -1,0 +1,59 @@
+"""What is known of the directions of a batch before anything is compiled: which cosines occur, and where.
+
+Measurements come along few directions, of which many share a cosine. A transport that is told so can follow light along
+just these.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import horizon
+
+MOST_COSINES = 256
+"""More distinct cosines on a side are not worth knowing."""
+
+MOST_PAIRS = 20_000
+"""Larger batches are not looked at."""
+
+STAND_IN = 0.5
+"""For directions in the tangent plane, whose values are 0, and for a side without directions."""
+
+
+class KnownDirections(eqx.Module):
+    """The distinct cosines among the directions of a batch.
+
+    above, below: |cosine|, (cosines,) each. of_wi, of_wo: for every direction the place of its cosine among those above
+    and then those below; the shapes of wi and wo without the last axis.
+    """
+
+    above: Array
+    below: Array
+    of_wi: Array
+    of_wo: Array
+
+
+def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
+    """What is known of the directions wi and wo, (..., 3) each; None if they are traced, or too many."""
+    if any(isinstance(w, jax.core.Tracer) for w in (wi, wo)):
+        return None
+    cosines = [np.asarray(w)[..., 2] for w in (wi, wo)]
+    if not 0 < np.broadcast(*cosines).size <= MOST_PAIRS:
+        return None
+    z = np.concatenate([part.ravel() for part in cosines])
+    size = np.where(np.abs(z) > horizon(z.dtype), np.minimum(np.abs(z), 1.0), STAND_IN).astype(z.dtype)
+    places = np.zeros(z.shape, np.int32)
+    sides: list[np.ndarray] = []
+    for side in (z > 0, z <= 0):
+        values, found = np.unique(size[side], return_inverse=True)
+        places[side] = found + (sides[0].size if sides else 0)
+        sides.append(values if values.size else np.asarray([STAND_IN], z.dtype))
+    if max(values.size for values in sides) > MOST_COSINES:
+        return None
+    split = cosines[0].size
+    of_wi, of_wo = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
+    return KnownDirections(*map(jnp.asarray, (*sides, of_wi, of_wo)))

@@ -1,0 +1,139 @@
+"""A slab by eigenvectors, against the exponential of its equations and doubling in extended precision."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax.transport.adding_doubling import media
+from layerjax.transport.adding_doubling.grid import make_grid
+from layerjax.transport.adding_doubling.slab import slab
+
+Long = np.longdouble
+NODES = 6
+value = jax.jit(slab)
+change = jax.jit(lambda primals, tangents: jax.jvp(slab, primals, tangents))
+
+
+def inverse(matrix):
+    n = len(matrix)
+    rows = np.concatenate([matrix, np.eye(n, dtype=Long)], axis=1)
+    for k in range(n):
+        pivot = k + np.argmax(np.abs(rows[k:, k]))
+        rows[[k, pivot]] = rows[[pivot, k]]
+        rows[k] /= rows[k, k]
+        others = np.arange(n) != k
+        rows[others] -= np.outer(rows[others, k], rows[k])
+    return rows[:, n:]
+
+
+def truth(p, q, half):
+    """R and T by the Taylor series of a thin slab's exponential, doubled: numpy's extended precision throughout."""
+    p, q = np.asarray(p).astype(Long), np.asarray(q).astype(Long)
+    n = len(p)
+    a, b = (p + q) / 2, (p - q) / 2
+    generator = 2 * Long(half) * np.block([[-a, b], [-b, a]])
+    steps = max(0, int(np.ceil(np.log2(float(np.abs(generator).sum(axis=0).max()) + 1e-300))) + 2)
+    thin, term = np.eye(2 * n, dtype=Long), np.eye(2 * n, dtype=Long)
+    for order in range(1, 25):
+        term = term @ generator / Long(2) ** steps / order
+        thin = thin + term
+    into = -inverse(thin[n:, n:]) @ thin[n:, :n]
+    reflect, transmit = into, thin[:n, :n] + thin[:n, n:] @ into
+    for _ in range(steps):
+        again = inverse(np.eye(n, dtype=Long) - reflect @ reflect) @ transmit
+        reflect, transmit = reflect + transmit @ reflect @ again, transmit @ again
+    return reflect, transmit
+
+
+def equations(albedo, g, modes=2):
+    """P and Q of a Henyey-Greenstein medium, (modes, n, n)."""
+    region = make_grid([1.0], (0,), NODES, jnp.float64).regions[0]
+    kernel = media.kernel_modes(lj.HenyeyGreenstein(g), False, region, modes)
+    rate = jnp.sqrt(2.0 * jnp.pi * kernel.solid / kernel.cosine)
+    back, onward = (albedo * rate[:, None] * part * rate for part in kernel.plain)
+    removed = jnp.diag(kernel.area / kernel.cosine)
+    return np.asarray(removed - onward + back), np.asarray(removed - onward - back)
+
+
+MEDIA = [(0.0, 0.5), (0.3, -0.9), (0.999999, 0.5), (1.0, 0.0), (1.0, 0.999)]
+
+
+@pytest.mark.parametrize("thickness", [0.0, 1e-8, 1e-3, 1.0, 30.0, 1e4])
+def test_values(thickness):
+    for albedo, g in MEDIA:
+        p, q = equations(albedo, g)
+        found = value(p, q, jnp.full(2, 0.5 * thickness))
+        for mode in range(2):
+            expected = truth(p[mode], q[mode], 0.5 * thickness)
+            for part, exact in zip(found, expected, strict=True):
+                # eigenvalues are right to rounding times the largest; near 0 their roots enter with the thickness
+                np.testing.assert_allclose(part[mode], exact.astype(float), rtol=0, atol=1e-14 * (1 + thickness))
+
+
+@pytest.mark.parametrize("thickness", [1e-8, 1e-3, 0.1, 1.0, 30.0])
+def test_derivatives(thickness):
+    """By differences of extended precision, of an error of 1e-9 of the slope; both of P, of Q and of the thickness."""
+    random = np.random.default_rng(0)
+    half = 0.5 * thickness
+    for albedo, g in MEDIA[1:]:
+        p, q = (part[0] for part in equations(albedo, g, 1))
+        dp = random.normal(size=p.shape)
+        dp, zero = 1e-2 * (dp + dp.T), np.zeros_like(p)
+        for tangent in ((dp, zero, 0.0), (zero, dp @ dp.T, 0.0), (zero, zero, 1.0)):
+            step = 1e-4 * (half if tangent[2] else 1.0)
+            _, slopes = change((p, q, jnp.asarray(half)), tuple(map(jnp.asarray, tangent)))
+
+            def moved(times, p=p, q=q, tangent=tangent, step=step):
+                long = [np.asarray(part).astype(Long) for part in (*tangent, p, q, half)]
+                return truth(*(base + Long(times * step) * rate for rate, base in zip(long[:3], long[3:], strict=True)))
+
+            # one-sided, of the second order: Q may be singular, and lossless media cannot scatter more
+            ends = [moved(times) for times in (0, 1, 2)]
+            expected = [(-3 * a + 4 * b - c) / (2 * Long(step)) for a, b, c in zip(*ends, strict=True)]
+            size = max(float(np.abs(part).max()) for part in expected)
+            for found, exact in zip(slopes, expected, strict=True):
+                # the rounding of a difference, 1e-19 / step, beside its own error
+                np.testing.assert_allclose(
+                    found, exact.astype(float), rtol=0, atol=1e-5 * size + 1e-18 / min(step, 1e-4)
+                )
+
+
+def test_nothing_is_lost_without_absorption():
+    """Down to the last mode that fades: R + T of flux is 1 for every direction."""
+    for thickness in (1e-8, 1.0, 1e4):
+        p, q = equations(1.0, 0.5)
+        region = make_grid([1.0], (0,), NODES, jnp.float64).regions[0]
+        root = np.sqrt(np.asarray(region.solid * region.cosine))
+        reflect, transmit = value(p, q, jnp.full(2, 0.5 * thickness))
+        np.testing.assert_allclose(root @ (reflect + transmit)[0] / root, 1.0, atol=1e-9)
+
+
+def test_gradients_are_finite_at_the_ends():
+    p, q = equations(1.0, 0.0)
+
+    def total(p, q, half):
+        return sum(jnp.sum(part) for part in slab(p, q, half))
+
+    for half in (0.0, 1e-12, 0.5, 5e3):
+        for slope in jax.jit(jax.grad(total, (0, 1, 2)))(p, q, jnp.full(2, half)):
+            assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("phase", [lj.HenyeyGreenstein(0.8), lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8))])
+def test_eigenvectors_and_doubling_agree(phase):
+    """The two forms of a medium, one in double and one in single precision: 1e-5 is what single precision allows."""
+    found = []
+    for dtype in (jnp.float32, jnp.float64):
+        region = make_grid([1.0], (0,), 4, dtype).regions[0]
+        medium = jax.tree.map(lambda x, dtype=dtype: jnp.asarray(x, dtype), lj.Medium(2.0, 0.95, phase))
+        kernel = (
+            media.kernel_modes(medium.phase, False, region, 4)
+            if phase.is_upright
+            else media.kernel_ordinates(medium.phase, False, region, 8)
+        )
+        found.append(media.medium_layer(medium, kernel, 15))
+    for name in ("reflect_top", "reflect_bottom", "transmit_down", "transmit_up"):
+        a, b = (getattr(layer, name).rest for layer in found)
+        np.testing.assert_allclose(a, b, atol=2e-6)
