@@ -6,14 +6,14 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 import os
 import sys
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fits._files import write_bytes, write_text, write_together
+from fits.cli.interrupts import hint
+from fits.cli.places import refuse_existing, require_free_place
 from fits.data.formats import read
 from fits.data.measurements import Measurements
 from fits.progress import show_progress
@@ -45,7 +45,7 @@ def fit(arguments: Namespace) -> int:
         require_blackjax()
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
-    with results.reserved(directory, arguments.force), show_progress() as progress, _hint(kept):
+    with results.reserved(directory, arguments.force), show_progress() as progress, hint(kept):
         result = run_fit(
             given.stack,
             data,
@@ -90,7 +90,7 @@ def _sample(directory: Path, arguments: Namespace) -> int:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
     settings = _chain_settings(directory / results.CHAIN, arguments)
     again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
-    with show_progress() as progress, _hint(again):
+    with show_progress() as progress, hint(again):
         posterior = run_sampler(
             result,
             **settings,
@@ -141,7 +141,7 @@ def report(arguments: Namespace) -> int:
     from fits.reporting import results
     from fits.reporting.html import report as write_page
 
-    _refuse_existing(arguments.out, arguments.force)
+    refuse_existing(arguments.out, arguments.force)
     directory = Path(arguments.directory)
     name, out = directory.resolve().name, arguments.out or directory / results.REPORT
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
@@ -163,7 +163,7 @@ def compare(arguments: Namespace) -> int:
     """Print which of several saved fits explains the data."""
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
-    _refuse_existing(arguments.out, arguments.force)
+    refuse_existing(arguments.out, arguments.force)
     _use_jax()
     from fits.inference.compare import compare as run_compare
     from fits.reporting import tables
@@ -188,7 +188,7 @@ def info(arguments: Namespace) -> int:
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
-        _refuse_existing(out, arguments.force)
+        refuse_existing(out, arguments.force)
     data = _measurements(arguments)
     for table in (tables.source_table(data), tables.data_table(data)):
         tables.print_table(table, sys.stdout)
@@ -202,13 +202,13 @@ def info(arguments: Namespace) -> int:
 
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
-    _require_free_place(arguments, ".csv", "measurements")
+    require_free_place(arguments, ".csv", "measurements")
     return _write_measurements(_measurements(arguments), arguments)
 
 
 def simulate(arguments: Namespace) -> int:
     """Write what a goniometer would measure of a stack."""
-    _require_free_place(arguments, ".csv", "measurements")
+    require_free_place(arguments, ".csv", "measurements")
     _use_jax()
     from fits.data.geometry import slices
     from fits.problem.simulate import simulate as run_simulation
@@ -237,7 +237,7 @@ def _write_measurements(data: Measurements, arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file."""
-    _require_free_place(arguments, ".png", "pictures")
+    require_free_place(arguments, ".png", "pictures")
     _use_jax()
     from fits.problem.stack_file import read_problem
     from fits.reporting.plots.data import as_png
@@ -326,30 +326,3 @@ def _at_start(stack: "Stack") -> "Stack":
     from fits.problem.parameters import is_free
 
     return jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free)
-
-
-def _require_free_place(arguments: Namespace, ending: str, what: str) -> None:
-    """Before any work: the file of --out can be written, and holds nothing that must stay."""
-    if Path(arguments.out).suffix.lower() != ending:
-        raise ValueError(f"{arguments.out}: {what} can be written as {ending} only")
-    _refuse_existing(arguments.out, arguments.force)
-
-
-def _refuse_existing(path: str | None, force: bool) -> None:
-    if path is None:
-        return
-    if Path(path).is_dir():
-        raise ValueError(f"{path}: is a directory, must be a file")
-    if not Path(path).resolve().parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
-    if Path(path).exists() and not force:
-        raise ValueError(f"{path}: the file exists already (--force overwrites it)")
-
-
-@contextmanager
-def _hint(what: str) -> Iterator[None]:
-    """Says on an interrupt what has become of the work."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(what) from None

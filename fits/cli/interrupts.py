@@ -1,6 +1,7 @@
 """Ctrl-C, so that it always arrives."""
 
 import _thread
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ def raised_again() -> Iterator[None]:
 
     def hook(dropped: Any) -> None:
         if dropped.exc_type is KeyboardInterrupt:
-            threading.Timer(AGAIN_AFTER, _thread.interrupt_main).start()
+            threading.Timer(AGAIN_AFTER, _interrupt).start()
         else:
             usual(dropped)
 
@@ -29,3 +30,20 @@ def raised_again() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = usual
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, in the midst of a system call if it is in one."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        _thread.interrupt_main()
+
+
+@contextmanager
+def hint(what: str) -> Iterator[None]:
+    """Says on an interrupt what has become of the work."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(what) from None

@@ -79,20 +79,27 @@ def sample(
     try:
         moved = Nuts(fit, chain, seed) if sampler == "nuts" else Ensemble(fit, chain, seed)
         _decide(moved, surrogate, path, identity, progress)
-        outlook = Outlook(chain, max_steps, ess)
-
-        def tell(now: bool = False) -> None:
-            if progress is not None and (now or outlook.overdue):
-                progress("sample", chain.iteration, None, outlook.note())
-
-        while not finished(chain, max_steps, ess):
-            moved.advance(min(next_check(chain.iteration), max_steps), tell)
-            chain.checkpoint()
-            tell(now=True)
-        chain.checkpoint()  # what a killed run left in the journal alone
+        _run(moved, chain, max_steps, ess, progress)
     finally:
         chain.close()
     return posterior_of(fit, chain, allow_short)
+
+
+def _run(
+    moved: Nuts | Ensemble, chain: MemoryChain, max_steps: int, ess: float | None, progress: Progress | None
+) -> None:
+    """Go on until the chain is long enough."""
+    outlook = Outlook(chain, max_steps, ess)
+
+    def tell(now: bool = False) -> None:
+        if progress is not None and (now or outlook.overdue):
+            progress("sample", chain.iteration, None, outlook.note())
+
+    while not finished(chain, max_steps, ess):
+        moved.advance(min(next_check(chain.iteration), max_steps), tell)
+        chain.checkpoint()
+        tell(now=True)
+    chain.checkpoint()  # what a killed run left in the journal alone
 
 
 def _require_possible(
