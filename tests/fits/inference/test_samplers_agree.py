@@ -32,7 +32,10 @@ def with_a_free_level() -> Fit:
     return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
 
 
-@pytest.fixture(scope="module", params=[coated, on_a_bound, with_a_free_level], ids=lambda made: made.__name__)
+MADE = [pytest.param(made, marks=pytest.mark.slow) for made in (coated, on_a_bound)] + [with_a_free_level]
+
+
+@pytest.fixture(scope="module", params=MADE, ids=lambda made: made.__name__)
 def plain(request: pytest.FixtureRequest) -> Posterior:
     fitted = request.param()
     assert bool(fitted.at_bound) == (request.param is on_a_bound)

@@ -8,6 +8,11 @@ import pytest
 from layerjax.transport.adding_doubling.facet_light import Normals, facet_energies
 from layerjax.transport.adding_doubling.grid import Region
 
+
+def slow(value):
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
 COSINES = np.array([0.02, 0.15, 0.4, 0.6, 0.745, 0.9, 1.0])
 
 
@@ -49,8 +54,8 @@ def walked(cosine, n, alpha, points=1500):
     return reflected, refracted, 1 - reflected - refracted
 
 
-@pytest.mark.parametrize("alpha", [1e-4, 0.02, 0.1, 0.3, 1.0])
-@pytest.mark.parametrize("ratio", [0.25, 1 / 1.5, 1.0, 1.5, 4.0])
+@pytest.mark.parametrize("alpha", [1e-4, slow(0.02), 0.1, slow(0.3), 1.0])
+@pytest.mark.parametrize("ratio", [slow(0.25), 1 / 1.5, slow(1.0), 1.5, slow(4.0)])
 def test_energies(ratio, alpha):
     """The rule is right to 4e-4, at grazing light (cosine 0.02) to 1e-3; midpoints of 1500 x 1500 to about 1e-4."""
     found = np.asarray(energies(COSINES, ratio, alpha)).T

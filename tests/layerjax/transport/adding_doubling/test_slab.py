@@ -121,7 +121,13 @@ def test_gradients_are_finite_at_the_ends():
             assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("phase", [lj.HenyeyGreenstein(0.8), lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8))])
+@pytest.mark.parametrize(
+    "phase",
+    [
+        lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8)),
+        pytest.param(lj.HenyeyGreenstein(0.8), marks=pytest.mark.slow),  # its values are compared above
+    ],
+)
 def test_eigenvectors_and_doubling_agree(phase):
     """The two forms of a medium, one in double and one in single precision: 1e-5 is what single precision allows."""
     found = []
