@@ -5,6 +5,7 @@ Everything here is a pure function of arrays, compiled once per structure and sh
 that a gradient holds no more than one chunk in memory and accumulates as it goes (`layerjax._batching`).
 """
 
+from functools import cache
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from layerjax.directions import Vector, read_directions, split
 from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify, simplify_and_name
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
-from layerjax.transport.known_directions import KnownDirections, known_directions
+from layerjax.transport.known_directions import Known, KnownDirections, known_directions
 
 
 class Prepared(eqx.Module):
@@ -45,7 +46,7 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
-    return _prepare(stack, transport, None)
+    return _prepare(stack, transport, lambda: None)
 
 
 def evaluate(
@@ -68,8 +69,7 @@ def evaluate(
         wo: unit directions towards the viewer, shape ``(..., 3)``. Same side as wi: reflection; opposite: transmission.
         transport: see `prepare`.
         side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
-        one below.
-            Other pairs give 0, and what only they need is left out of the program.
+            one below. Other pairs give 0, and what only they need is left out of the program.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
         known: what `known_directions` says of wi and wo, where these are traced. Concrete ones are looked at here:
             along few distinct cosines `AddingDoubling` follows light exactly, and costs less.
@@ -80,9 +80,12 @@ def evaluate(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
-    if known is None and not isinstance(stack, Prepared):
-        known = known_directions(wi, wo)
-    prepared = _prepared(stack, transport, wi.dtype, known)
+    if known is not None and (known.of_wi.shape, known.of_wo.shape) != (wi.shape[:-1], wo.shape[:-1]):
+        raise ValueError(
+            f"known: it is of directions of shapes {known.of_wi.shape} and {known.of_wo.shape}, "
+            f"wi and wo have {wi.shape[:-1]} and {wo.shape[:-1]}"
+        )
+    prepared = _prepared(stack, transport, wi.dtype, lambda: known_directions(wi, wo) if known is None else known)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
@@ -105,7 +108,11 @@ def evaluate_with_error(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
-    known = None if isinstance(stack, Prepared) else known_directions(wi, wo)
+
+    @cache
+    def known() -> KnownDirections | None:
+        return known_directions(wi, wo)
+
     prepared = _prepared(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
     other = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
@@ -207,7 +214,7 @@ def _check_side(side: Side) -> None:
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
-def _compared(stack: Stack | Prepared, transport: Transport, known: KnownDirections | None) -> Prepared | None:
+def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> Prepared | None:
     """The stack prepared for the transport that errors are told by; None, if it knows them itself."""
     other = transport.compared()
     if other is None:
@@ -220,14 +227,12 @@ def _compared(stack: Stack | Prepared, transport: Transport, known: KnownDirecti
     return _prepare(stack, other, known)
 
 
-def _prepared(
-    stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: KnownDirections | None = None
-) -> Prepared:
+def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
     prepared = stack if isinstance(stack, Prepared) else _prepare(stack, transport, known)
     return in_precision(prepared, dtype)
 
 
-def _prepare(stack: Stack, transport: Any, known: KnownDirections | None) -> Prepared:
+def _prepare(stack: Stack, transport: Any, known: Known) -> Prepared:
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
     chosen = automatic(stack, simplified) if transport == "auto" else transport

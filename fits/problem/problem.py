@@ -244,12 +244,17 @@ def _model(problem: Problem, used: Measurements, levels: _Levels, template: Temp
         lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
         degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
         transport=problem.transport,
-        known=lj.known_directions(used.wi, used.wo),
+        known=lj.known_directions(used.wi, used.wo) if _uses_known(problem.transport) else None,
         side="reflection" if above else "all",
         objective=problem.objective,
         tails=problem.noise.tails,
         varying=levels.varying,
     )
+
+
+def _uses_known(transport: Any) -> bool:
+    """Whether known directions are of use; where they are not, programs should not depend on how many there are."""
+    return transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known)
 
 
 def _require_same_channels(model: Model, start: Floats, used: Measurements) -> None:

@@ -20,7 +20,7 @@ from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.known_directions import KnownDirections
+from layerjax.transport.known_directions import Known
 
 Side = Literal["all", "reflection", "transmission"]
 """Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
@@ -41,6 +41,9 @@ class Transport(eqx.Module):
     random: ClassVar[bool]
     """Whether values are drawn at random, with a key."""
 
+    uses_known: ClassVar[bool] = False
+    """Whether `prepare_for` makes use of known directions."""
+
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.
@@ -52,7 +55,7 @@ class Transport(eqx.Module):
     def prepare(self, stack: Stack) -> Any:
         """All the work that no direction is needed for, of a simplified stack."""
 
-    def prepare_for(self, stack: Stack, known: KnownDirections | None) -> Any:
+    def prepare_for(self, stack: Stack, known: Known) -> Any:
         """The same for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 

@@ -4,6 +4,7 @@ Measurements come along few directions, of which many share a cosine. A transpor
 just these.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -35,6 +36,10 @@ class KnownDirections(eqx.Module):
     below: Array
     of_wi: Array
     of_wo: Array
+
+
+Known = Callable[[], KnownDirections | None]
+"""Looks at the directions of a batch when it is called: whom they are of no use need not pay for it."""
 
 
 def known_directions(wi: Any, wo: Any) -> KnownDirections | None:

@@ -12,6 +12,7 @@ from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
+from tests.helpers.models import line_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
 PROBLEM = """\
@@ -58,3 +59,9 @@ def coat_fit(coat_toml: Path, coat_data: Measurements) -> Fit:
     """The fit of that stack to those slices."""
     given = read_problem(coat_toml)
     return fit(given.stack, coat_data, transport=given.transport, noise=given.noise, starts=4, seed=0)
+
+
+@pytest.fixture(scope="session")
+def result() -> Fit:
+    """The fit of a line: the cheapest model there is."""
+    return line_fit()

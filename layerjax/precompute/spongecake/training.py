@@ -201,9 +201,9 @@ def _means(random: np.random.Generator, media: Numbers) -> tuple[Array, Array]:
 
 
 class PhaseOfKind(PhaseFunction):
-    """Any of `KINDS`, by a number. kind: 1 at its place, 0 elsewhere. alpha: roughness, or g; blur: see `BlurredSGGX`.
+    """Any of `KINDS`, by a number.
 
-    Its kernel is all that lobes need: nothing is drawn from it.
+    kind: 1 at its place, 0 elsewhere. alpha: roughness, or g; blur: see `BlurredSGGX`.
     """
 
     uses_half_vector: ClassVar[bool] = True
@@ -223,7 +223,9 @@ class PhaseOfKind(PhaseFunction):
         return self.kernel(wi, wo, None) / self.cross_section(wi)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        raise NotImplementedError
+        drawn = [phase.sample(wi, u1, u2) for phase in self._phases()]
+        x, y, z = (self._chosen(list(part)) for part in zip(*drawn, strict=True))
+        return x, y, z
 
     def _phases(self) -> list[PhaseFunction]:
         """In the order of `KINDS`; those that are not chosen are isotropic, and finite with their derivatives."""

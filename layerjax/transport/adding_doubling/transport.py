@@ -10,7 +10,7 @@ rest is read off tables, or, where directions are known and the stack lets them,
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_p
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
-from layerjax.transport.known_directions import KnownDirections
+from layerjax.transport.known_directions import Known, KnownDirections
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
@@ -82,6 +82,8 @@ class AddingDoubling(DeterministicTransport):
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or is used while tracing.
     """
 
+    uses_known: ClassVar[bool] = True
+
     nodes: int = eqx.field(static=True, default=32)
     modes: int = eqx.field(static=True, default=48)
     ordinates: tuple[int, int] = eqx.field(static=True, default=(10, 24))
@@ -115,11 +117,12 @@ class AddingDoubling(DeterministicTransport):
             return self._climb(stack)
         return self._solved(stack)
 
-    def prepare_for(self, stack: Stack, known: KnownDirections | None) -> Solved:
-        if known is not None and self.tolerance is None and self.orders != "first":
+    def prepare_for(self, stack: Stack, known: Known) -> Solved:
+        if self.tolerance is None and self.orders != "first":
             plan = make_plan(stack, self.nodes, self.modes, self.ordinates, self.microfacets)
-            if carries_asked(stack, plan):
-                return Solved(first_order(stack), None, _solve_between(stack, known, plan))
+            directions = known() if carries_asked(stack, plan) else None
+            if directions is not None:
+                return Solved(first_order(stack), None, _solve_between(stack, directions, plan))
         return self.prepare(stack)
 
     def measured(

@@ -27,7 +27,7 @@ from fits.problem.problem import Problem
 from fits.reporting.plots.data import data_picture
 from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
 from tests.helpers.files import contents, largest_file
-from tests.helpers.models import LINE, line, line_data, line_fit
+from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT
 
 MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
@@ -84,11 +84,6 @@ def stopped(words: list[str], cache: Path, when: Callable[[], bool]) -> Iterator
             yield process
         finally:
             process.kill()
-
-
-@pytest.fixture(scope="module")
-def result() -> Fit:
-    return line_fit()
 
 
 @pytest.fixture(scope="module")

@@ -23,14 +23,9 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from tests.helpers.files import largest_file
-from tests.helpers.models import LINE, line, line_data, line_fit
+from tests.helpers.models import LINE, line, line_data
 
 SHORT = {"walkers": 16, "seed": 1, "max_steps": 200, "surrogate": True}
-
-
-@pytest.fixture(scope="module")
-def result() -> Fit:
-    return line_fit()
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,11 @@ from fits.inference.posterior import Posterior
 from fits.inference.sampling import load, sample
 from fits.reporting.results import load_posterior, save_fit
 from tests.helpers.files import largest_file
-from tests.helpers.models import line_fit
 
 pytest.importorskip("blackjax")
 
 NUTS = {"sampler": "nuts", "seed": 1}
 SHORT = {**NUTS, "max_steps": 120}
-
-
-@pytest.fixture(scope="module")
-def result() -> Fit:
-    return line_fit()
 
 
 @pytest.fixture(scope="module")

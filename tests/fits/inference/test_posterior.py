@@ -27,11 +27,6 @@ from tests.helpers.places import ROOT
 
 
 @pytest.fixture(scope="module")
-def result() -> Fit:
-    return line_fit()
-
-
-@pytest.fixture(scope="module")
 def posterior(result: Fit):
     return sample(result, walkers=16, seed=1)
 

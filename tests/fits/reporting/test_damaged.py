@@ -15,12 +15,6 @@ from fits.inference.starts import start_points
 from fits.inference.starts_file import End, StartsFile
 from fits.reporting.results import load_fit, save_fit
 from tests.helpers.files import largest_file
-from tests.helpers.models import line_fit
-
-
-@pytest.fixture(scope="module")
-def result() -> Fit:
-    return line_fit()
 
 
 def damaged(content: bytes, step: int) -> Iterator[tuple[int, bytes]]:

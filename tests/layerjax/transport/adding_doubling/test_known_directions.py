@@ -56,6 +56,12 @@ def test_traced_directions_that_are_known():
     np.testing.assert_allclose(traced, lj.evaluate(stack, wi, wo, SOLVER), rtol=1e-10)
 
 
+def test_directions_that_others_are_known_of_are_refused():
+    wi, wo = pairs(STACKS["paint"])
+    with pytest.raises(ValueError, match=r"known: it is of directions of shapes \(2,\) and \(2,\), wi and wo have"):
+        lj.evaluate(STACKS["paint"], wi, wo, SOLVER, known=lj.known_directions(wi[:2], wo[:2]))
+
+
 def test_shapes_and_directions_without_light():
     stack = STACKS["slab"]
     wi, wo = (w[::5].copy() for w in pairs(stack))
