@@ -5,6 +5,7 @@ from layerjax.directions import angles as angles
 from layerjax.directions import direction as direction
 from layerjax.evaluate import Prepared as Prepared
 from layerjax.evaluate import albedo as albedo
+from layerjax.evaluate import choose_transport as choose_transport
 from layerjax.evaluate import evaluate as evaluate
 from layerjax.evaluate import evaluate_with_error as evaluate_with_error
 from layerjax.evaluate import pdf as pdf

@@ -5,7 +5,7 @@ Everything here is a pure function of arrays, compiled once per structure and sh
 that a gradient holds no more than one chunk in memory and accumulates as it goes (`layerjax._batching`).
 """
 
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -47,6 +47,22 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
     return _prepare(stack, transport, lambda: None)
+
+
+def choose_transport(
+    stack: Stack, transport: Transport | Literal["auto"] = "auto", *, known: KnownDirections | None = None
+) -> Transport:
+    """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
+
+    Args:
+        stack: the layered material. What is traced in it counts as not known.
+        transport: see `prepare`.
+        known: what `known_directions` says of the directions of `evaluate`; None: they are many, or not known.
+
+    Raises:
+        ValueError: as `prepare`.
+    """
+    return _chosen(stack, transport, lambda: known)[0]
 
 
 def evaluate(
@@ -108,11 +124,7 @@ def evaluate_with_error(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
-
-    @cache
-    def known() -> KnownDirections | None:
-        return known_directions(wi, wo)
-
+    known = cache(partial(known_directions, wi, wo))
     prepared = _prepared(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
     other = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
@@ -233,10 +245,17 @@ def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: 
 
 
 def _prepare(stack: Stack, transport: Any, known: Known) -> Prepared:
+    known = cache(known)
+    chosen, simplified = _chosen(stack, transport, known)
+    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
+
+
+def _chosen(stack: Stack, transport: Any, known: Known) -> tuple[Transport, Stack]:
+    """The transport with nothing left open, and the simplified stack."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
     chosen = automatic(stack, simplified) if transport == "auto" else transport
     if not isinstance(chosen, Transport):
         raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
     chosen.check(simplified, names)
-    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
+    return chosen.chosen_for(simplified, known), simplified

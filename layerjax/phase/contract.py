@@ -70,6 +70,14 @@ class PhaseFunction(eqx.Module):
         return sphere_rule(wi, nodes)
 
     @property
+    def width(self) -> Parameter:
+        """About the angle, in radians and up to 1, within which p changes: what a grid of directions must resolve.
+
+        Peaks that may go straight on (see `peaks_forward`) do not count.
+        """
+        return 1.0
+
+    @property
     def is_upright(self) -> bool:
         """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
         return True

@@ -58,6 +58,10 @@ class SGGX(PhaseFunction):
         return flake_rule(wi, *radii(self.kind, self.alpha), self._axis(), nodes)
 
     @property
+    def width(self) -> Parameter:
+        return self.alpha
+
+    @property
     def is_upright(self) -> bool:
         if self.axis is None:
             return True

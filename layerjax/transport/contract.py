@@ -55,8 +55,12 @@ class Transport(eqx.Module):
     def prepare(self, stack: Stack) -> Any:
         """All the work that no direction is needed for, of a simplified stack."""
 
+    def chosen_for(self, stack: Stack, known: Known) -> "Transport":
+        """The same transport with all that it leaves open chosen for the (simplified) stack and known directions."""
+        return self
+
     def prepare_for(self, stack: Stack, known: Known) -> Any:
-        """The same for values at known directions alone, for transports to which these are of use."""
+        """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 
     @abc.abstractmethod
@@ -91,6 +95,10 @@ class Transport(eqx.Module):
 
     def coarser(self) -> "Transport | None":
         """The same transport at a lower resolution, to estimate the error from the difference; None if it has none."""
+        return None
+
+    def finer(self) -> "Transport | None":
+        """The same transport at a higher resolution; None if it has none."""
         return None
 
     def _leaving(self, state: Any, wi: Vector, uniforms: Uniforms) -> tuple[Vector, Array]:

@@ -25,6 +25,7 @@ from layerjax.transport.adding_doubling.grid import Grid, make_grid
 from layerjax.transport.adding_doubling.interfaces import interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.operators import Layer, add
+from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
 from layerjax.transport.known_directions import KnownDirections
 
 
@@ -39,18 +40,13 @@ class Plan(eqx.Module):
     microfacets: Microfacets = eqx.field(static=True)
 
 
-def make_plan(stack: Stack, nodes: int, modes: int, ordinates: tuple[int, int], microfacets: Microfacets) -> Plan:
+def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) -> Plan:
     """The plan for a simplified stack."""
     steps = tuple(doublings(layer.thickness) for layer in stack.layers if isinstance(layer, Medium))
-    if any(is_tilted(layer) for layer in stack.layers):
-        nodes, azimuths = ordinates
+    if any(map(is_tilted, stack.layers)):
+        nodes, azimuths = resolution.ordinates
         return Plan(nodes, azimuths // 2 + 1, azimuths, steps, _ranks(stack), microfacets)
-    return Plan(nodes, modes, None, steps, _ranks(stack), microfacets)
-
-
-def is_tilted(layer: Any) -> bool:
-    """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
-    return isinstance(layer, Medium) and not layer.phase.is_upright
+    return Plan(resolution.nodes, resolution.modes, None, steps, _ranks(stack), microfacets)
 
 
 def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tuple[Grid, Layer]:
@@ -126,9 +122,9 @@ def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     return base_layer(here, _relative(base, here.ior), plan.modes, plan.microfacets)
 
 
-def carries_asked(stack: Stack, plan: Plan) -> bool:
+def carries_asked(stack: Stack) -> bool:
     """Whether directions that are asked for can stand in the place of the grid's outer ones."""
-    if plan.azimuths is not None or not stack.layers or not isinstance(stack.layers[0], Interface):
+    if any(map(is_tilted, stack.layers)) or not stack.layers or not isinstance(stack.layers[0], Interface):
         return False
     if stack.base is not None:
         return True

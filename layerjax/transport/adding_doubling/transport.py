@@ -21,27 +21,25 @@ from jax import Array
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
-from layerjax.stack import Stack
+from layerjax.stack import Stack, channel_count
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
+from layerjax.transport.adding_doubling.resolution import Resolution, chosen, rungs
 from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
-from layerjax.transport.known_directions import Known, KnownDirections
+from layerjax.transport.known_directions import Known, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
 
 Orders = Literal["all", "first", "multiple"]
 
-LADDER = ((8, 8), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96))
-"""Resolutions (nodes, modes) that `tolerance` climbs."""
-
-ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28))
-"""The same for ordinates."""
-
-
 MOST = 1024
 """Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
+
+
+PROBED = 8
+"""Known cosines along which a tolerance is checked, at most."""
 
 
 class Solved(eqx.Module):
@@ -64,12 +62,15 @@ class AddingDoubling(DeterministicTransport):
     light along them is followed exactly, and half the nodes and modes give the same error or less.
 
     Args:
-        nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024.
-        modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal.
-        ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. Both are
-            chosen while tracing: an axis that is traced counts as tilted.
-        tolerance: relative error to aim at instead: `prepare` climbs through resolutions until two agree to it, which
-            needs concrete parameters. The error of the result is then about a quarter of the tolerance or less.
+        nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as
+            give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`):
+            roughnesses that are concrete count, of traced ones lobes of 0.15 are expected.
+        modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal. None: as many as
+            suit the nodes.
+        ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. None:
+            chosen like nodes. Which of the two it is, is decided while tracing: a traced axis counts as tilted.
+        tolerance: relative error to aim at instead of a resolution: this is climbed until two agree to it, which needs
+            concrete parameters. The error of the result is then about a quarter of the tolerance or less.
         orders: ``"all"``, only paths with one event (``"first"``, nothing is solved), or those with more
             (``"multiple"``). An event is a collision, a reflection or refraction at an interface, or a reflection at
             the base.
@@ -84,18 +85,19 @@ class AddingDoubling(DeterministicTransport):
 
     uses_known: ClassVar[bool] = True
 
-    nodes: int = eqx.field(static=True, default=32)
-    modes: int = eqx.field(static=True, default=48)
-    ordinates: tuple[int, int] = eqx.field(static=True, default=(10, 24))
+    nodes: int | None = eqx.field(static=True, default=None)
+    modes: int | None = eqx.field(static=True, default=None)
+    ordinates: tuple[int, int] | None = eqx.field(static=True, default=None)
     tolerance: float | None = eqx.field(static=True, default=None)
     orders: Orders = eqx.field(static=True, default="all")
     microfacets: Microfacets = eqx.field(static=True, default="single")
 
     def __check_init__(self) -> None:
         for name, value, least in (("nodes", self.nodes, 2), ("modes", self.modes, 1)):
-            if not (isinstance(value, int) and least <= value <= MOST):
+            if value is not None and not (isinstance(value, int) and least <= value <= MOST):
                 raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
-        cosines, azimuths = self.ordinates if len(self.ordinates) == 2 else (0, 0)
+        given = (2, 4) if self.ordinates is None else self.ordinates
+        cosines, azimuths = given if len(given) == 2 else (0, 0)
         if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
             raise ValueError(
                 f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "
@@ -112,17 +114,26 @@ class AddingDoubling(DeterministicTransport):
         if self.microfacets == "multiple":
             refuse_vmf(stack, names, 'AddingDoubling(microfacets="multiple")')
 
-    def prepare(self, stack: Stack) -> Solved:
+    def chosen_for(self, stack: Stack, known: Known) -> "AddingDoubling":
+        followed = self.orders != "first" and carries_asked(stack)
+        directions = known() if followed else None
         if self.tolerance is not None:
-            return self._climb(stack)
-        return self._solved(stack)
+            return self._climbed(stack, directions)
+        return self._at(self._resolution(stack, directions is not None))
+
+    def prepare(self, stack: Stack) -> Solved:
+        first = first_order(stack)
+        if self.orders == "first" or not stack.layers:
+            return Solved(first, None)
+        return Solved(first, _solve(stack, first, self._plan(stack, None)))
 
     def prepare_for(self, stack: Stack, known: Known) -> Solved:
-        if self.tolerance is None and self.orders != "first":
-            plan = make_plan(stack, self.nodes, self.modes, self.ordinates, self.microfacets)
-            directions = known() if carries_asked(stack, plan) else None
+        if self.orders != "first" and carries_asked(stack):
+            directions = known()
             if directions is not None:
-                return Solved(first_order(stack), None, _solve_between(stack, directions, plan))
+                return Solved(
+                    first_order(stack), None, _solve_between(stack, directions, self._plan(stack, directions))
+                )
         return self.prepare(stack)
 
     def measured(
@@ -138,14 +149,11 @@ class AddingDoubling(DeterministicTransport):
 
     def coarser(self) -> "AddingDoubling":
         """The same at about two thirds of the resolution, for an estimate of the error."""
-        nodes, azimuths = self.ordinates
-        return dataclasses.replace(
-            self,
-            nodes=max(2, 2 * self.nodes // 3),
-            modes=max(1, 2 * self.modes // 3),
-            ordinates=(max(2, 3 * nodes // 4), max(4, 3 * azimuths // 8 * 2)),
-            tolerance=None,
-        )
+        return self._at(self._given().coarser())
+
+    def finer(self) -> "AddingDoubling":
+        """The same at about three halves of the resolution."""
+        return self._at(self._given().finer())
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = []
@@ -185,33 +193,44 @@ class AddingDoubling(DeterministicTransport):
         near, far = (total([w, part], zero) for w, part in zip(whole, less, strict=True))
         return near, far
 
-    def _solved(self, stack: Stack) -> Solved:
-        first = first_order(stack)
-        if self.orders == "first" or not stack.layers:
-            return Solved(first, None)
-        plan = make_plan(stack, self.nodes, self.modes, self.ordinates, self.microfacets)
-        return Solved(first, _solve(stack, first, plan))
+    def _at(self, resolution: Resolution) -> "AddingDoubling":
+        return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
-    def _climb(self, stack: Stack) -> Solved:
+    def _given(self) -> Resolution:
+        if self.nodes is None or self.modes is None or self.ordinates is None:
+            raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
+        return Resolution(self.nodes, self.modes, self.ordinates)
+
+    def _resolution(self, stack: Stack, followed: bool) -> Resolution:
+        """What is given, and for the rest what is chosen."""
+        by_stack = chosen(stack, followed)
+        nodes = by_stack.nodes if self.nodes is None else self.nodes
+        suiting = by_stack.modes if self.nodes is None else max(1, 3 * self.nodes // 2)
+        return Resolution(nodes, suiting if self.modes is None else self.modes, self.ordinates or by_stack.ordinates)
+
+    def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
+        return make_plan(stack, self._resolution(stack, known is not None), self.microfacets)
+
+    def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
+        """The coarsest resolution that agrees with the one before to `tolerance`, at the directions asked for if
+        light is followed along them, else all over the hemispheres."""
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(stack)):
             raise ValueError(
                 f"AddingDoubling.tolerance: {self.tolerance:g} needs concrete parameters: "
                 "prepare the stack outside jit, grad and vmap, or give nodes and modes"
             )
         assert self.tolerance is not None
-        wi, wo = _probes(stack.base is not None)
+        wi, wo = _probes(stack.base is not None, known)
         before: Array | None = None
-        tilted = make_plan(stack, 2, 1, (2, 4), self.microfacets).azimuths is not None
         change = np.inf
-        for rung in ORDINATES_LADDER if tilted else LADDER:
-            finer = {"ordinates": rung} if tilted else {"nodes": rung[0], "modes": rung[1]}
-            options = dataclasses.replace(self, tolerance=None, **finer)
-            state = options._solved(stack)
-            values = _read(options, state, wi, wo)
+        for rung in rungs(stack):
+            options = self._at(rung)
+            state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
+            values = options.measured(state, wi, wo, "all", channel_count(stack), None)[0]
             if before is not None:
                 change = float(jnp.max(jnp.abs(values - before) / (jnp.abs(values) + 0.1 * jnp.mean(values))))
                 if change <= self.tolerance:
-                    return state
+                    return options
             before = values
         raise ValueError(
             f"AddingDoubling.tolerance: {self.tolerance:g} is not reached: "
@@ -231,16 +250,14 @@ def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
     return between(whole, known, grid.regions[-1].ior, stack.base is not None)
 
 
-@eqx.filter_jit
-def _read(options: AddingDoubling, state: Solved, wi: Vector, wo: Vector) -> Array:
-    return jnp.stack(options.evaluate(state, wi, wo, "all"))
-
-
-def _probes(opaque: bool) -> tuple[Vector, Vector]:
-    """Pairs at which two resolutions are compared: 0 to 80 degrees, in and out of the plane, all sides there are."""
-    polar = jnp.deg2rad(jnp.asarray([3.0, 25.0, 50.0, 70.0, 80.0]))
+def _probes(opaque: bool, known: KnownDirections | None) -> tuple[Array, Array]:
+    """Pairs at which two resolutions are compared: all over the hemispheres, or along some of the known cosines; in
+    and out of the plane, all sides there are."""
     azimuth = jnp.deg2rad(jnp.asarray([0.0, 40.0, 90.0, 140.0, 180.0]))
-    sides = (0.0,) if opaque else (0.0, np.pi)
-    polar_o = jnp.concatenate([jnp.abs(side - polar) for side in sides])
-    in_, out, phi = (array.ravel() for array in jnp.meshgrid(polar_o, polar_o, azimuth, indexing="ij"))
-    return split(direction(in_, jnp.zeros_like(in_))), split(direction(out, phi))
+    if known is None:
+        above = below = jnp.deg2rad(jnp.asarray([3.0, 25.0, 50.0, 70.0, 80.0]))
+    else:
+        above, below = (jnp.arccos(side[:: -(-side.size // PROBED)]) for side in (known.above, known.below))
+    polar = above if opaque else jnp.concatenate([above, jnp.pi - below])
+    theta_i, theta_o, phi = (array.ravel() for array in jnp.meshgrid(polar, polar, azimuth, indexing="ij"))
+    return direction(theta_i, jnp.zeros_like(theta_i)), direction(theta_o, phi)

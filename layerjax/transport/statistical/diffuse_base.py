@@ -32,6 +32,7 @@ from layerjax.surfaces import Lambertian, Surface
 from layerjax.transport.adding_doubling.facet_light import Normals, facet_energies
 from layerjax.transport.adding_doubling.grid import Grid, Region, interpolated, lifted, table_region
 from layerjax.transport.adding_doubling.operators import Parts
+from layerjax.transport.adding_doubling.resolution import Resolution
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
 from layerjax.transport.first_order import share_met
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
@@ -68,7 +69,7 @@ def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> Diffu
     """The diffuse part of a simplified stack over a diffuse base."""
     bare = Stack(stack.layers, None)
     # planned out here: what is known of the layers while tracing saves the solver work
-    plan = make_plan(bare, NODES, 1, (2, 4), microfacets)
+    plan = make_plan(bare, Resolution(NODES, 1, (2, 4)), microfacets)
     return _closed_form(bare, base, plan, precision(stack))
 
 
