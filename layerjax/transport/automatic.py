@@ -1,11 +1,9 @@
 """Which transport a stack gets when none is named."""
 
-from layerjax.stack import Interface, Medium, Stack, is_known, media_of
-from layerjax.surfaces import Lambertian
+from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.transport.adding_doubling import AddingDoubling
 from layerjax.transport.contract import Transport
 from layerjax.transport.single_scattering import SingleScattering
-from layerjax.transport.statistical import Statistical
 
 
 def automatic(given: Stack, simplified: Stack) -> Transport:
@@ -14,15 +12,10 @@ def automatic(given: Stack, simplified: Stack) -> Transport:
     An interface counts where it was given, though its index may be known to be that of what lies above it: a fit that
     passes through that index stays with one transport.
     """
-    faces = [layer for layer in given.layers if isinstance(layer, Interface)]
-    if not faces:
+    if any(isinstance(layer, Interface) for layer in given.layers):
+        return AddingDoubling()
+    # of light that meets nothing twice one event is the whole; thin media do not count: a share of 1e-4 along the
+    # normal is a hundredth at grazing angles
+    if all(is_known(medium.albedo, 0.0) for medium in media_of(simplified)):
         return SingleScattering()
-    closed = len(faces) == 1 and faces[0].distribution == "ggx" and isinstance(given.base, Lambertian)
-    if closed and all(map(_only_absorbs, media_of(simplified))):
-        return Statistical(microfacets="single")
     return AddingDoubling()
-
-
-def _only_absorbs(medium: Medium) -> bool:
-    """In a way that `Statistical` carries."""
-    return is_known(medium.albedo, 0.0) and medium.phase.forward_lobe is not None and medium.f0 is None

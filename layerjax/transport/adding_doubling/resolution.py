@@ -23,8 +23,11 @@ ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28))
 FINEST = (48, 64)
 """What is chosen without a tolerance, at most: more takes minutes and gigabytes."""
 
-FOLLOWED, READ = 2.4, 4.8
-"""Nodes for a lobe of width 1: where light is followed along known directions, and where values are read off tables."""
+FOLLOWED, READ = 6, 12
+"""Nodes at least: where light is followed along known directions, and where values are read off tables."""
+
+ACROSS = 2.4
+"""Nodes needed, times the width of the narrowest lobe."""
 
 ASSUMED = 0.15
 """Width of lobes of which nothing is known while tracing."""
@@ -59,7 +62,7 @@ def chosen(stack: Stack, followed: bool) -> Resolution:
         stack: a simplified stack; of what is traced in it, `ASSUMED` is taken for roughnesses.
         followed: whether light is followed along the directions asked for, so that nothing is read off tables.
     """
-    needed = max((FOLLOWED if followed else READ) / width for width in (1.0, *_widths(stack)))
+    needed = max(FOLLOWED if followed else READ, *(ACROSS / width for width in (1.0, *_widths(stack))))
     rung = next((rung for rung in LADDER if rung[0] >= needed), FINEST)
     nodes, modes = min(rung, FINEST)
     ordinates = next((rung for rung in ORDINATES_LADDER if rung[0] >= needed), ORDINATES_LADDER[-1])
