@@ -22,11 +22,11 @@ def base_layer(region: Region, base: Surface, modes: int, microfacets: Microface
     weight = projected_weight(region)
     kernels = modes_at_nodes(base.evaluate, region, region, modes)
     if isinstance(base, Conductor):
-        return Layer(Parts(_conductor(region, base, kernels, microfacets)))
+        return Layer(_conductor(region, base, kernels, microfacets))
     return Layer(Parts(jnp.stack(kernels) * weight[:, None]))
 
 
-def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Array:
+def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Parts:
     normals = Normals(base.alpha, base.distribution)
 
     def seen_by(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Array, Array]:
@@ -34,14 +34,14 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microf
 
     cosine, seen = of_facets(seen_by, region, normals, jnp.ones((), region.cosine.dtype), "reflected", ENERGY_POINTS)
     ior, k = per_channel(base.ior), per_channel(base.k)
-    operators = []
+    operators, given = [], []
     for c, kernel in enumerate(kernels):
         energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
-        operator = scaled_to_energy(region, kernel, energy)
+        operators.append(scaled_to_energy(region, kernel, energy))
         if microfacets == "multiple":
-            operator = operator.at[0].add(_coloured_return(energy, jnp.sum(seen, axis=-1), region.weight))
-        operators.append(operator)
-    return jnp.stack(operators)
+            gain = _coloured_return(energy, jnp.sum(seen, axis=-1), region.weight)
+            given.append(jnp.zeros_like(operators[-1]).at[0].set(gain))
+    return Parts(jnp.stack(operators), jnp.stack(given) if given else None)
 
 
 def _coloured_return(energy: Array, lossless: Array, weight: Array) -> Array:

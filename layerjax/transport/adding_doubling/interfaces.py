@@ -74,48 +74,54 @@ def interface_layer(
         operators = _followed(grid, asked, far, normals, modes, diffuse)
     else:  # what masking loses is given back in proportion to sums over all directions outside
         operators = _operators(grid, joined(asked, near), far, normals, modes, microfacets, asked.weight.size)
-    outer, into, out, inner = (Parts(None if operator is None else operator[None]) for operator in operators)
+    outer, into, out, inner = (_channelled(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
+
+
+def _channelled(parts: Parts) -> Parts:
+    return Parts(*(None if operator is None else operator[None] for operator in (parts.first, parts.rest)))
 
 
 def _operators(
     grid: Grid, near: Region, far: Region, normals: Normals, modes: int, microfacets: Microfacets, asked: int = 0
-) -> list[Array | None]:
-    """Reflection outside, light that enters, light that leaves, reflection inside: of the first `asked`, or of all."""
+) -> list[Parts]:
+    """Reflection outside, light that enters, light that leaves, reflection inside: of the first `asked`, or of all.
+
+    What is given back after it was lost to masking has met several facets: it is no path of one event.
+    """
     outside, down, lost_outside = facet_energies(near, far, normals)
     inside, up, lost_inside = facet_energies(far, near, normals)
     unresolved = 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
     through = _deposit(grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes)
     through = _balanced(through, near, far, down, up, AGREEING / unresolved)
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
-    operators: list[Array | None] = [None, through, _adjoint(through, leaving, far)]
+    outer = None
     if not asked:
         reflect_near = _face(near, outside, far.ior / near.ior, normals, modes)
-        operators[0] = reflect_near + unresolved * _left_over(near, outside, down, jnp.sum(through[0], axis=-2))
+        outer = reflect_near + unresolved * _left_over(near, outside, down, jnp.sum(through[0], axis=-2))
     passed = safe_div(through[0] @ near.weight, far.weight)
     reflect_far = _face(far, inside, near.ior / far.ior, normals, modes)
-    operators.append(reflect_far + unresolved * _left_over(far, inside, up, passed))
+    inner = reflect_far + unresolved * _left_over(far, inside, up, passed)
+    once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
+    given: list[Array | None] = [None] * 4
     if microfacets == "multiple":
         turned = [
             _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
-        given = _given_back((lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight))
-        operators = [
-            None if operator is None else operator.at[0].add(gain)
-            for operator, gain in zip(operators, given, strict=True)
-        ]
-    if asked:
-        _, into, out, inner = operators
-        assert into is not None
-        assert out is not None
-        return [None, into[..., :asked], out[:, :asked], inner]
-    return operators
+        gains = _given_back((lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight))
+        given = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
+    found = list(map(Parts, once, given))
+    return [_of_asked(parts, place, asked) for place, parts in enumerate(found)] if asked else found
 
 
-def _followed(
-    grid: Grid, asked: Region, inner: Region, normals: Normals, modes: int, diffuse: bool
-) -> list[Array | None]:
+def _of_asked(parts: Parts, place: int, asked: int) -> Parts:
+    """Of the first `asked` directions outside alone: outer reflection, light that enters, that leaves, inner one."""
+    rows, columns = (asked if place in (0, 2) else None), (asked if place in (0, 1) else None)
+    return Parts(*(None if part is None else part[:, :rows, :columns] for part in (parts.first, parts.rest)))
+
+
+def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes: int, diffuse: bool) -> list[Parts]:
     """The same where what masking loses is lost, for directions asked for: no sum over directions outside is needed."""
     ratio = inner.ior / asked.ior
     if diffuse:  # only smooth functions are summed over what is let in
@@ -126,7 +132,7 @@ def _followed(
     through = _deposit(grid, *rays, inner, asked, modes)
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(asked.weight), inner)
-    return [None, through, back, _face(inner, inside, 1.0 / ratio, normals, modes)]
+    return [Parts(operator) for operator in (None, through, back, _face(inner, inside, 1.0 / ratio, normals, modes))]
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:

@@ -22,6 +22,7 @@ from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, channel_count
+from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import Resolution, chosen, rungs
@@ -123,7 +124,8 @@ class AddingDoubling(DeterministicTransport):
 
     def prepare(self, stack: Stack) -> Solved:
         first = first_order(stack)
-        if self.orders == "first" or not stack.layers:
+        gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
+        if self.orders == "first" or not (stack.layers or gives_back):
             return Solved(first, None)
         return Solved(first, _solve(stack, first, self._plan(stack, None)))
 
