@@ -70,12 +70,12 @@ def read_between(found: Between, wi: Vector, wo: Vector, side: Side) -> Channels
     out, into = jnp.minimum(found.of_wo, last), jnp.minimum(found.of_wi, last)
     modes = np.arange(found.values.shape[-1])
     series = found.values[out, into]
-    waves = jnp.where(modes == 0, 1.0, 2.0) * jnp.cos(_turn(wi, wo)[..., None] * modes)
+    waves = jnp.where(modes == 0, 1.0, 2.0) * jnp.cos(turn(wi, wo)[..., None] * modes)
     total = jnp.sum(series * waves[..., None, :], axis=-1)
     return tuple(jnp.where(valid, not_negative(total[..., c]), 0.0) for c in range(total.shape[-1]))
 
 
-def _turn(wi: Vector, wo: Vector) -> Array:
+def turn(wi: Vector, wo: Vector) -> Array:
     """Azimuth between the directions of travel."""
     sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
     at_pole = (sine == 0) & (cosine == 0)

@@ -26,6 +26,7 @@ from layerjax.transport.adding_doubling.interfaces import interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
+from layerjax.transport.adding_doubling.straight import without_straight
 from layerjax.transport.known_directions import KnownDirections
 
 
@@ -84,6 +85,8 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
         if tilted and not is_expanded:
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
+    if asked is not None:
+        whole = without_straight(stack, [found for found, _ in solved], whole)
     return grid, whole
 
 

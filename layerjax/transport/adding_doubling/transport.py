@@ -27,6 +27,7 @@ from layerjax.transport.adding_doubling.asked import Between, between, read_betw
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import Resolution, chosen, rungs
 from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
+from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
@@ -46,12 +47,13 @@ PROBED = 8
 class Solved(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest.
+    Both are None if there is no rest. straight: what passes two interfaces, left out of `between`.
     """
 
     first: FirstOrder
     tables: Tables | None
     between: Between | None = None
+    straight: Straight | None = None
 
 
 class AddingDoubling(DeterministicTransport):
@@ -133,9 +135,8 @@ class AddingDoubling(DeterministicTransport):
         if self.orders != "first" and carries_asked(stack):
             directions = known()
             if directions is not None:
-                return Solved(
-                    first_order(stack), None, _solve_between(stack, directions, self._plan(stack, directions))
-                )
+                found = _solve_between(stack, directions, self._plan(stack, directions))
+                return Solved(first_order(stack), None, found, straight(stack))
         return self.prepare(stack)
 
     def measured(
@@ -146,6 +147,8 @@ class AddingDoubling(DeterministicTransport):
         i, o = split(wi), split(wo)
         rest = read_between(state.between, i, o, side)
         parts = [rest] if self.orders == "multiple" else [evaluate_first(state.first, i, o, side), rest]
+        if state.straight is not None and side != "reflection":
+            parts.append(evaluate_straight(state.straight, i, o))
         values = total(parts, jnp.zeros_like(i[2] * o[2]))
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 

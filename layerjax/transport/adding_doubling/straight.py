@@ -1,0 +1,144 @@
+"""Light that passes a slab by two refractions, at its two interfaces, and meets nothing between: in closed form.
+
+Both lobes may be narrower than the nodes are apart, which then do not tell where they overlap. The directions between
+are integrated over along the facets that either side sees, and the two sums weighed against each other (Veach & Guibas
+1995): the narrower lobe gives the points, the wider the values.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._batching import by_rows
+from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax.channels import Channels, each, total
+from layerjax.directions import Vector, flip, select
+from layerjax.stack import Interface, Medium, Stack, optical_depths
+from layerjax.surfaces.interface import interface_transmission
+from layerjax.transport.adding_doubling.asked import asked_region, turn
+from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
+from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
+
+POINTS = (16, 12)
+"""Points a panel, and in azimuth, of the facets of either side."""
+
+AT_ONCE = 1 << 19
+"""Rays that are followed together."""
+
+
+class Straight(eqx.Module):
+    """The two interfaces, and the media above, between and below them."""
+
+    upper: Interface
+    lower: Interface
+    media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
+
+
+def straight(stack: Stack) -> Straight | None:
+    """What light passes by two refractions alone; None, if none does."""
+    faces = _faces(stack)
+    if faces is None:
+        return None
+    parts = (stack.layers[: faces[0]], stack.layers[faces[0] + 1 : faces[1]], stack.layers[faces[1] + 1 :])
+    upper, lower = (stack.layers[k] for k in faces)
+    assert isinstance(upper, Interface)
+    assert isinstance(lower, Interface)
+    above, between, below = (tuple(layer for layer in part if isinstance(layer, Medium)) for part in parts)
+    return Straight(upper, lower, (above, between, below))
+
+
+def _faces(stack: Stack) -> tuple[int, int] | None:
+    faces = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
+    return (faces[0], faces[1]) if stack.base is None and len(faces) == 2 else None
+
+
+def without_straight(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
+    """The whole stack without the light that passes by two refractions alone, as its layers have it."""
+    faces = _faces(stack)
+    if faces is None:
+        return whole
+    down = _refracted_twice([(layer.transmit_down.first, layer.direct_down) for layer in layers], faces)
+    upward = [(layer.transmit_up.first, layer.direct_up) for layer in reversed(layers)]
+    up = _refracted_twice(upward, [len(layers) - 1 - place for place in faces])
+
+    def rest(layer: Layer) -> tuple[Operator, Operator]:
+        return layer.transmit_down.rest, layer.transmit_up.rest
+
+    return eqx.tree_at(
+        rest, whole, tuple(plus(part, -once) for part, once in zip(rest(whole), (down, up), strict=True))
+    )
+
+
+def _refracted_twice(layers: Sequence[tuple[Operator, Operator]], faces: Sequence[int]) -> Array:
+    """Flux that meets the two faces alone, of layers in the order in which light comes through them.
+
+    layers: what each passes with one event, and what untouched.
+    """
+    before: Operator = jnp.ones(1)
+    passed: Operator = None
+    for place, (through, direct) in enumerate(layers):
+        if place in faces:
+            passed = right(through, before) if passed is None else matmul(through, passed)
+        elif passed is None:
+            before = times(before, direct)
+        else:
+            passed = left(direct, passed)
+    assert passed is not None
+    return passed
+
+
+def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
+    """BSDF of that light; wi and wo on either side, 0 for pairs on one side."""
+    shape = jnp.broadcast_shapes(wi[2].shape, wo[2].shape)
+    downward = wi[2] > 0
+    over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
+    edge = horizon(over[2].dtype)
+    valid = (over[2] > edge) & (under[2] > edge)
+    rows = [jnp.broadcast_to(jnp.where(valid, x, y), shape).ravel() for x, y in ((over[2], 0.5), (under[2], 0.5))]
+    rows.append(jnp.broadcast_to(turn(over, flip(under)), shape).ravel())
+    rays = rows[0].size * 8 * POINTS[0] * POINTS[1]
+    found = by_rows(lambda rows: _passed(state, *rows), tuple(rows), rays // AT_ONCE)
+    outside = total(
+        [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
+    )
+    below = jnp.where(downward, 1.0, 1.0 / state.lower.ior**2)  # f / ior_o^2 is reciprocal
+
+    def value(passed: Array, depth: Array) -> Array:
+        return jnp.where(valid, passed.reshape(shape) * below * jnp.exp(-depth), 0.0)
+
+    return each(value, found, outside)
+
+
+def _column(x: Array, y: Array, z: Array) -> Vector:
+    return x[:, None], y[:, None], z[:, None]
+
+
+def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
+    """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each."""
+    inner, below = state.upper.ior, state.lower.ior
+    normals = [Normals(face.alpha, face.distribution) for face in (state.upper, state.lower)]
+    sine_i, sine_o = (safe_sqrt((1.0 - c) * (1.0 + c)) for c in (cosine_i, cosine_o))
+    cos_phi, sin_phi = jnp.cos(azimuth), jnp.sin(azimuth)
+    over = _column(-sine_i, jnp.zeros_like(sine_i), -cosine_i)
+    under = _column(sine_o * cos_phi, sine_o * sin_phi, -cosine_o)
+    sums = []
+    for ends in (0, 1):
+        cosine, ratio = ((cosine_i, inner), (cosine_o, inner / below))[ends]
+        travel, share = refracted_rays(asked_region(cosine, jnp.ones_like(inner)), ratio, normals[ends], POINTS)
+        # shares stand for mirror images too
+        x, y, z = (
+            jnp.concatenate([part, sign * part], axis=-1) for part, sign in zip(travel, (1.0, -1.0, 1.0), strict=True)
+        )
+        share = 0.5 * jnp.concatenate([share, share], axis=-1)
+        if ends:  # followed backwards, from where it leaves
+            x, y = x * cos_phi[:, None] - y * sin_phi[:, None], x * sin_phi[:, None] + y * cos_phi[:, None]
+        middle: Vector = (-x, -y, z)
+        g_i = interface_transmission((x, y, z), over, 1.0 / inner, *normals[0])
+        g_o = interface_transmission(middle, under, below / inner, *normals[1])
+        mine, other = ((g_i, g_o / below**2), (g_o / below**2, g_i))[ends]
+        value = (g_o, g_i * below**2)[ends] * safe_div(mine, mine + other)
+        depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
+        sums.append(tuple(jnp.sum(share * value * jnp.exp(-depth), axis=-1) for depth in depths))
+    return total(sums)

@@ -1,0 +1,55 @@
+"""Light that passes a slab by two refractions alone: against the walk, however narrow, and with its derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+
+SOLVER = lj.AddingDoubling(nodes=6, modes=6)
+THETA_I, THETA_O, PHI = (
+    np.radians([0.0, 20.0, 0.0, 45.0, 150.0, 180.0]),
+    np.radians([147.0, 152.0, 170.0, 128.0, 20.0, 33.0]),
+    np.array([0.0, 0.1, 2.0, 0.0, 0.1, 1.0]),
+)
+WI, WO = lj.direction(THETA_I, 0.0), lj.direction(THETA_O, PHI)
+
+
+def slab(ior, alpha, ior_below, alpha_below):
+    dye = lj.Medium(0.5, [0.0, 0.6], lj.HenyeyGreenstein(0.3))
+    return lj.Stack([lj.Interface(ior, alpha), dye, lj.Interface(ior_below, alpha_below)])
+
+
+@pytest.mark.parametrize("numbers", [(1.29, 0.24, 1.9, 0.75), (1.5, 0.05, 1.2, 0.1), (0.8, 0.3, 1.0, 0.02)])
+def test_agrees_with_the_walk(numbers):
+    """4 standard errors, and 1e-3 of the values for the solver at 6 nodes."""
+    stack = slab(*numbers)
+    values = np.asarray(lj.evaluate(stack, WI, WO, SOLVER))
+    walked, errors = map(
+        np.asarray, lj.evaluate_with_error(stack, WI, WO, lj.RandomWalk(paths=1 << 13), key=jax.random.key(1))
+    )
+    assert np.all(np.abs(values - walked) < 4.0 * errors + 1e-3 * np.max(walked))
+
+
+def test_is_reciprocal_and_turns_upside_down():
+    stack = slab(1.5, 0.05, 1.2, 0.1)
+    forth, back = lj.evaluate(stack, WI, WO, SOLVER), lj.evaluate(stack, WO, WI, SOLVER)
+    ratio = np.where(np.asarray(WI)[:, 2:] > 0, 1.2**2, 1.2**-2)
+    np.testing.assert_allclose(forth, ratio * back, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_differences():
+    """Central differences of step 1e-5: 1e-10 of the curvature, and rounding of 1e-11."""
+    start = jnp.asarray([1.5, 0.05, 1.2, 0.1])
+
+    def values(numbers):
+        return lj.evaluate(slab(*numbers), WI, WO, SOLVER, known=lj.known_directions(WI, WO))
+
+    slopes = jax.jit(jax.jacfwd(values))(start)
+    compiled = jax.jit(values)
+    for place in range(4):
+        step = jnp.zeros(4).at[place].set(1e-5)
+        difference = (compiled(start + step) - compiled(start - step)) / 2e-5
+        np.testing.assert_allclose(slopes[..., place], difference, rtol=1e-5, atol=1e-5 * np.abs(difference).max())
