@@ -92,7 +92,12 @@ def study(
     """Run it, and write ``recovery.json`` and ``recovery.md``; returns the markdown and the two paths."""
     size = size or (QUICK if quick else DEFAULT)
     geometry = fits.slices(incidence=INCIDENCE)
-    exact = np.asarray(lj.evaluate(stack_of(TRUTH.values()), jnp.asarray(geometry.wi), jnp.asarray(geometry.wo)), float)
+    exact = np.asarray(
+        lj.evaluate(
+            stack_of(TRUTH.values()), jnp.asarray(geometry.wi), jnp.asarray(geometry.wo), lj.SingleScattering()
+        ),
+        float,
+    )
     generator = np.random.default_rng(2024)
     noisy = exact * (1.0 + NOISE * generator.standard_normal((size.repeats, *exact.shape)))
     others = exact * (1.0 + NOISE * generator.standard_normal((size.many, *exact.shape)))
@@ -191,7 +196,7 @@ def problem_of(geometry: fits.Geometry, values: Floats) -> fits.Problem:
     )
     used = np.ones(len(geometry), bool)
     data = fits.Measurements(geometry.wi, geometry.wo, values, None, used, ("value",))
-    return fits.Problem(stack_of(free), data, noise=fits.Noise(relative=NOISE))
+    return fits.Problem(stack_of(free), data, lj.SingleScattering(), noise=fits.Noise(relative=NOISE))
 
 
 def _rows(results: list[tuple[fits.Fit, fits.Posterior]], many: Repeats, size: Size) -> list[Row]:

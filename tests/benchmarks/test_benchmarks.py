@@ -18,12 +18,14 @@ from benchmarks.studies.throughput import fitting, forward_models
 from benchmarks.studies.throughput import run as throughput
 from benchmarks.suite.scenes import CONDUCTOR, SCENES, Scene, pairs
 
+SINGLE = lj.SingleScattering()
+
 COUNT = 200
 BY_NAME = pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
 
 
 def ours(scene: Scene, wi, wo):
-    return np.asarray(lj.evaluate(scene.build(scene.arrays("float64")), wi, wo, side=scene.side))
+    return np.asarray(lj.evaluate(scene.build(scene.arrays("float64")), wi, wo, SINGLE, side=scene.side))
 
 
 @BY_NAME
@@ -41,7 +43,7 @@ def test_finite_differences_agree_with_layerjax(scene: Scene) -> None:
     target = 1.1 * ours(scene, wi, wo)
 
     def loss(p):
-        return jnp.sum(jnp.mean((lj.evaluate(scene.build(p), wi, wo, side=scene.side) - target) ** 2, axis=0))
+        return jnp.sum(jnp.mean((lj.evaluate(scene.build(p), wi, wo, SINGLE, side=scene.side) - target) ** 2, axis=0))
 
     value, slopes = jax.jit(jax.value_and_grad(loss))(scene.arrays("float64"))
     parameters = {name: np.asarray(number) for name, number in scene.parameters.items()}
@@ -70,7 +72,7 @@ def test_the_peers_agree_with_plain_numpy(scene: Scene) -> None:
 
 def test_the_material_that_is_fitted_agrees_with_its_numpy_model() -> None:
     wi, wo = pairs(COUNT, "reflection")
-    values = lj.evaluate(fitting.stack_of(fitting.TRUTH), wi, wo)
+    values = lj.evaluate(fitting.stack_of(fitting.TRUTH), wi, wo, SINGLE)
     np.testing.assert_allclose(fitting.model(fitting.TRUTH, wi, wo), values[:, 0], rtol=1e-13)
 
 

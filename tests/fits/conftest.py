@@ -17,6 +17,8 @@ from tests.helpers.models import line_fit
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
 PROBLEM = """\
 # a hazy coat over paint
+transport = "SingleScattering"
+
 [[layers]]
 kind = "Medium"
 thickness = { start = 1.0, low = 0.05, high = 5.0 }
@@ -40,7 +42,8 @@ def coat_toml(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def coat_data() -> Measurements:
     """Noisy slices of that stack with known parameters; the last ten readings are masked."""
     truth = lj.Stack([lj.Medium(thickness=TRUE_THICKNESS, albedo=0.8)], base=lj.Lambertian(albedo=TRUE_ALBEDO))
-    data = simulate(truth, slices(incidence=(10, 50), azimuth=(0, 60)), noise=0.03, seed=1)
+    view = slices(incidence=(10, 50), azimuth=(0, 60))
+    data = simulate(truth, view, transport=lj.SingleScattering(), noise=0.03, seed=1)
     keep = [True] * (len(data) - 10) + [False] * 10
     return data.where(keep, "the last ten readings are left out")
 

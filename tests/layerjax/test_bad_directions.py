@@ -7,19 +7,21 @@ import pytest
 
 import layerjax as lj
 
+SINGLE = lj.SingleScattering()
+
 STACK = lj.Stack([lj.Medium(0.5)], lj.Lambertian(0.5))
 UP = np.array([0.0, 0.0, 1.0])
 KEY = jax.random.key(0)
 WALK = lj.RandomWalk(paths=64)
 
 FUNCTIONS = {
-    "evaluate, wi": lambda w: lj.evaluate(STACK, w, UP),
-    "evaluate, wo": lambda w: lj.evaluate(STACK, UP, w),
+    "evaluate, wi": lambda w: lj.evaluate(STACK, w, UP, SINGLE),
+    "evaluate, wo": lambda w: lj.evaluate(STACK, UP, w, SINGLE),
     "evaluate_with_error": lambda w: lj.evaluate_with_error(STACK, w, UP, WALK, key=KEY),
-    "sample": lambda w: lj.sample(STACK, w, KEY),
-    "pdf, wi": lambda w: lj.pdf(STACK, w, UP),
-    "pdf, wo": lambda w: lj.pdf(STACK, UP, w),
-    "albedo": lambda w: lj.albedo(STACK, w),
+    "sample": lambda w: lj.sample(STACK, w, KEY, SINGLE),
+    "pdf, wi": lambda w: lj.pdf(STACK, w, UP, SINGLE),
+    "pdf, wo": lambda w: lj.pdf(STACK, UP, w, SINGLE),
+    "albedo": lambda w: lj.albedo(STACK, w, SINGLE),
     "albedo of walks": lambda w: lj.albedo(STACK, w, WALK, key=KEY),
     "unscattered": lambda w: lj.unscattered(STACK, w),
     "goniophotometer": lambda w: lj.goniophotometer(STACK, w, key=KEY, paths=64, polar=1, azimuth=1),
@@ -63,7 +65,7 @@ def test_an_empty_batch_has_empty_results(name, shape):
 
 def test_constants_of_a_program_are_refused_as_well():
     with pytest.raises(ValueError, match="wo: a direction has length 2"):
-        jax.jit(lambda wi: lj.evaluate(STACK, wi, 2.0 * UP))(jnp.asarray(UP))
+        jax.jit(lambda wi: lj.evaluate(STACK, wi, 2.0 * UP, SINGLE))(jnp.asarray(UP))
 
 
 def test_angles_are_real():
@@ -81,7 +83,7 @@ def test_an_axis_may_have_any_length(axis, dtype):
     def value(axis):
         medium = lj.Medium(0.5, phase=lj.SGGX("fiber", 0.3, axis))
         wi, wo = (lj.direction(*angles).astype(dtype) for angles in ((0.5, 0.1), (0.9, 2.0)))
-        return lj.evaluate(lj.Stack([medium], lj.Lambertian(0.5)), wi, wo)
+        return lj.evaluate(lj.Stack([medium], lj.Lambertian(0.5)), wi, wo, SINGLE)
 
     np.testing.assert_allclose(value(axis), value([1.0, 0.0, 1.0]), rtol=10 * np.finfo(dtype).eps)
 

@@ -9,6 +9,8 @@ import layerjax as lj
 from tests.helpers.box import POINTS, draw
 from tests.helpers.derivatives import with_slopes
 
+SINGLE = lj.SingleScattering()
+
 
 def flakes(kind, tilted, fresnel):
     def make(p):
@@ -58,7 +60,7 @@ def test_values_and_gradients_are_finite(name, dtype, mode):
     parameters, wi, wo = jax.tree.map(lambda x: x.astype(dtype), draw(11))
 
     def total(parameters, wi, wo):
-        return jnp.sum(lj.evaluate(make(parameters), wi, wo))
+        return jnp.sum(lj.evaluate(make(parameters), wi, wo, SINGLE))
 
     value, gradients = jax.jit(jax.vmap(with_slopes(total, (0, 1, 2), mode)))(parameters, wi, wo)
     assert value.dtype == dtype
@@ -75,7 +77,9 @@ def test_reciprocity_to_rounding(name):
     make = STRUCTURES[name]
     parameters, wi, wo = draw(12)
     apart = np.linalg.norm(wi + wo, axis=1) > 1e-6  # straight on, the value depends on how -wi is approached
-    both_ways = jax.jit(jax.vmap(lambda p, a, b: (lj.evaluate(make(p), a, b), lj.evaluate(make(p), b, a))))
+    both_ways = jax.jit(
+        jax.vmap(lambda p, a, b: (lj.evaluate(make(p), a, b, SINGLE), lj.evaluate(make(p), b, a, SINGLE)))
+    )
     forward, backward = both_ways(parameters, wi, wo)
     # depths up to 1e4 / 1e-6 are exponentiated: their rounding is what may differ, relative to values that count
     np.testing.assert_allclose(forward[apart], backward[apart], rtol=1e-11, atol=1e-290)
@@ -93,7 +97,7 @@ def test_no_draw_gains_energy(name):
     @jax.vmap
     def weigh(parameters, wi, key):
         stack = make(parameters)
-        _, density, weight = lj.sample(stack, wi, key)
+        _, density, weight = lj.sample(stack, wi, key, SINGLE)
         return density, weight, lj.unscattered(stack, wi)
 
     density, weight, straight = weigh(parameters, wi, jax.random.split(jax.random.key(0), POINTS))
@@ -117,7 +121,7 @@ def test_tangent_and_unnormalised_directions_give_no_nan():
 
         @jax.jit
         def all_of(stack, a, b):
-            values, back = jax.vjp(lambda a, b: lj.evaluate(stack, a, b), a, b)
+            values, back = jax.vjp(lambda a, b: lj.evaluate(stack, a, b, SINGLE), a, b)
             return values, *back(jnp.ones_like(values))
 
         assert all(np.isfinite(array).all() for array in all_of(whole, wi, wo))
@@ -132,7 +136,7 @@ def test_albedo_and_what_passes_straight_through_stay_below_one(name):
     @jax.vmap
     def energies(parameters, wi):
         stack = make(parameters)
-        reflected, transmitted = lj.albedo(stack, wi, nodes=16)
+        reflected, transmitted = lj.albedo(stack, wi, SINGLE, nodes=16)
         return reflected, transmitted, lj.unscattered(stack, wi)
 
     reflected, transmitted, straight = energies(parameters, wi)

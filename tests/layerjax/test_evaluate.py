@@ -10,6 +10,8 @@ import layerjax as lj
 from layerjax._batching import CHUNK_BYTES
 from tests.helpers.cases import tilt3
 
+SINGLE = lj.SingleScattering()
+
 STACK = lj.Stack(tilt3(), lj.Lambertian([0.2, 0.5, 0.8]))
 
 
@@ -35,13 +37,13 @@ def directions(count, seed, dtype=np.float64):
 
 def test_shapes_broadcast_and_end_in_channels():
     wi, wo = directions(4, 0)[:, None], directions(5, 1)[None]
-    assert lj.evaluate(STACK, wi, wo).shape == (4, 5, 3)
-    assert lj.evaluate(OPEN, wi, wo).shape == (4, 5, 1)
-    assert lj.evaluate(OPEN, wi[0, 0], wo[0, 0]).shape == (1,)
-    assert lj.pdf(STACK, wi, wo).shape == (4, 5)
-    wo, density, weight = lj.sample(STACK, wi, jax.random.key(0))
+    assert lj.evaluate(STACK, wi, wo, SINGLE).shape == (4, 5, 3)
+    assert lj.evaluate(OPEN, wi, wo, SINGLE).shape == (4, 5, 1)
+    assert lj.evaluate(OPEN, wi[0, 0], wo[0, 0], SINGLE).shape == (1,)
+    assert lj.pdf(STACK, wi, wo, SINGLE).shape == (4, 5)
+    wo, density, weight = lj.sample(STACK, wi, jax.random.key(0), SINGLE)
     assert (wo.shape, density.shape, weight.shape) == ((4, 1, 3), (4, 1), (4, 1, 3))
-    reflected, transmitted = lj.albedo(STACK, wi, nodes=4)
+    reflected, transmitted = lj.albedo(STACK, wi, SINGLE, nodes=4)
     assert reflected.shape == transmitted.shape == (4, 1, 3)
     assert lj.unscattered(OPEN, wi).shape == (4, 1, 1)
 
@@ -49,10 +51,10 @@ def test_shapes_broadcast_and_end_in_channels():
 def test_an_empty_stack_is_nothing_at_all():
     empty = lj.Stack([])
     wi = directions(3, 0)
-    assert (lj.evaluate(empty, wi, wi) == 0).all()
+    assert (lj.evaluate(empty, wi, wi, SINGLE) == 0).all()
     assert (lj.unscattered(empty, wi) == 1).all()
-    assert (lj.sample(empty, wi, jax.random.key(0))[2] == 0).all()
-    assert all((share == 0).all() for share in lj.albedo(empty, wi))
+    assert (lj.sample(empty, wi, jax.random.key(0), SINGLE)[2] == 0).all()
+    assert all((share == 0).all() for share in lj.albedo(empty, wi, SINGLE))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
@@ -61,13 +63,13 @@ def test_large_batches_run_in_chunks_with_the_same_result(dtype):
     part = (2 * chunk + chunk // 3) // 14 * 2
     count = 7 * part  # two whole chunks and a rest
     wi, wo = directions(count, 2, dtype), directions(count, 3, dtype)
-    whole = lj.evaluate(STACK, wi, wo)
-    parts = [lj.evaluate(STACK, wi[i : i + part], wo[i : i + part]) for i in range(0, count, part)]
+    whole = lj.evaluate(STACK, wi, wo, SINGLE)
+    parts = [lj.evaluate(STACK, wi[i : i + part], wo[i : i + part], SINGLE) for i in range(0, count, part)]
     np.testing.assert_allclose(whole, np.concatenate(parts), rtol=50 * np.finfo(dtype).eps, atol=1e-30)
     assert whole.dtype == dtype
 
     def loss(stack, wi, wo):
-        return jnp.sum(lj.evaluate(stack, wi, wo) ** 2)
+        return jnp.sum(lj.evaluate(stack, wi, wo, SINGLE) ** 2)
 
     together = jax.grad(loss)(STACK, wi, wo)
     half = count // 2
@@ -80,38 +82,38 @@ def test_large_batches_run_in_chunks_with_the_same_result(dtype):
 
 def test_sampling_in_chunks_keeps_weights_and_densities_consistent():
     wi = jnp.broadcast_to(lj.direction(0.7, 0.2), (20_000, 3))
-    wo, density, weight = lj.sample(STACK, wi, jax.random.key(3))
+    wo, density, weight = lj.sample(STACK, wi, jax.random.key(3), SINGLE)
     some = slice(0, 20_000, 997)
-    np.testing.assert_allclose(density[some], lj.pdf(STACK, wi[some], wo[some]), rtol=1e-12)
-    expected = lj.evaluate(STACK, wi[some], wo[some]) * jnp.abs(wo[some, 2:]) / density[some, None]
+    np.testing.assert_allclose(density[some], lj.pdf(STACK, wi[some], wo[some], SINGLE), rtol=1e-12)
+    expected = lj.evaluate(STACK, wi[some], wo[some], SINGLE) * jnp.abs(wo[some, 2:]) / density[some, None]
     np.testing.assert_allclose(weight[some], expected, rtol=1e-12)
 
 
 def test_the_directions_decide_the_precision():
     for dtype in (jnp.float32, jnp.float64):
-        assert lj.evaluate(STACK, directions(2, 0, dtype), directions(2, 1, dtype)).dtype == dtype
-    assert lj.evaluate(STACK, [0, 0, 1], [0.0, 0.6, 0.8]).dtype == jnp.float64
+        assert lj.evaluate(STACK, directions(2, 0, dtype), directions(2, 1, dtype), SINGLE).dtype == dtype
+    assert lj.evaluate(STACK, [0, 0, 1], [0.0, 0.6, 0.8], SINGLE).dtype == jnp.float64
 
 
 def test_preparing_changes_nothing():
     wi, wo = directions(10, 4), directions(10, 5)
     prepared = lj.prepare(OPEN, lj.SingleScattering())
-    np.testing.assert_array_equal(lj.evaluate(prepared, wi, wo), lj.evaluate(OPEN, wi, wo))
-    np.testing.assert_array_equal(lj.pdf(prepared, wi, wo), lj.pdf(OPEN, wi, wo))
+    np.testing.assert_array_equal(lj.evaluate(prepared, wi, wo), lj.evaluate(OPEN, wi, wo, SINGLE))
+    np.testing.assert_array_equal(lj.pdf(prepared, wi, wo), lj.pdf(OPEN, wi, wo, SINGLE))
     key = jax.random.key(0)
-    np.testing.assert_array_equal(lj.sample(prepared, wi, key)[0], lj.sample(OPEN, wi, key)[0])
+    np.testing.assert_array_equal(lj.sample(prepared, wi, key)[0], lj.sample(OPEN, wi, key, SINGLE)[0])
 
 
 def test_sides_agree_where_they_are_asked_for():
     wi, wo = directions(200, 6), directions(200, 7)
-    everything = lj.evaluate(OPEN, wi, wo)[:, 0]
+    everything = lj.evaluate(OPEN, wi, wo, SINGLE)[:, 0]
     above = (wi[:, 2] > 0) & (wo[:, 2] > 0)
     across = wi[:, 2] * wo[:, 2] < 0
     for side, asked in (("reflection", above), ("transmission", across)):
-        values = lj.evaluate(OPEN, wi, wo, side=side)[:, 0]
+        values = lj.evaluate(OPEN, wi, wo, SINGLE, side=side)[:, 0]
         np.testing.assert_allclose(values, jnp.where(asked, everything, 0.0), rtol=1e-12)
     with pytest.raises(ValueError, match="side: 'up' is not one of"):
-        lj.evaluate(OPEN, wi, wo, side="up")
+        lj.evaluate(OPEN, wi, wo, SINGLE, side="up")
 
 
 def test_errors_are_refused_before_anything_is_evaluated():
@@ -127,8 +129,8 @@ def test_errors_are_refused_before_anything_is_evaluated():
 def test_what_is_known_to_be_absent_changes_no_value():
     wi, wo = directions(50, 8), directions(50, 9)
     plain = lj.Stack([lj.Medium(0.7, 1.0, lj.SGGX("surface", 0.4), 0.0), lj.Medium(0.0), lj.Medium(0.4, 0.0)])
-    simplified = lj.evaluate(plain, wi, wo)
-    traced = jax.jit(lambda stack: lj.evaluate(stack, wi, wo))(plain)  # traced leaves cannot be simplified
+    simplified = lj.evaluate(plain, wi, wo, SINGLE)
+    traced = jax.jit(lambda stack: lj.evaluate(stack, wi, wo, SINGLE))(plain)  # traced leaves cannot be simplified
     np.testing.assert_allclose(simplified, traced, rtol=1e-13)
 
 
@@ -149,4 +151,4 @@ def test_one_program_serves_all_values_of_a_structure():
 
 def test_wrong_shapes_are_refused_by_name():
     with pytest.raises(ValueError, match=r"wo: shape \(2,\) given, \(\.\.\., 3\) needed"):
-        lj.evaluate(OPEN, jnp.ones(3), jnp.ones(2))
+        lj.evaluate(OPEN, jnp.ones(3), jnp.ones(2), SINGLE)

@@ -7,13 +7,15 @@ import pytest
 import layerjax as lj
 from benchmarks.measuring.operations import count, total
 
+SINGLE = lj.SingleScattering()
+
 WI, WO = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
 BASE = lj.Lambertian(0.5)
 FLAKES = lj.SGGX("surface", 0.3)
 
 
 def program(stack, side="all"):
-    return count(lambda wi, wo: lj.evaluate(stack, wi, wo, side=side), WI, WO)
+    return count(lambda wi, wo: lj.evaluate(stack, wi, wo, SINGLE, side=side), WI, WO)
 
 
 def operations(stack, side="all"):
@@ -104,7 +106,7 @@ def test_an_absorbing_medium_has_no_lobe():
 def test_traced_values_are_kept():
     # a derivative with respect to a thickness of 0 is not 0: what is traced must not be simplified away
     def value(thickness):
-        return lj.evaluate(lj.Stack([medium(thickness=thickness)]), WI[0], WO[0])[0]
+        return lj.evaluate(lj.Stack([medium(thickness=thickness)]), WI[0], WO[0], SINGLE)[0]
 
     assert value(0.0) == 0.0
     assert jax.grad(value)(0.0) > 0.0

@@ -7,13 +7,15 @@ import pytest
 import layerjax as lj
 from tests.helpers.cases import HEMISPHERES, POINTS, X, fiber_2, flakes
 
+SINGLE = lj.SingleScattering()
+
 
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(jnp.float64, 1e-9), (jnp.float32, 1e-5)])
 def test_point_values(name, dtype, tolerance):
     layers, incident, outgoing, expected = POINTS[name]
     wi, wo = (lj.direction(*angles).astype(dtype) for angles in (incident, outgoing))
-    value = lj.evaluate(lj.Stack(layers()), wi, wo)
+    value = lj.evaluate(lj.Stack(layers()), wi, wo, SINGLE)
     assert value.shape == (1,)
     assert value.dtype == dtype
     np.testing.assert_allclose(value[0], expected, rtol=tolerance)
@@ -24,7 +26,7 @@ def test_hemispherical_values(name):
     layers, incident, *references = HEMISPHERES[name]
     wi = lj.direction(*incident)
     stack = lj.Stack(layers())
-    own, other = lj.albedo(stack, wi, nodes=96)
+    own, other = lj.albedo(stack, wi, SINGLE, nodes=96)
     up, down = (own, other) if wi[2] > 0 else (other, own)
     for value, digits in zip((up, down, lj.unscattered(stack, wi)), references, strict=True):
         half_digit = 0.5 * 10.0 ** -len(digits.split(".")[1])  # what the printed digits leave open
@@ -40,7 +42,7 @@ def test_substrate_is_seen_through_the_media():
     for w in (np.asarray(wi), np.asarray(wo)):
         depth += np.sqrt(0.25 * w[0] ** 2 + w[1] ** 2 + w[2] ** 2) / w[2]
     expected = 0.5 / np.pi * np.exp(-depth)
-    difference = lj.evaluate(stack, wi, wo) - lj.evaluate(bare, wi, wo)
+    difference = lj.evaluate(stack, wi, wo, SINGLE) - lj.evaluate(bare, wi, wo, SINGLE)
     np.testing.assert_allclose(difference[0], expected, rtol=1e-10)
 
 
@@ -48,8 +50,8 @@ def test_substrate_energy():
     # Lambert 0.5 under fiber 0.5 (x axis), thickness 1, theta 0.5, phi 0.3: what the base alone reflects
     wi = lj.direction(0.5, 0.3)
     layers = [flakes("fiber", 0.5, X, 1.0)]
-    with_base, transmitted = lj.albedo(lj.Stack(layers, lj.Lambertian(0.5)), wi, nodes=64)
-    without, _ = lj.albedo(lj.Stack(layers), wi, nodes=64)
+    with_base, transmitted = lj.albedo(lj.Stack(layers, lj.Lambertian(0.5)), wi, SINGLE, nodes=64)
+    without, _ = lj.albedo(lj.Stack(layers), wi, SINGLE, nodes=64)
     np.testing.assert_allclose(with_base - without, _attenuated_lambertian(np.asarray(wi), 0.5, 0.5, 1.0), rtol=1e-7)
     assert transmitted[0] == 0.0
 
@@ -58,7 +60,7 @@ def test_an_opaque_base_ends_everything_below_it():
     stack = lj.Stack(fiber_2(), base=lj.Lambertian(1.0))
     above, below = lj.direction(0.5, 0.3), lj.direction(2.5, 0.3)
     for wi, wo in ((above, below), (below, above), (below, below)):
-        assert lj.evaluate(stack, wi, wo)[0] == 0.0
+        assert lj.evaluate(stack, wi, wo, SINGLE)[0] == 0.0
     assert lj.unscattered(stack, above)[0] == 0.0
 
 
@@ -72,7 +74,9 @@ def test_the_lower_half_of_a_stack_is_the_upper_half_of_its_mirror_image():
     wi = lj.direction(jnp.array([0.5, 2.4, 2.4]), 1.0)
     wo = lj.direction(jnp.array([2.2, 1.1, 2.0]), 4.0)
     np.testing.assert_allclose(
-        lj.evaluate(lj.Stack(layers), wi, wo), lj.evaluate(lj.Stack(mirrored), wi * flip, wo * flip), rtol=1e-13
+        lj.evaluate(lj.Stack(layers), wi, wo, SINGLE),
+        lj.evaluate(lj.Stack(mirrored), wi * flip, wo * flip, SINGLE),
+        rtol=1e-13,
     )
 
 

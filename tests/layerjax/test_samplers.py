@@ -11,6 +11,8 @@ from layerjax.normals.ggx import ggx_density, ggx_masking, ggx_sample
 from tests.helpers.cases import haze, tilt3
 from tests.helpers.sampling import DRAWS, SIGNIFICANCE, chi_square, density_of
 
+SINGLE = lj.SingleScattering()
+
 ABOVE, BELOW, GRAZING = (0.7, 0.4), (2.3, 1.0), (1.45, 2.0)
 
 STACKS = {
@@ -40,21 +42,23 @@ IDS = [f"{name}, theta {wi[0]}" for name, _, wi in CASES]
 def test_samples_follow_their_density(name, stack, wi):
     wi = lj.direction(*wi)
     towards = jnp.broadcast_to(wi, (DRAWS, 3))
-    wo, density, weight = lj.sample(stack, towards, jax.random.key(7))
+    wo, density, weight = lj.sample(stack, towards, jax.random.key(7), SINGLE)
     above_only = stack.base is not None  # a surface states its density above the horizon alone
     keep = wo[:, 2] > 0 if above_only else slice(None)
 
     def cells(w):
-        return jnp.where(w[..., 2] > 0, lj.pdf(stack, wi, w), 0.0) if above_only else lj.pdf(stack, wi, w)
+        return (
+            jnp.where(w[..., 2] > 0, lj.pdf(stack, wi, w, SINGLE), 0.0) if above_only else lj.pdf(stack, wi, w, SINGLE)
+        )
 
     probability, total = chi_square(wo[keep], cells)
     assert probability > SIGNIFICANCE
     np.testing.assert_allclose(total, 1.0 if not above_only else np.mean(wo[:, 2] > 0), atol=4e-3)
-    found = density_of(wo, lambda w: lj.pdf(stack, wi, w))
+    found = density_of(wo, lambda w: lj.pdf(stack, wi, w, SINGLE))
     np.testing.assert_allclose(density[:100], found[:100], rtol=1e-9)
 
     mean, error = np.mean(weight, axis=0), np.std(weight, axis=0) / np.sqrt(DRAWS)
-    reflected, transmitted = lj.albedo(stack, wi)
+    reflected, transmitted = lj.albedo(stack, wi, SINGLE)
     np.testing.assert_array_less(np.abs(mean - (reflected + transmitted)), 4.5 * error + 1e-6)
     assert np.max(weight) <= 1.0 + 1e-9 or name.startswith("oren-nayar")
 
@@ -83,7 +87,7 @@ def test_picks_by_collision_probability():
     thin, thick = 0.3, 1.1
     stack = lj.Stack([haze(0.98, thin), haze(-0.98, thick)])
     wi = lj.direction(0.5, 0.0)
-    wo, _, _ = lj.sample(stack, jnp.broadcast_to(wi, (DRAWS, 3)), jax.random.key(5))
+    wo, _, _ = lj.sample(stack, jnp.broadcast_to(wi, (DRAWS, 3)), jax.random.key(5), SINGLE)
     onward = np.mean(np.asarray(wo @ wi) < 0)
     c = float(wi[2])
     share = (1 - np.exp(-thin / c)) / (1 - np.exp(-(thin + thick) / c))
@@ -97,7 +101,7 @@ def test_picks_by_collision_probability():
 def test_the_same_key_draws_the_same():
     stack = lj.Stack(tilt3())
     wi = jnp.broadcast_to(lj.direction(0.5, 0.0), (10, 3))
-    first, again = (lj.sample(stack, wi, jax.random.key(1))[0] for _ in range(2))
-    other = lj.sample(stack, wi, jax.random.key(2))[0]
+    first, again = (lj.sample(stack, wi, jax.random.key(1), SINGLE)[0] for _ in range(2))
+    other = lj.sample(stack, wi, jax.random.key(2), SINGLE)[0]
     assert (first == again).all()
     assert (first != other).any()

@@ -10,6 +10,8 @@ from jax.flatten_util import ravel_pytree
 import layerjax as lj
 from layerjax.stack import simplify
 
+SINGLE = lj.SingleScattering()
+
 HG = lj.HenyeyGreenstein(0.5)
 
 REFUSED = {
@@ -88,7 +90,7 @@ def test_placeholders_pass_the_constructor_and_are_refused_on_evaluation():
 
     stack = lj.Stack([lj.Medium(Unknown(), phase=lj.SGGX("fiber", Unknown()))], lj.Lambertian(0.5))
     with pytest.raises(ValueError, match=r"layers\[0\]\.thickness, layers\[0\]\.phase\.alpha not given a value"):
-        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0))
+        lj.evaluate(stack, lj.direction(0.5, 0.0), lj.direction(0.5, 1.0), SINGLE)
 
 
 def make(p):
@@ -106,7 +108,7 @@ WI, WO = lj.direction(0.6, 0.2), lj.direction(0.9, 2.4)
 
 def test_gradients_agree_with_central_differences():
     def value(p, wi, wo):
-        return jnp.sum(lj.evaluate(make(p), wi, wo) * jnp.array([1.0, 2.0, 3.0]))
+        return jnp.sum(lj.evaluate(make(p), wi, wo, SINGLE) * jnp.array([1.0, 2.0, 3.0]))
 
     arguments = (PARAMETERS, WI, WO)
     reverse = jax.jit(jax.grad(value, (0, 1, 2)))(*arguments)
@@ -126,7 +128,7 @@ def test_gradients_where_wi_and_wo_are_equally_attenuated():
     # at the mirror image of wi through the plane; |a - b| and min(a, b) have no derivative there, the value has
     def value(x):
         layers = [lj.Medium(x[0], phase=lj.SGGX("surface", 0.4)), lj.Medium(x[1], 0.7, HG)]
-        return lj.evaluate(lj.Stack(layers), lj.direction(x[2], 0.3), lj.direction(jnp.pi - x[3], x[4]))[0]
+        return lj.evaluate(lj.Stack(layers), lj.direction(x[2], 0.3), lj.direction(jnp.pi - x[3], x[4]), SINGLE)[0]
 
     random = np.random.default_rng(0)
     theta, thickness = random.uniform(0.05, 1.4, 500), random.uniform(0.1, 3.0, (2, 500))
@@ -142,8 +144,8 @@ def test_gradients_where_wi_and_wo_are_equally_attenuated():
 def test_a_parameter_map_runs_under_vmap():
     alphas = jnp.linspace(0.1, 0.9, 5)
     stacks = eqx.filter_vmap(lambda alpha: make({**PARAMETERS, "alpha": alpha}))(alphas)
-    together = jax.vmap(lambda stack: lj.evaluate(stack, WI, WO))(stacks)
-    alone = [lj.evaluate(make({**PARAMETERS, "alpha": alpha}), WI, WO) for alpha in alphas]
+    together = jax.vmap(lambda stack: lj.evaluate(stack, WI, WO, SINGLE))(stacks)
+    alone = [lj.evaluate(make({**PARAMETERS, "alpha": alpha}), WI, WO, SINGLE) for alpha in alphas]
     np.testing.assert_allclose(together, jnp.stack(alone), rtol=1e-13)
 
 

@@ -117,7 +117,7 @@ def coated_lobe(seed: int = 0) -> fits.Problem:
         channels=("value",),
     )
     free = [fits.Free(*ends) for ends in zip(START.tolist(), LOW.tolist(), HIGH.tolist(), strict=True)]
-    return fits.Problem(stack_of(free), data)
+    return fits.Problem(stack_of(free), data, transport=lj.SingleScattering())
 
 
 def scipy_fit(problem: fits.Problem, values: Floats) -> Any:

@@ -94,7 +94,7 @@ def measure(scene: Scene, precision: str, size: Size, with_peers: bool) -> list[
     thin = [np.ascontiguousarray(a[::FINITE_DIFFERENCES_SHARE].T) for a in (wi, wo, target)]
 
     def values(p: Parameters, wi: Array, wo: Array) -> Array:
-        return lj.evaluate(scene.build(p), wi, wo, side=scene.side)
+        return lj.evaluate(scene.build(p), wi, wo, lj.SingleScattering(), side=scene.side)
 
     def loss(p: Parameters, wi: Array, wo: Array, target: Array) -> Array:
         return jnp.sum(jnp.mean((values(p, wi, wo) - target) ** 2, axis=0))

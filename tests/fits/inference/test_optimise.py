@@ -286,9 +286,11 @@ def test_a_medium_over_a_base_is_recovered() -> None:
         ],
         base=lj.Lambertian(albedo=Free(0.5, 0.0, 1.0)),
     )
-    data = simulate(truth, slices(incidence=[10, 40, 60], azimuth=[0, 90]), noise=0.02, seed=3)
+    single = lj.SingleScattering()
+    view = slices(incidence=[10, 40, 60], azimuth=[0, 90])
+    data = simulate(truth, view, transport=single, noise=0.02, seed=3)
     calls = []
-    result = fit(free, data, starts=9, progress=lambda *arguments: calls.append(arguments))
+    result = fit(free, data, transport=single, starts=9, progress=lambda *arguments: calls.append(arguments))
     assert result.converged
     assert result.units["layers[0].thickness"] == "optical depth"
     expected = [0.6, 0.9, 0.7, 0.5, 0.3, 0.4]

@@ -210,7 +210,7 @@ def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
     values = np.repeat(coat_data.values, 3, axis=1)
     data = replace(coat_data, values=values, sigma=None, channels=("red", "green", "blue"))
     stack = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(Free(0.5, 0.0, 1.0)))
-    grey = fit(stack, data, noise=Noise(relative=0.03), starts=1)
+    grey = fit(stack, data, transport=lj.SingleScattering(), noise=Noise(relative=0.03), starts=1)
     figure = model_pictures.curves_picture({"grey": grey})
     assert isinstance(figure, Figure)
     curves = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 100]
