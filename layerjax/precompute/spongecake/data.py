@@ -139,7 +139,7 @@ def shard(number: int, media: int, split: Split, seed: int) -> Samples:
     light, view = (np.asarray(w, np.float32) for w in (wi[:, np.where(order == 1, 1, 0)], wo[:, order]))
     with jax.enable_x64(False):
         numbers = {name: jnp.asarray(array, jnp.float32) for name, array in vars(layers).items() if name != "kind"}
-        teacher = AddingDoubling(ordinates=ORDINATES[split, media], orders="multiple")
+        teacher = AddingDoubling(nodes=32, modes=48, ordinates=ORDINATES[split, media], orders="multiple")
         found = _solve(
             teacher, tuple(KINDS[k] for k in layers.kind[0]), tilted, numbers, jnp.asarray(light), jnp.asarray(view)
         )
