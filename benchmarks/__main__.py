@@ -1,9 +1,9 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
-``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
-beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
-``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
-coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other) and ``side-by-side``
-(which transport when: a page of docs from the results of error-vs-time)."""
+``calibration`` (are posteriors?), ``error-vs-time`` (every model against the truth, over the suite of stacks),
+``references`` (the solver and the walk beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe
+by lobe, beside the walk), ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy,
+figures, fits), ``endf`` (thin coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each
+other) and ``side-by-side`` (which transport when: a page of docs from the results of error-vs-time)."""
 
 import argparse
 import importlib
@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-NAMES = ("throughput", "recovery", "error-vs-time", "references", "statistics", "spongecake", "endf", "rough-diffuse",
-         "side-by-side")  # fmt: skip
+NAMES = ("throughput", "recovery", "calibration", "error-vs-time", "references", "statistics", "spongecake", "endf",
+         "rough-diffuse", "side-by-side")  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,7 +34,15 @@ def main(arguments: list[str] | None = None) -> int:
     families = sorted({path.parent.name for path in (Path(__file__).parent / "suite").glob("*/*.toml")})
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
     compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
-    compared.add_argument("--resume", action="store_true", help="measure only what the directory does not hold yet")
+    calibrated = commands.choices["calibration"]
+    calibrated.add_argument("--repeats", type=int, metavar="N", help="how many there are to be in all")
+    calibrated.add_argument(
+        "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), default=(6, 6), help="of AddingDoubling"
+    )
+    for command in (compared, calibrated):
+        command.add_argument(
+            "--resume", action="store_true", help="keep what the directory holds, and add what it lacks"
+        )
     given = parser.parse_args(arguments)
 
     # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
@@ -61,6 +69,12 @@ def main(arguments: list[str] | None = None) -> int:
             options |= {"families": given.families, "models": named(given.models), "resume": given.resume}
         except ValueError as error:
             parser.error(str(error))
+    if given.benchmark == "calibration":
+        from layerjax import AddingDoubling
+
+        nodes, modes = given.resolution
+        options |= {"transport": AddingDoubling(nodes=nodes, modes=modes), "repeats": given.repeats}
+        options["resume"] = given.resume
     study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
     text, paths = study(**options)
     print(text)

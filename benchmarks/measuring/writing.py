@@ -14,6 +14,9 @@ DIRECTORY = Path(__file__).parents[1] / "results"
 DIGITS = 6
 """Significant digits of the numbers in a JSON file: what lies beyond differs between machines."""
 
+NOT_REACHED = "**error not reached**"
+"""Verdict on the time of something that is not as exact as it should be."""
+
 
 @dataclass(frozen=True)
 class Bar:

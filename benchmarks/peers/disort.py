@@ -43,6 +43,7 @@ def bsdf(
     corrected: bool = True,
     modes: int | None = None,
     reflection_only: bool = False,
+    base: float = 0.0,
 ) -> Values:
     """BSDF of the slab lit from above, without the unscattered light, 1/sr, (cosines, azimuths).
 
@@ -55,10 +56,11 @@ def bsdf(
         corrected: delta-M scaling, and the corrections of Nakajima & Tanaka (1988) for it.
         modes: Fourier modes in azimuth; None: as many as streams.
         reflection_only: leave out the transmission; `cosines` are then above 0 (None: the upper half of the nodes).
+        base: albedo of a Lambertian base under the slab; 0 for none.
     """
     from PythonicDISORT.subroutines import interpolate
 
-    solution = _solve(thickness, g, albedo, incidence, streams, corrected, modes)
+    solution = _solve(thickness, g, albedo, incidence, streams, corrected, modes, base)
     depths, travel = np.array([0.0] if reflection_only else [0.0, thickness]), np.asarray(azimuths) - np.pi
     if cosines is None:
         radiance = solution(depths, travel).reshape(streams, len(depths), -1)
@@ -72,7 +74,14 @@ def bsdf(
 
 
 def _solve(
-    thickness: float, g: float, albedo: float, incidence: float, streams: int, corrected: bool, modes: int | None
+    thickness: float,
+    g: float,
+    albedo: float,
+    incidence: float,
+    streams: int,
+    corrected: bool,
+    modes: int | None,
+    base: float,
 ) -> Callable[..., Values]:
     """The radiance as a function of depth and azimuth, as the solver returns it."""
     from PythonicDISORT import pydisort
@@ -94,6 +103,7 @@ def _solve(
             NFourier=streams if modes is None else modes,
             f_arr=legendre[streams] if corrected else 0,
             NT_cor=corrected,
+            BDRF_Fourier_modes=[base] if base else [],
             cache_asso_leg="no_mu0",
         )
     return solved[-1]

@@ -1,7 +1,7 @@
 """The two references beside their peers: PythonicDISORT for `AddingDoubling`, Mitsuba's volpath for `RandomWalk`."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from benchmarks.measuring import environment
-from benchmarks.measuring.timing import Work, interleaved, once
-from benchmarks.measuring.writing import DIRECTORY, Bar, environment_lines, write
+from benchmarks.measuring.timing import Work, interleaved
+from benchmarks.measuring.writing import DIRECTORY, NOT_REACHED, Bar, environment_lines, write
 from benchmarks.peers import disort
 from benchmarks.peers import functions as peers
 from benchmarks.peers.mitsuba_volpath import Volpath
+from benchmarks.studies.references import speed
+from benchmarks.studies.references.ways import Way, cheapest, largest_error, spread, way_of
 from benchmarks.studies.throughput.fitting import Row, as_json, markdown
 
 Floats = NDArray[np.float64]
 
 FULL_BRDF, WALK, FIXED_ERROR, ANISOTROPIC = Bar(0.05, 0.02), Bar(0.4, 0.2), Bar(1e-2, 1e-3), Bar(100.0, 10.0)
-
-FLOOR = 1e-3
-"""Errors are relative, with this share of the largest value as a floor."""
 
 AZIMUTHS = np.linspace(0.0, np.pi, 33)
 INCIDENCE = (np.arange(16) + 0.5) / 16
@@ -74,7 +73,11 @@ one compiled function of them; it has 16 x 16 cosines and 33 azimuths. Otherwise
 reaches the error. The layers with axes are measured by their rms error from the walk. The bars are those of the
 project's performance sheet: at least, and in brackets the aim. {peers}
 
-{rows}"""
+{rows}
+{speed}"""
+
+
+CALLED = speed.Size(rounds=21)
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class Size:
     """How much is measured.
 
     rounds: interleaved repeats. paths: of a walk per pair. errors: to be reached in the full BRDF. depths: thickness of
-    the slabs that are walked. pairs: directions of the comparison of walk and solver.
+    the slabs that are walked. pairs: directions of the comparison of walk and solver. called: of the table of times.
     """
 
     rounds: int
@@ -90,18 +93,11 @@ class Size:
     errors: tuple[float, ...] = (1e-3, 2e-4)
     depths: tuple[float, ...] = (1.0, 10.0)
     pairs: int = 64
+    called: speed.Size = CALLED
 
 
-DEFAULT, QUICK = Size(7, 1 << 20), Size(3, 1 << 18, errors=(1e-3,))
-
-
-@dataclass(frozen=True)
-class Way:
-    """A solver at one resolution: its name, the work, and the error of what it gives."""
-
-    name: str
-    work: Callable[[], Any]
-    error: float
+DEFAULT = Size(7, 1 << 20)
+QUICK = Size(3, 1 << 18, errors=(1e-3,), called=speed.Size(rounds=5, starts=4))
 
 
 def study(
@@ -125,15 +121,25 @@ def study(
     if "Mitsuba" not in missing:
         rows += walks(size, report)
     rows += fixed_error(size, report)
-    rows.append(anisotropic(size, report))
+    fibers, bar = anisotropic(size, report), speed.FIBERS
+    rows.append(fibers)
+    fast = speed.rows(size.called, "PythonicDISORT" not in missing, report)
+    fast.append(speed.row(fibers.work, fibers.unit, fibers.ours, bar, "", fibers.verdict != NOT_REACHED))
     absent = "; ".join(f"{name} did not run: {reason}" for name, reason in missing.items())
     text = TEXT.format(
         environment=environment_lines(surroundings),
         rounds=size.rounds,
         peers=f"{absent}." if absent else "Peers: PythonicDISORT and Mitsuba 3 (`llvm_ad_rgb`), same run.",
         rows=markdown(rows),
+        speed=speed.markdown(fast),
     )
-    content = {"environment": surroundings, "rounds": size.rounds, "peers missing": missing, "rows": as_json(rows)}
+    content = {
+        "environment": surroundings,
+        "rounds": size.rounds,
+        "peers missing": missing,
+        "rows": as_json(rows),
+        "speed": [asdict(row) for row in fast],
+    }
     return text, write("references", content, text, directory)
 
 
@@ -146,23 +152,23 @@ def full_brdf(size: Size, report: Callable[[str], None]) -> list[Row]:
     report("full BRDF: the truth")
     exact = _solver(stack, wi, wo, FINEST, "reflection")()[..., 0]
     other = _discrete_ordinates(max(STREAMS), max(STREAMS), True)()
-    known = _error(other, exact)
+    known = largest_error(other, exact)
     report(f"full BRDF: AddingDoubling {FINEST} and DISORT {max(STREAMS)} differ by {known:.0e}")
     theirs = [
-        _way(f"{n} x {m}{', corrected' * corrected}", _discrete_ordinates(n, m, corrected), exact)
+        way_of(f"{n} x {m}{', corrected' * corrected}", _discrete_ordinates(n, m, corrected), exact)
         for n in STREAMS
         for m in (n // 2, n)
         for corrected in (False, True)
     ]
     ours = [
-        _way(f"{n} x {m}", _compiled(stack, wi, wo, (n, m), "reflection"), exact[..., None])
+        way_of(f"{n} x {m}", _compiled(stack, wi, wo, (n, m), "reflection"), exact[..., None])
         for n, m in FULL_RESOLUTIONS
     ]
     rows = []
     for error in size.errors:
         report(f"full BRDF: error {error:g}")
-        mine = _cheapest(ours, error)
-        yours = _cheapest(theirs, error)
+        mine = cheapest(ours, error)
+        yours = cheapest(theirs, error)
         seconds = interleaved({"ours": mine.work, "theirs": yours.work}, size.rounds)
         short = "".join(
             f"; {name} falls short" for name, way in (("ours", mine), ("DISORT", yours)) if way.error > error
@@ -209,8 +215,8 @@ def fixed_error(size: Size, report: Callable[[str], None]) -> list[Row]:
         report(f"time to 1 %: {name}")
         wi, wo = _pairs(size.pairs)
         exact = _solver(stack, wi, wo, FINEST, "all")()
-        mine = _cheapest(
-            [_way(f"{n} x {m}", _solver(stack, wi, wo, (n, m), "all"), exact) for n, m in RESOLUTIONS], 0.01
+        mine = cheapest(
+            [way_of(f"{n} x {m}", _solver(stack, wi, wo, (n, m), "all"), exact) for n, m in RESOLUTIONS], 0.01
         )
         walk = lj.RandomWalk(paths=max(size.paths // size.pairs, 2))
         walked = _walk(lj.prepare(stack, walk), wi, wo)
@@ -233,7 +239,7 @@ def anisotropic(size: Size, report: Callable[[str], None]) -> Row:
     ways, notes = [], []
     for stack, tried in ((TILTED, ANISOTROPIC_RESOLUTIONS), (SYMMETRIC, RESOLUTIONS)):
         values, errors = (np.asarray(x) for x in _walk(lj.prepare(stack, lj.RandomWalk(size.paths)), wi, wo)())
-        way = _coarsest(stack, wi, wo, tried, values, 0.01, measure=_spread)
+        way = _coarsest(stack, wi, wo, tried, values, 0.01, measure=spread)
         short = " falls short" * (way.error > 0.01)
         ways.append(way)
         notes.append(
@@ -256,10 +262,10 @@ def _coarsest(
     side: Any = "all",
     measure: Callable[[Floats, Floats], float] | None = None,
 ) -> Way:
-    """`AddingDoubling` at the first resolution that reaches the error (by `_error`, or `measure`); else at the last."""
+    """`AddingDoubling` at the first resolution that reaches the error, largest or by `measure`; else at the last."""
     for nodes, modes in resolutions:
         work = _solver(stack, wi, wo, (nodes, modes), side)
-        way = Way(f"{nodes} x {modes}", work, (measure or _error)(work(), exact))
+        way = Way(f"{nodes} x {modes}", work, (measure or largest_error)(work(), exact))
         if way.error <= error:
             break
     return way
@@ -304,27 +310,6 @@ def _pairs(number: int) -> tuple[Floats, Floats]:
     return wi, wo
 
 
-def _way(name: str, work: Callable[[], Floats], exact: Floats) -> Way:
-    return Way(name, work, _error(work(), exact))
-
-
-def _cheapest(ways: Sequence[Way], error: float) -> Way:
-    """The fastest way that reaches the error; the most exact if none does."""
-    reaching = [way for way in ways if way.error <= error]
-    if not reaching:
-        return min(ways, key=lambda way: way.error)
-    return min(reaching, key=lambda way: min(once(way.work) for _ in range(3)))
-
-
-def _error(values: Floats, exact: Floats) -> float:
-    return float(np.max(np.abs(values - exact) / np.maximum(exact, FLOOR * exact.max())))
-
-
-def _spread(values: Floats, exact: Floats) -> float:
-    """Root mean square of the relative errors: noise in what counts as exact touches it less than the largest."""
-    return float(np.sqrt(np.mean(((values - exact) / exact) ** 2)))
-
-
 def _row(
     work: str,
     unit: str,
@@ -340,5 +325,5 @@ def _row(
     ours, theirs = (scale * float(np.median(seconds[way])) for way in ("ours", "theirs"))
     words, verdict = (bar.words(), bar.verdict(ratio)) if bar else ("", "")
     if not reached:
-        verdict = "**error not reached**"
+        verdict = NOT_REACHED
     return Row(work, unit, ours, theirs, name, ratio, words, verdict, note)

@@ -1,0 +1,93 @@
+"""Ranks of truths among posterior draws: whether they are uniform, in numbers and as a picture."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import stats
+
+import fits
+from fits.reporting.plots.data import CYCLE, INK, STYLE
+
+DRAWS = 99
+"""Posterior draws a repeat: ranks go from 0 to 99, and bins of them are equally wide."""
+
+BINS = (20, 10, 5, 4, 2)
+EXPECTED = 5
+"""Repeats in a bin from which the chi-square distribution holds: fewer repeats have fewer bins."""
+
+LEAST_P = 0.01
+BAND = 0.99
+
+Ranks = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Uniformity of the ranks of one parameter: the statistic and p-value of a chi-square test over `bins`, and that of
+    Kolmogorov and Smirnov; and the mean rank in standard errors from where it should be."""
+
+    parameter: str
+    bins: int
+    chi_square: float
+    p_chi_square: float
+    p_kolmogorov_smirnov: float
+    mean_off: float
+    uniform: bool
+
+
+def spread_draws(posterior: fits.Posterior) -> tuple[Floats, float]:
+    """`DRAWS` draws (DRAWS, P), and after how many of the longest autocorrelation times one walker is asked again.
+
+    They are spread evenly over the chain after its burn-in, each of another walker than the last.
+    """
+    kept = posterior.chain[posterior.burn_in :]
+    steps, walkers, _ = kept.shape
+    chosen = np.linspace(0, steps - 1, DRAWS).round().astype(int)
+    apart = (steps - 1) / (DRAWS - 1) * walkers
+    return kept[chosen, np.arange(DRAWS) % walkers], float(apart / np.max(posterior.autocorrelation_time))
+
+
+def ranks_of(truth: Floats, draws: Floats) -> list[int]:
+    """How many draws (DRAWS, P) lie below the truth (P,), for each parameter."""
+    return [int(below) for below in np.sum(draws < truth, axis=0)]
+
+
+def judged(parameter: str, ranks: Ranks) -> Row:
+    """Whether ranks (repeats,) are uniform: neither test has a p-value below `LEAST_P`."""
+    counts = _counts(ranks)
+    chi_square, p = stats.chisquare(counts)
+    share = (ranks + 0.5) / (DRAWS + 1)
+    p_ks = stats.kstest(share, "uniform").pvalue
+    off = (np.mean(share) - 0.5) * np.sqrt(12.0 * len(ranks))
+    uniform = min(p, p_ks) > LEAST_P
+    return Row(parameter, len(counts), float(chi_square), float(p), float(p_ks), float(off), bool(uniform))
+
+
+def picture(ranks: Mapping[str, Ranks]) -> Figure:
+    """A histogram of ranks for each parameter by its label, with the band that holds 99 % of the bars if uniform."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.6 * len(ranks), 2.5), layout="constrained")
+        panels = np.ravel(figure.subplots(1, len(ranks), sharey=True, squeeze=False))
+        for panel, (label, found), colour in zip(panels, ranks.items(), CYCLE, strict=False):
+            counts = _counts(found)
+            edges = np.linspace(0, DRAWS + 1, len(counts) + 1)
+            low, high = stats.binom.interval(BAND, len(found), 1 / len(counts))
+            panel.stairs(counts, edges, fill=True, color=colour, alpha=0.75)
+            panel.axhspan(low, high, color=INK, alpha=0.15, linewidth=0)
+            panel.axhline(len(found) / len(counts), color=INK, linewidth=0.8)
+            panel.grid(visible=False)
+            panel.set(title=label, xlim=(0, DRAWS + 1), ylim=(0, None))
+        figure.supxlabel(f"rank of the truth among {DRAWS} draws", size=9)
+        figure.supylabel("repeats", size=9)
+    return figure
+
+
+def _counts(ranks: Ranks | Sequence[int]) -> Ranks:
+    """Repeats in each of as many equal bins as they suffice for."""
+    bins = next((number for number in BINS if len(ranks) >= EXPECTED * number), BINS[-1])
+    return np.bincount(np.asarray(ranks) * bins // (DRAWS + 1), minlength=bins)

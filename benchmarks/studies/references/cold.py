@@ -1,0 +1,140 @@
+"""Seconds that a fresh process waits: each compiles all that it runs, no program is kept from one to another."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import fits
+import layerjax as lj
+from benchmarks.suite import coated_haze
+
+What = Literal["value", "jacobian", "gradient", "evaluate", "grad", "fit"]
+Orders = Literal["all", "first"]
+Program = Callable[[Array], Any]
+
+ROOT = Path(__file__).parents[3]
+NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is run. nodes, modes, orders: of `AddingDoubling`. starts: of the fit. ess: effective samples after it."""
+
+    nodes: int
+    modes: int
+    orders: Orders = "all"
+    starts: int = 16
+    ess: float = 1000.0
+
+    @property
+    def transport(self) -> lj.AddingDoubling:
+        return lj.AddingDoubling(nodes=self.nodes, modes=self.modes, orders=self.orders)
+
+
+def fresh(what: What, work: Work) -> dict[str, float]:
+    """Measure it in a process of its own."""
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    program = f"import sys; from {__name__} import main; main(sys.argv[1:])"
+    command = [sys.executable, "-c", program, what, json.dumps(asdict(work)), str(time.time())]
+    ended = subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    found: dict[str, float] = json.loads(ended.stdout)
+    return found
+
+
+def programs(transport: lj.Transport) -> dict[str, Program]:
+    """Compiled functions of the six parameters: all readings; these and their Jacobian; a loss and its gradient."""
+    geometry = coated_haze.readings()
+
+    def value(p: Array) -> Array:
+        stack = coated_haze.stack_of(dict(zip(coated_haze.PARAMETERS, p, strict=True)))
+        return lj.evaluate(stack, geometry.wi, geometry.wo, transport, side="reflection")[:, 0]
+
+    def twice(p: Array) -> tuple[Array, Array]:
+        values = value(p)
+        return values, values
+
+    return {
+        "value": jax.jit(value),
+        "jacobian": jax.jit(jax.jacfwd(twice, has_aux=True)),
+        "gradient": jax.jit(jax.value_and_grad(lambda p: (value(p) ** 2).sum())),
+    }
+
+
+def compiling(what: str, transport: lj.Transport) -> dict[str, float]:
+    """Seconds to trace and compile one of the programs: of its first call less those of its second."""
+    program = programs(transport)[what]
+    p = jnp.array(list(coated_haze.PARAMETERS.values()))
+    first, second = (_seconds(lambda: program(p)) for _ in range(2))
+    return {"seconds": first - second}
+
+
+def first_call(what: str) -> dict[str, float]:
+    """Seconds of the first `evaluate`, or the first gradient of it, of the coat in the README, as it stands there."""
+    coat = lj.Stack(
+        [lj.Interface(ior=1.5, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=lj.HenyeyGreenstein(0.6))],
+        lj.Lambertian(albedo=[0.8, 0.4, 0.2]),
+    )
+    wi, wo = lj.direction(0.5, 0.0), lj.direction(np.array([0.3, 0.6]), 3.1)
+    if what == "evaluate":
+        return {"seconds": _seconds(lambda: lj.evaluate(coat, wi, wo))}
+    return {"seconds": _seconds(lambda: jax.grad(lambda stack: lj.evaluate(stack, wi, wo).sum())(coat))}
+
+
+def fitting(work: Work, began: float) -> dict[str, float]:
+    """Seconds of a fit since the process began, of another one after it, and of a posterior after that."""
+    stack = coated_haze.stack_of(coated_haze.FREE)
+    noise = fits.Noise(relative=NOISE, use_sigma=False)
+
+    def fit(seed: int) -> fits.Fit:
+        data = fits.simulate(
+            coated_haze.stack_of(), coated_haze.readings(), transport=work.transport, noise=NOISE, seed=seed
+        )
+        return fits.fit(stack, data, transport=work.transport, noise=noise, starts=work.starts, seed=seed)
+
+    fit(0)
+    cold = time.time() - began
+    start = time.perf_counter()
+    found = fit(1)
+    warm = time.perf_counter() - start
+    start = time.perf_counter()
+    posterior = fits.sample(found, ess=work.ess)
+    return {
+        "cold": cold,
+        "warm": warm,
+        "sample": time.perf_counter() - start,
+        "effective": float(np.min(posterior.effective_samples)),
+        "evaluations": float(posterior.log_probability.size),
+        "acceptance": posterior.acceptance,
+    }
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    jax.block_until_ready(work())
+    return time.perf_counter() - began
+
+
+def main(arguments: list[str]) -> None:
+    """Measure one thing, and print it: WHAT, the work as JSON, and when the process was started, of the epoch."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_compilation_cache", False)
+    what, settings, began = arguments
+    work = Work(**json.loads(settings))
+    if what == "fit":
+        found = fitting(work, float(began))
+    elif what in ("evaluate", "grad"):
+        found = first_call(what)
+    else:
+        found = compiling(what, work.transport)
+    print(json.dumps(found))

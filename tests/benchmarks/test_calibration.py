@@ -1,0 +1,76 @@
+"""Calibration: ranks that should count as uniform do, others do not, and a killed run goes on where it was."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import fits
+import layerjax as lj
+from benchmarks.studies.calibration import ranks, run
+
+CHEAP = lj.AddingDoubling(orders="first")
+
+
+@pytest.mark.parametrize(
+    ("width", "shift", "uniform"),
+    [(1.0, 0.0, True), (0.6, 0.0, False), (1.6, 0.0, False), (1.0, 0.5, False)],
+    ids=["right", "too narrow", "too wide", "shifted"],
+)
+def test_ranks_tell_whether_posteriors_are_right(width: float, shift: float, uniform: bool) -> None:
+    """Of a mean with a standard normal prior, seen once with unit noise: its posterior is known."""
+    generator = np.random.default_rng(0)
+    truth = generator.standard_normal(200)
+    mean = 0.5 * (truth + generator.standard_normal(200))
+    draws = mean + shift + width * np.sqrt(0.5) * generator.standard_normal((ranks.DRAWS, 200))
+    row = ranks.judged("mean", np.array(ranks.ranks_of(truth, draws)))
+    assert row.uniform == uniform
+    assert row.bins == 20
+    if shift:
+        assert row.mean_off < -3.0  # posteriors too high: truths rank low
+
+
+def test_draws_come_from_the_whole_chain_after_its_burn_in() -> None:
+    chain = np.arange(1000 * 12).reshape(1000, 12, 1)
+    posterior = SimpleNamespace(chain=chain, burn_in=100, autocorrelation_time=np.array([2.0, 4.0]))
+    draws, apart = ranks.spread_draws(posterior)
+    assert draws.shape == (ranks.DRAWS, 1)
+    assert draws[0] == chain[100, 0]
+    assert draws[-1, 0] == chain[999, (ranks.DRAWS - 1) % 12, 0]
+    assert apart == pytest.approx(899 / 98 * 12 / 4.0)
+
+
+@pytest.mark.parametrize("name", run.FREE)
+def test_truths_come_from_the_prior(name: str) -> None:
+    free = run.FREE[name]
+    generator = np.random.default_rng(1)
+    values = np.array([run.drawn(free, generator) for _ in range(1000)])
+    if isinstance(free.prior, fits.LogNormal):
+        values, centre = np.log(values), np.log(free.prior.median)
+    else:
+        centre = free.prior.mean
+    assert stats.kstest(values, stats.norm(centre, free.prior.sd).cdf).pvalue > 0.01
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
+    """Transport: paths with one event alone, which are cheap."""
+    parts_of, cheap = tmp_path / "parts", {"transport": CHEAP, "surrogate": False}
+    run.study(directory=parts_of, repeats=1, resume=True, **cheap)
+    said: list[str] = []
+    text, paths = run.study(directory=parts_of, repeats=3, resume=True, report=said.append, **cheap)
+    assert [line.partition(":")[0] for line in said[1:]] == ["repeat 2/3", "repeat 3/3"]
+    assert sorted(paths) == sorted(parts_of.iterdir())  # and no temporary file is left
+    whole = run.study(directory=tmp_path / "whole", repeats=3, **cheap)[1][0]
+    parts, at_once = (json.loads(path.read_text()) for path in (paths[0], whole))
+    for content in (parts, at_once):
+        for record in content["repeats"]:
+            assert record.pop("seconds") > 0
+    assert parts["repeats"] == at_once["repeats"]
+    assert parts["parameters"] == at_once["parameters"]
+    assert all(0 <= rank <= ranks.DRAWS for record in parts["repeats"] for rank in record["ranks"])
+    assert paths[1].read_text() == text
+    with pytest.raises(ValueError, match="other settings"):
+        run.study(directory=parts_of, resume=True, transport=CHEAP, surrogate=True)
