@@ -55,6 +55,11 @@ class Resolution(NamedTuple):
         return Resolution(-(-3 * self.nodes // 2), -(-3 * self.modes // 2), (cosines + 2, azimuths + 4))
 
 
+def suiting(nodes: int) -> int:
+    """Modes for so many nodes."""
+    return max(1, 3 * nodes // 2)
+
+
 def chosen(stack: Stack, followed: bool) -> Resolution:
     """The coarsest resolution that is expected to give errors of 1e-3, up to `FINEST`.
 

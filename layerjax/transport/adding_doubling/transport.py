@@ -25,7 +25,7 @@ from layerjax.stack import Stack, channel_count
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
-from layerjax.transport.adding_doubling.resolution import Resolution, chosen, rungs
+from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, rungs, suiting
 from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
@@ -202,16 +202,16 @@ class AddingDoubling(DeterministicTransport):
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
     def _given(self) -> Resolution:
-        if self.nodes is None or self.modes is None or self.ordinates is None:
+        if self.nodes is None:
             raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
-        return Resolution(self.nodes, self.modes, self.ordinates)
+        return Resolution(self.nodes, self.modes or suiting(self.nodes), self.ordinates or ORDINATES_LADDER[0])
 
     def _resolution(self, stack: Stack, followed: bool) -> Resolution:
         """What is given, and for the rest what is chosen."""
         by_stack = chosen(stack, followed)
         nodes = by_stack.nodes if self.nodes is None else self.nodes
-        suiting = by_stack.modes if self.nodes is None else max(1, 3 * self.nodes // 2)
-        return Resolution(nodes, suiting if self.modes is None else self.modes, self.ordinates or by_stack.ordinates)
+        modes = by_stack.modes if self.nodes is None else suiting(self.nodes)
+        return Resolution(nodes, self.modes or modes, self.ordinates or by_stack.ordinates)
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
         return make_plan(stack, self._resolution(stack, known is not None), self.microfacets)
