@@ -5,6 +5,7 @@ bound, and a way on for an objective on which Gauss-Newton steps stall. jaxopt i
 """
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.problem.model import Model, half_squares
-from fits.problem.problem import Problem
 
 TOLERANCE = 1e-12
 MOST_STEPS = 500
@@ -29,17 +29,16 @@ def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:
     return jax.value_and_grad(cost, argnums=1)(model, s)
 
 
-def minimise_in_box(problem: Problem, start: NDArray[np.float64]) -> tuple[NDArray[np.float64], float, int, bool]:
+def minimise_in_box(
+    value_and_gradient: Callable[[Any], tuple[Any, Any]], start: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float, int, bool]:
     """Minimise from `start` (P,) in the unit box: the point, its cost, the iterations, and whether it converged."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
         from jaxopt import ScipyBoundedMinimize
 
-    def function(s: Any) -> tuple[Any, Any]:
-        return problem.call(cost_and_gradient, s)
-
     solver = ScipyBoundedMinimize(
-        fun=function,
+        fun=value_and_gradient,
         method="l-bfgs-b",
         value_and_grad=True,
         jit=False,  # the function is compiled already, and for all problems of this structure

@@ -113,9 +113,7 @@ class Fit:
     @cached_property
     def residuals(self) -> Floats:
         """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure."""
-        if self.is_posterior:
-            return np.asarray(self.problem.call(Model.standardised, self.vector), float)
-        return -np.asarray(self.problem.residuals(self.vector), float).reshape(self.problem.model.values.shape)
+        return np.asarray(self.problem.call(Model.standardised_at, self.vector, self.predicted), float)
 
     @property
     def chi_square(self) -> float:
@@ -135,7 +133,9 @@ class Fit:
     @cached_property
     def log_likelihood(self) -> float:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
-        return float(self.problem.log_likelihood(self.vector)) if self.is_posterior else float("nan")
+        if not self.is_posterior:
+            return float("nan")
+        return float(np.sum(self.problem.call(Model.log_likelihood_per_datum_at, self.vector, self.predicted)))
 
     @property
     def correlation(self) -> Floats:

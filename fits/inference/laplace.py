@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit, gammaln, logit
 
-from fits.inference.bounded import cost_and_gradient
+from fits.inference.descent import here
 from fits.inference.fit_result import Fit
 from fits.problem.problem import Problem
 
@@ -102,11 +102,11 @@ class Approximation:
 def slope_at_bounds(problem: Problem, unit: Floats, held: NDArray[np.bool_]) -> Floats:
     """How steeply the log-posterior falls in the box, (P,), where a parameter is held by a bound; 0 if none is.
 
-    The gradient of a costly model is not compiled for nothing.
+    The Jacobian of a costly model is not compiled for nothing.
     """
     if not held.any():
         return np.zeros(len(unit))
-    return np.abs(np.asarray(problem.call(cost_and_gradient, unit)[1], float))
+    return np.abs(here(problem, unit).gradient)
 
 
 def first_positions(

@@ -9,7 +9,7 @@ residuals than parameters. Columns are scaled to unit length first, so that unit
 Marquardt 1963; its update after Nielsen 1999).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +28,7 @@ PASSES = 3
 
 
 class _State(eqx.Module):
-    first: Array
+    steps: Array
     trial: Array
     cost: Array
     gradient: Array
@@ -36,6 +36,8 @@ class _State(eqx.Module):
     predicted: Array
     damping: Array
     growth: Array
+    beside: Any
+    watched: Any
     terminate: Array
     failed: Array
 
@@ -47,8 +49,12 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
     Fisher information (J'J alone would overshoot up to twofold at every step).
 
-    It stops when a full Gauss-Newton step promises less than `atol + rtol cost`, or when rounding ends all progress. A
-    start whose residuals are not finite, or a stall away from a minimum, gives `optx.RESULTS.nonlinear_divergence`.
+    It stops when a full Gauss-Newton step promises less than `atol + rtol cost`, when rounding ends all progress, or
+    after `options["most_steps"]`, which may be traced. A start whose residuals are not finite, or a stall away from a
+    minimum, gives `optx.RESULTS.nonlinear_divergence`.
+
+    The solution has the auxiliary output at the solution, and statistics have the "cost" and its "gradient" there; as
+    "watched" the Jacobian, a leading axis for the P parameters, of the part of it that `options["watch"]` picks.
     """
 
     rtol: float = 1e-10
@@ -58,8 +64,10 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
         """State before the first evaluation."""
         zero = jnp.zeros((), y.dtype)
+        beside = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
+        watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), _watch(options)(aux_struct))
         return _State(
-            first=jnp.array(True),
+            steps=jnp.zeros((), int),
             trial=y,
             cost=zero + jnp.inf,
             gradient=jnp.zeros_like(y),
@@ -67,23 +75,25 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             predicted=zero,
             damping=zero + FIRST_DAMPING,
             growth=zero + FIRST_GROWTH,
+            beside=beside,
+            watched=watched,
             terminate=jnp.array(False),
             failed=jnp.array(False),
         )
 
     def step(self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, _State, Any]:
         """Evaluate the trial, accept or refuse it, and propose the next one."""
-        logarithmic = options.get("logarithmic", ())
-        cost, gradient, normal, aux = _normal_equations(fn, state.trial, args, logarithmic)
+        first = state.steps == 0
+        cost, gradient, normal, beside, watched = _normal_equations(fn, state.trial, args, options)
         finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
         ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
-        accept = finite & (state.first | (ratio > SMALLEST_RATIO))
+        accept = finite & (first | (ratio > SMALLEST_RATIO))
 
         shrink = jnp.maximum(1.0 / 9.0, 1.0 - (2.0 * jnp.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
         step_damping = jnp.where(accept, state.damping * shrink, state.damping * state.growth)
         epsilon = jnp.finfo(y.dtype).eps
         least = jnp.asarray(SMALLEST_DAMPING * epsilon, y.dtype)
-        damping = jnp.maximum(jnp.where(state.first, state.damping, step_damping), least)
+        damping = jnp.maximum(jnp.where(first, state.damping, step_damping), least)
         growth = jnp.where(accept, FIRST_GROWTH, 2.0 * state.growth)
 
         y = jnp.where(accept, state.trial, y)
@@ -91,14 +101,17 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             jnp.where(accept, new, old)
             for new, old in ((cost, state.cost), (gradient, state.gradient), (normal, state.normal))
         )
+        beside, watched = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old), (beside, watched), (state.beside, state.watched)
+        )
         trial, predicted, promise = _projected_step(y, gradient, normal, damping, least)
 
         converged = promise <= self.atol + jnp.maximum(self.rtol, 4 * epsilon) * cost
         lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
         stalled = lost & (promise > jnp.sqrt(epsilon) * cost)
-        hopeless = stalled | (damping > LARGEST_DAMPING) | (state.first & ~finite)
+        hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
         new_state = _State(
-            first=jnp.array(False),
+            steps=state.steps + 1,
             trial=trial,
             cost=cost,
             gradient=gradient,
@@ -106,33 +119,45 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             predicted=predicted,
             damping=damping,
             growth=growth,
+            beside=beside,
+            watched=watched,
             terminate=converged | lost | hopeless,
             failed=hopeless & ~converged,
         )
-        return y, new_state, aux
+        return y, new_state, beside
 
     def terminate(
         self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any
     ) -> tuple[Array, optx.RESULTS]:
         """Whether to stop, and why."""
-        failure = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
-        return state.terminate, failure
+        out_of_steps = state.steps >= options.get("most_steps", jnp.inf)
+        short = optx.RESULTS.where(state.terminate, optx.RESULTS.successful, optx.RESULTS.nonlinear_max_steps_reached)
+        result = optx.RESULTS.where(state.failed, optx.RESULTS.nonlinear_divergence, short)
+        running = ~(state.terminate | out_of_steps)
+        return ~running, optx.RESULTS.where(running, optx.RESULTS.successful, result)
 
     def postprocess(
         self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
     ) -> tuple[Array, Any, dict[str, Any]]:
-        """The solution, and the cost there among the statistics that go with it."""
-        return y, aux, {"cost": state.cost}
+        """The solution, and what is known there."""
+        return y, state.beside, {"cost": state.cost, "gradient": state.gradient, "watched": state.watched}
 
 
-def _normal_equations(fn: Any, y: Array, args: Any, logarithmic: Sequence[int] = ()) -> tuple[Array, Array, Array, Any]:
-    """Cost, J'r and J'J at y, with J'J replaced for the `logarithmic` arrays of residuals."""
+def _watch(options: Any) -> Callable[[Any], Any]:
+    """What picks the part of the auxiliary output whose Jacobian is kept: nothing, unless it is asked for."""
+    return options.get("watch", lambda beside: None)
 
-    def push(tangent: Array) -> tuple[Any, Any, Any]:
-        residuals, tangents, aux = jax.jvp(lambda z: fn(z, args), (y,), (tangent,), has_aux=True)
-        return residuals, tangents, aux
 
-    residuals, columns, aux = jax.vmap(push, out_axes=(None, 0, None))(jnp.eye(y.size, dtype=y.dtype))
+def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array, Array, Array, Any, Any]:
+    """Cost, J'r and J'J at y, with J'J replaced for the `logarithmic` arrays of residuals; the auxiliary output, and
+    the Jacobian of what is watched of it."""
+    logarithmic, watch = options.get("logarithmic", ()), _watch(options)
+
+    def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
+        (residuals, beside), (tangents, moved) = jax.jvp(lambda z: fn(z, args), (y,), (tangent,))
+        return residuals, beside, tangents, watch(moved)
+
+    residuals, beside, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
     cost, gradient, normal = jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
     for index, (residual, column) in enumerate(zip(jax.tree.leaves(residuals), jax.tree.leaves(columns), strict=True)):
         flat, rows = residual.reshape(-1), column.reshape(y.size, -1)
@@ -141,7 +166,7 @@ def _normal_equations(fn: Any, y: Array, args: Any, logarithmic: Sequence[int] =
         if index in logarithmic:  # half the square of r is a logarithm L, whose derivative is r dr
             rows = rows * flat
         normal += rows @ rows.T
-    return cost, gradient, normal, aux
+    return cost, gradient, normal, beside, watched
 
 
 def _projected_step(

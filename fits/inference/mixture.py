@@ -13,7 +13,7 @@ from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import slope_at_bounds, student, student_draws
-from fits.inference.ridge import height, open_directions, ridge, vector_at
+from fits.inference.ridge import height, open_directions, ridge
 from fits.inference.uncertainty import local_information
 
 LEAST_PART = 0.01  # of the squared length of an open direction
@@ -58,7 +58,7 @@ class Mixture:
         bounds = np.concatenate([bounds, np.tile(np.diag(1.0 / reach)[held], (len(points), 1, 1))], axis=1)
         root = np.empty((len(points), len(held), len(held)))
         for index, (point, rows) in enumerate(zip(points, bounds, strict=True)):
-            information = local_information(problem, vector_at(problem, point))[0]
+            information = local_information(problem, point)[0]
             information[:, held] = 0.0
             wide = np.eye(len(held)) / WIDEST_REACH
             _, values, directions = np.linalg.svd(np.vstack([information, rows, wide]))

@@ -14,10 +14,12 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.measurements import Measurements
+from fits.inference.descent import descend
 from fits.inference.fit_result import ENDED, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
-from fits.inference.starts import End, Solver, polished, run_starts, solve_start, start_points
-from fits.inference.uncertainty import Uncertainty, uncertainty
+from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
+from fits.inference.starts import MOST_STEPS, End, Solver, run_starts, start_points
+from fits.inference.uncertainty import Uncertainty
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Transport
 from fits.problem.parameters import Free
@@ -32,9 +34,6 @@ standard error, the error counted up to a twentieth of the box. Of one that the 
 the costs agree."""
 SAME_COST = 1e-3
 """Costs agree within this, in the log-posterior, times the reduced chi-square where that is above 1."""
-EQUALLY_WELL = 2.0
-"""Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
-where that is above 1."""
 
 
 class Repeats(NamedTuple):
@@ -104,10 +103,15 @@ def fit_problem(
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
     ends = _ends(problem, start_points(problem, starts, seed), solver, progress or _silent, checkpoint)
-    best = int(np.argmin([end.cost for end in ends]))
-    lowest, found, improved = _improved(problem, ends[best], solver)
-    ends[best] = lowest
+    return _fit_of(optimum(problem, ends, solver), {"starts": starts, "seed": seed, "solver": solver})
+
+
+def _fit_of(at: Optimum, settings: dict[str, int | str]) -> Fit:
+    """The fit of an optimum, with what is to be said of it."""
+    problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
+    minima, ended = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
+    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * at.excess)
     result = Fit(
         problem=problem,
         vector=lowest.vector,
@@ -121,18 +125,16 @@ def fit_problem(
         condition_number=found.condition_number,
         unresolved=found.unresolved,
         without_influence=found.without_influence,
-        minima=(),
-        alternatives=(),
-        settings={"starts": starts, "seed": seed, "solver": solver},
+        minima=minima,
+        alternatives=as_good,
+        settings=settings,
+        ended=ended,
     )
-    excess = max(1.0, result.reduced_chi_square if result.degrees_of_freedom > 0 else 1.0)
-    if not result.is_posterior:  # in units of the residual variance
-        excess = 2.0 * lowest.cost / max(result.degrees_of_freedom, 1)
-    minima, ended = _minima(problem, ends, best, found, SAME_COST * excess)
-    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * excess)
-    notes = ("L-BFGS-B improved on Levenberg-Marquardt",) if improved else ()
-    result = replace(result, minima=minima, alternatives=as_good, ended=ended)
-    return replace(result, status="; ".join((*_status(result), *notes)))
+    notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
+    result = replace(result, status="; ".join((*_status(result), *notes)))
+    if np.all(np.isfinite(at.predicted)):  # to compute it again, another program would be compiled
+        vars(result)["predicted"] = at.predicted
+    return result
 
 
 def _ends(
@@ -145,15 +147,6 @@ def _ends(
 
     with StartsFile(checkpoint, problem, points, solver) as kept:
         return run_starts(problem, points, solver, progress, kept)
-
-
-def _improved(problem: Problem, lowest: End, solver: Solver) -> tuple[End, Uncertainty, bool]:
-    """The lowest end on its bounds, the errors there, and whether L-BFGS-B improved on it."""
-    found, improved = uncertainty(problem, lowest.vector, lowest.cost), False
-    if solver == "least_squares" and (found.at_bound.any() or not lowest.converged):
-        lowest, improved = polished(problem, lowest)
-        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
-    return lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound)), found, improved
 
 
 def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int = 0) -> Repeats:
@@ -195,24 +188,15 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
 def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)
-        vectors, costs, _, success, _ = jax.lax.map(lambda start: solve_start(repeat, start, jnp.asarray(True)), starts)
-        best = jnp.argmin(costs)
-        vector, cost, converged = vectors[best], costs[best], success[best]
-        rows, prior_rows, _ = jax.jacfwd(repeat.information_rows)(vector)
-        width = model.box.slope(vector)
-        rows, prior_rows = rows * width, prior_rows * width
-        covariance = jnp.linalg.pinv(rows.T @ rows + prior_rows.T @ prior_rows, hermitian=True)
+        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), jnp.asarray(MOST_STEPS)), starts)
+        end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
+        width = model.box.slope(end.vector)
+        covariance = jnp.linalg.pinv(end.root.T @ end.root + jnp.diag(model.box.prior_slopes() ** 2), hermitian=True)
         if model.objective != "likelihood":
-            covariance = covariance * 2.0 * cost / max(rows.shape[0] - vector.size, 1)
-        return vector, jnp.sqrt(jnp.diagonal(covariance)) * width, cost, converged
+            covariance = covariance * 2.0 * end.cost / max(row.size - width.size, 1)
+        return end.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, end.cost, end.converged
 
     return jax.lax.map(one, values)
-
-
-def _on_bounds(problem: Problem, vector: Floats, held: NDArray[np.bool_]) -> Floats:
-    """Exact bounds where the solver ended on them."""
-    nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
-    return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
 
 
 def _minima(

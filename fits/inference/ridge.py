@@ -3,12 +3,10 @@
 Points are compared in log-odds of the box, which run on linearly next to a bound, so that there is a slope on it.
 """
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from fits.inference.bounded import cost_and_gradient
 from fits.inference.identifiability import square
 from fits.inference.uncertainty import local_information
 from fits.problem.problem import Problem
@@ -56,14 +54,9 @@ def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> tuple[F
 
 def open_directions(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Floats:
     """Directions in the box, (number, F), in which the posterior is wide at the optimum (P,)."""
-    rows = local_information(problem, vector_at(problem, optimum))[0][:, free]
+    rows = local_information(problem, optimum)[0][:, free]
     _, values, directions = np.linalg.svd(square(rows))
     return directions[values * OPEN < 1.0]
-
-
-def vector_at(problem: Problem, unit: Floats) -> Floats:
-    """The physical vector (P,) at a point of the unit box."""
-    return np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
 
 
 def _brought_back(
@@ -85,7 +78,7 @@ def _across(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Directions across the ridge (F - dimension, F), inverse deviations along them, directions along it, slopes."""
     unit = _unit(place)
-    rows, gradient = local_information(problem, vector_at(problem, unit))
+    rows, gradient, _ = local_information(problem, unit)
     along = _stretch(unit[free])
     _, values, directions = np.linalg.svd(square(rows[:, free] * along))
     across = directions[:-dimension]
@@ -117,7 +110,7 @@ def _unit(place: Floats) -> Floats:
 
 def height(problem: Problem, unit: Floats) -> float:
     """Log-posterior at a point of the unit box."""
-    return -float(problem.call(cost_and_gradient, unit)[0])
+    return -local_information(problem, unit)[2]
 
 
 def _distance(place: Floats, places: list[Floats]) -> float:

@@ -1,17 +1,16 @@
 """What the data say about the parameters at an optimum: errors, correlations, and the combinations they do not resolve.
 
-All follow from the Fisher information A'A (see `Model.information_rows`), with one column of A a parameter in units of
+All follow from the Fisher information A'A (see `Model.linear_parts`), with one column of A a parameter in units of
 its box.
 """
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 
+from fits.inference.descent import here
 from fits.inference.identifiability import (
     UNKNOWN_BEYOND,
     Combination,
@@ -20,7 +19,6 @@ from fits.inference.identifiability import (
     unresolved_combinations,
     without_influence,
 )
-from fits.problem.model import Model
 from fits.problem.problem import Problem
 
 ON_BOUND = 1e-6  # of the box
@@ -39,6 +37,7 @@ class Uncertainty:
     standard_errors: (P,), infinite where nothing holds a parameter.
     unresolved: the combinations that the data do not resolve, of all parameters, also those at a bound.
     without_influence: names of those that the data say nothing about at all.
+    predicted: the model at the optimum, (N, C), in 1/sr.
     """
 
     at_bound: NDArray[np.bool_]
@@ -47,6 +46,7 @@ class Uncertainty:
     condition_number: float
     unresolved: tuple[Combination, ...]
     without_influence: tuple[str, ...]
+    predicted: Floats
 
 
 def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
@@ -54,11 +54,14 @@ def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
 
     Where the model is not finite nothing is known: all errors are infinite.
     """
-    data_root, prior_root, gradient, unit = (np.asarray(x, float) for x in problem.call(_triangles, vector))
-    count = len(vector)
-    if not all(np.all(np.isfinite(part)) for part in (data_root, prior_root, gradient)):
+    box, count = problem.model.box, len(vector)
+    unit = np.asarray(box.to_unit(jnp.asarray(vector)), float)
+    found = here(problem, unit)
+    data_root, gradient = found.root, found.gradient
+    if not (np.isfinite(found.cost) and np.all(np.isfinite(data_root))):
         nowhere = np.zeros(count, bool)
-        return Uncertainty(nowhere, np.full(count, np.inf), np.zeros((count, count)), float("inf"), (), ())
+        infinite = np.full(count, np.inf)
+        return Uncertainty(nowhere, infinite, np.zeros((count, count)), float("inf"), (), (), found.predicted)
     scatter = 1.0  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
@@ -67,25 +70,25 @@ def uncertainty(problem: Problem, vector: Floats, cost: float) -> Uncertainty:
     at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
     at_bound &= ~np.isin(problem.names, idle)
     free = np.flatnonzero(~at_bound)
-    width = np.asarray(problem.model.box.slope(jnp.asarray(vector)), float)
+    width = np.asarray(box.slope(jnp.asarray(vector)), float)
     unresolved = unresolved_combinations(data_root, problem.names, width)
-    data_root, prior_root = data_root[:, free], prior_root[:, free]
+    data_root, prior_root = data_root[:, free], _prior_root(problem)[:, free]
     errors, covariance = np.full(count, np.nan), np.zeros((count, count))
     if free.size:
         boxes = _inverse_information(np.vstack([data_root, prior_root]))
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unresolved, idle)
+    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unresolved, idle, found.predicted)
 
 
-def local_information(problem: Problem, vector: Floats) -> tuple[Floats, Floats]:
-    """Rows of A, of the data and the prior, (rows, P), at any `vector` (P,): A'A is the information in boxes^-2.
+def local_information(problem: Problem, unit: Floats) -> tuple[Floats, Floats, float]:
+    """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2.
 
-    And the gradient of the negative log-posterior there, (P,), in boxes^-1.
+    And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
     """
-    data_root, prior_root, gradient, _ = (np.asarray(x, float) for x in problem.call(_triangles, vector))
-    return np.vstack([data_root, prior_root]), gradient
+    found = here(problem, unit)
+    return np.vstack([found.root, _prior_root(problem)]), found.gradient, float(found.cost)
 
 
 def condition_number(root: Floats) -> float:
@@ -99,12 +102,9 @@ def condition_number(root: Floats) -> float:
     return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
 
 
-def _triangles(model: Model, vector: Array) -> tuple[Array, Array, Array, Array]:
-    # forward, as the rows are, and with them: reverse through a transport that iterates takes twice as long to compile
-    data_rows, prior_rows, gradient = jax.jacfwd(model.information_rows)(vector)
-    width, unit = model.box.slope(vector), model.box.to_unit(vector)
-    # R of the QR decomposition has A's singular values without squaring its condition number
-    return jnp.linalg.qr(data_rows * width, mode="r"), prior_rows * width, gradient * width, unit
+def _prior_root(problem: Problem) -> Floats:
+    """Rows (P, P) of the prior's information, in boxes^-1."""
+    return np.diag(np.asarray(problem.model.box.prior_slopes(), float))
 
 
 def _inverse_information(root: Floats) -> Floats:

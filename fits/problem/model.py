@@ -88,17 +88,28 @@ class Model(eqx.Module):
 
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr."""
-        return self._predict(self.build(vector))
+        parts = self.build(vector)
+        return parts.scale * forward(parts.stack, self.wi, self.wo, self.transport, self.side, self.known)
 
     def sigma(self, vector: Array) -> Array:
         """Scale of the noise, (N, C), in 1/sr."""
-        parts = self.build(vector)
-        return total_sigma(self._predict(parts), self.variance, parts.relative, parts.floor)
+        return self.sigma_at(vector, self.predict(vector))
 
-    def standardised(self, vector: Array) -> Array:
-        """(datum - model) / sigma, (N, C)."""
-        predicted, sigma = self._predicted_and_sigma(vector)
-        return (self.values - predicted) / sigma
+    def sigma_at(self, vector: Array, predicted: Array) -> Array:
+        """Scale of the noise, (N, C), in 1/sr, with these parameters and what they predict, (N, C)."""
+        parts = self.build(vector)
+        return total_sigma(predicted, self.variance, parts.relative, parts.floor)
+
+    def standardised_at(self, vector: Array, predicted: Array) -> Array:
+        """(datum - model) / sigma, (N, C), with these parameters and what they predict; or, for a named objective,
+        datum minus model in its own measure."""
+        if self.objective != "likelihood":
+            return -self._named(predicted)
+        return (self.values - predicted) / self.sigma_at(vector, predicted)
+
+    def cost_at(self, vector: Array, predicted: Array) -> Array:
+        """Half the sum of squared residuals with these parameters and what they predict, (N, C)."""
+        return half_squares(self._residuals(vector, predicted, self.sigma_at(vector, predicted)))
 
     def residuals(self, vector: Array, fixed_sigma: Array | None = None) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
@@ -106,31 +117,30 @@ class Model(eqx.Module):
         The third of them, where sigma varies with the parameters, is that of log sigma. `fixed_sigma` (N, C), where it
         is finite, replaces sigma: the first step towards a fit of noise levels.
         """
-        predicted, sigma = self._predicted_and_sigma(vector)
+        return self.linear_parts(vector, fixed_sigma)[0]
+
+    def linear_parts(
+        self, vector: Array, fixed_sigma: Array | None = None
+    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        """See `residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
+
+        The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
+        only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
+        """
+        predicted = self.predict(vector)
+        sigma = self.sigma_at(vector, predicted)
+        rows = self._information_rows(predicted, sigma)
         if fixed_sigma is not None:
             sigma = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma)
-        return self._residuals(vector, predicted, sigma)
-
-    def information_rows(self, vector: Array) -> tuple[Array, Array, Array]:
-        """Of the data (rows,) and of the prior (P,): their Jacobian A has the Fisher information A'A; and the cost.
-
-        The expected information needs first derivatives only and is never indefinite; for Gaussian noise that is known
-        it is J'J. For a named objective: its residuals. The cost is half the sum of squared residuals.
-        """
-        predicted, sigma = self._predicted_and_sigma(vector)
-        residuals = self._residuals(vector, predicted, sigma)
-        cost = half_squares(residuals)
-        if self.objective != "likelihood":
-            return residuals[0].reshape(-1), jnp.zeros_like(vector), cost
-        of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
-        rows = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
-        if self.varying:
-            rows = jnp.concatenate([rows, jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)])
-        return rows, self.box.prior_residuals(vector), cost
+        return self._residuals(vector, predicted, sigma), (predicted, rows)
 
     def log_likelihood_per_datum(self, vector: Array) -> Array:
         """Normalised log-density of each datum, (N, C)."""
-        predicted, sigma = self._predicted_and_sigma(vector)
+        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+
+    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
+        """The same with these parameters and what they predict, (N, C)."""
+        sigma = self.sigma_at(vector, predicted)
         return log_density((self.values - predicted) / sigma, sigma, self.tails, self.degrees_of_freedom)
 
     def log_likelihood(self, vector: Array) -> Array:
@@ -147,22 +157,27 @@ class Model(eqx.Module):
         total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
+    def _named(self, predicted: Array) -> Array:
+        assert self.objective != "likelihood"
+        return named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:]))
+
     def _residuals(self, vector: Array, predicted: Array, sigma: Array) -> tuple[Array, ...]:
         if self.objective != "likelihood":
-            return (named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:])),)
+            return (self._named(predicted),)
         z = (predicted - self.values) / sigma
         parts = [tail_residual(z, self.tails, self.degrees_of_freedom), self.box.prior_residuals(vector)]
         if self.varying:
             parts.append(sigma_residual(sigma, self.lowest))
         return tuple(parts)
 
-    def _predicted_and_sigma(self, vector: Array) -> tuple[Array, Array]:
-        parts = self.build(vector)
-        predicted = self._predict(parts)
-        return predicted, total_sigma(predicted, self.variance, parts.relative, parts.floor)
-
-    def _predict(self, parts: Parts) -> Array:
-        return parts.scale * forward(parts.stack, self.wi, self.wo, self.transport, self.side, self.known)
+    def _information_rows(self, predicted: Array, sigma: Array) -> Array:
+        if self.objective != "likelihood":
+            return self._named(predicted).reshape(-1)
+        of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
+        rows = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
+        if self.varying:
+            rows = jnp.concatenate([rows, jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)])
+        return rows
 
 
 def half_squares(residuals: tuple[Array, ...]) -> Array:

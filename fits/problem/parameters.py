@@ -156,6 +156,11 @@ class Box(eqx.Module):
         """
         return (self._natural(vector) - self.centre) * self.inverse_sd
 
+    def prior_slopes(self) -> Array:
+        """d `prior_residuals` / d unit, each by its own parameter, shape (P,)."""
+        low, high = self._ends()
+        return (high - low) * self.inverse_sd
+
     def slope(self, vector: Array) -> Array:
         """d physical / d unit, shape (P,): the width of the box in physical units at this point."""
         low, high = self._ends()

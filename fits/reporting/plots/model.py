@@ -170,7 +170,7 @@ def assumed_sigma(fit: "Fit") -> Floats:
 
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call(Model.sigma, fit.vector))
+    return np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:

@@ -1,0 +1,69 @@
+"""The lowest of the ends of all starts, and what is known there."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.inference.descent import here
+from fits.inference.starts import End, Solver, polished, unit_of
+from fits.inference.uncertainty import Uncertainty, uncertainty
+from fits.problem.model import Model
+from fits.problem.problem import Problem
+
+EQUALLY_WELL = 2.0
+"""Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
+where that is above 1."""
+
+Floats = NDArray[np.float64]
+
+
+class Optimum(NamedTuple):
+    """The ends of all starts, the place of the lowest among them, and what is known there.
+
+    improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
+    differences in cost count in, see `EQUALLY_WELL`.
+    """
+
+    problem: Problem
+    ends: list[End]
+    best: int
+    found: Uncertainty
+    improved: bool
+    predicted: Floats
+    excess: float
+
+    @property
+    def lowest(self) -> End:
+        """The lowest end, exactly on the bounds that hold it."""
+        return self.ends[self.best]
+
+
+def optimum(problem: Problem, ends: list[End], solver: Solver) -> Optimum:
+    """The lowest of the ends, checked and improved by L-BFGS-B where a parameter lies on a bound."""
+    best = int(np.argmin([end.cost for end in ends]))
+    lowest, improved = ends[best], False
+    found = uncertainty(problem, lowest.vector, lowest.cost)
+    if solver == "least_squares" and (found.at_bound.any() or not lowest.converged):
+        lowest, improved = polished(problem, lowest)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
+    lowest = lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound))
+    held = found.at_bound.any()
+    predicted = here(problem, unit_of(problem, lowest.vector)).predicted if held else found.predicted
+    ends = [*ends[:best], lowest, *ends[best + 1 :]]
+    return Optimum(problem, ends, best, found, improved, predicted, _excess(problem, lowest, predicted))
+
+
+def _on_bounds(problem: Problem, vector: Floats, held: NDArray[np.bool_]) -> Floats:
+    """Exact bounds where the solver ended on them."""
+    nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
+    return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
+
+
+def _excess(problem: Problem, lowest: End, predicted: Floats) -> float:
+    """The reduced chi-square where it is above 1; of a named objective, the residual variance."""
+    freedom = problem.count - len(lowest.vector)
+    if problem.objective != "likelihood":
+        return 2.0 * lowest.cost / max(freedom, 1)
+    residuals = np.asarray(problem.call(Model.standardised_at, lowest.vector, predicted), float)
+    return max(1.0, float(np.sum(residuals**2)) / freedom if freedom > 0 else 1.0)
