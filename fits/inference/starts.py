@@ -4,6 +4,9 @@ A start that runs out of steps goes on for as long as that is worth something: t
 how good its end is.
 """
 
+import os
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
@@ -34,16 +37,28 @@ def run_starts(
 ) -> list[End]:
     """Where each of the points (starts, P) in the unit box ends; those that a file has `kept` are not run again."""
     solve = least_squares_end if solver == "least_squares" else bounded_end
-    ends: list[End] = []
-    for index, point in enumerate(points):
-        end = None if kept is None else kept.ends.get(index)
-        if end is None:
-            end = solve(problem, point)
-            if kept is not None:
-                kept.add(index, end)
-        ends.append(end)
-        progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends):.6g}")
-    return ends
+    ends: dict[int, End] = {}
+
+    def ended(index: int, end: End, new: bool = True) -> None:
+        ends[index] = end
+        if kept is not None and new:
+            kept.add(index, end)
+        progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
+
+    for index in range(len(points)):
+        if kept is not None and index in kept.ends:
+            ended(index, kept.ends[index], new=False)
+    left = [index for index in range(len(points)) if index not in ends]
+    for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
+        ended(index, solve(problem, points[index]))
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        running = {pool.submit(solve, problem, points[index]): index for index in left[1:]}
+        for future in as_completed(running):
+            ended(running[future], future.result())
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return [ends[index] for index in range(len(points))]
 
 
 def least_squares_end(problem: Problem, point: Floats, fresh: bool = True) -> End:
