@@ -55,6 +55,10 @@ class Fit:
         without_influence: names of the parameters that the data say nothing about.
         settings: starts, seed and solver.
         ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
+        numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
+            the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
+            from a coarser one, which is more than it. None for a transport without a resolution.
+        resolution: of the transport, in words; None where it has none. `problem` holds it.
     """
 
     problem: Problem
@@ -73,6 +77,8 @@ class Fit:
     without_influence: tuple[str, ...] = ()
     settings: Mapping[str, int | str] = field(default_factory=dict)
     ended: Mapping[str, int] = field(default_factory=dict)
+    numerical_error: float | None = None
+    resolution: str | None = None
 
     @property
     def values(self) -> dict[str, float]:

@@ -18,6 +18,8 @@ from fits.inference.descent import descend
 from fits.inference.fit_result import ENDED, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
+from fits.inference.refinement import Accuracy, refined
+from fits.inference.resolution import at_start, resolutions
 from fits.inference.starts import MOST_STEPS, End, Solver, run_starts, start_points
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.likelihood import Noise, Objective
@@ -64,7 +66,9 @@ def fit(
     Args:
         stack: holds `Free` where a number is to be fitted.
         data: only the samples that its mask leaves in are used.
-        transport, noise, scale, objective: see `Problem`.
+        transport, noise, scale, objective: see `Problem`. A resolution that the transport leaves open is chosen: coarse
+            for the starts, at the end so fine that the numerical error of the model stays below a tenth of the data's
+            standard deviation, where that is within reach. `Fit.problem` has it.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
             parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or
@@ -102,11 +106,17 @@ def fit_problem(
         raise ValueError(f"starts is {starts}; it must be at least 1")
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    ends = _ends(problem, start_points(problem, starts, seed), solver, progress or _silent, checkpoint)
-    return _fit_of(optimum(problem, ends, solver), {"starts": starts, "seed": seed, "solver": solver})
+    known, progress = resolutions(problem), progress or _silent
+    if known is not None and known.open:
+        problem = replace(problem, transport=known.far)
+    ends = _ends(problem, start_points(problem, starts, seed), solver, progress, checkpoint)
+    best, accuracy = optimum(problem, ends, solver), None
+    if known is not None:
+        best, accuracy = refined(best, known, solver, progress)
+    return _fit_of(best, accuracy, {"starts": starts, "seed": seed, "solver": solver})
 
 
-def _fit_of(at: Optimum, settings: dict[str, int | str]) -> Fit:
+def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str]) -> Fit:
     """The fit of an optimum, with what is to be said of it."""
     problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
@@ -129,8 +139,11 @@ def _fit_of(at: Optimum, settings: dict[str, int | str]) -> Fit:
         alternatives=as_good,
         settings=settings,
         ended=ended,
+        numerical_error=None if accuracy is None else accuracy.error,
+        resolution=None if accuracy is None else accuracy.resolution,
     )
     notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
+    notes += [] if accuracy is None else [accuracy.words]
     result = replace(result, status="; ".join((*_status(result), *notes)))
     if np.all(np.isfinite(at.predicted)):  # to compute it again, another program would be compiled
         vars(result)["predicted"] = at.predicted
@@ -153,7 +166,8 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
 
     Args:
-        problem: gives the stack, the directions and the noise.
+        problem: gives the stack, the directions and the noise. A resolution that its transport leaves open is that of
+            the start values; the problem of a `Fit` has the one that the noise asks for.
         values: BSDF in 1/sr, (K, N, C).
         starts: of each fit; the lowest end is kept, converged or not.
         seed: of the starts.
@@ -165,7 +179,7 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     Raises:
         ValueError: values of another shape.
     """
-    values = np.asarray(values, float)
+    values, problem = np.asarray(values, float), at_start(problem)
     expected = problem.model.values.shape
     if values.ndim != 3 or values.shape[1:] != expected:
         raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")

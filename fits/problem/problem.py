@@ -37,7 +37,7 @@ class Problem:
         data: only its used samples enter.
         transport: a layerjax transport that is not random, "auto" (see `layerjax.prepare`), or any callable
             (stack, wi, wo) -> values, of unit directions (N, 3) and a BSDF (N, C) in 1/sr; the stack may then be any
-            pytree.
+            pytree. A resolution that it leaves open is what is known while tracing asks for, and for a fit see `fit`.
         noise: how a datum scatters about the model.
         scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".

@@ -90,7 +90,7 @@ def read_problem(path: str | Path) -> ProblemFile:
         check_keys("the file", tables, known)
         return ProblemFile(
             stack=_stack({key: tables[key] for key in ("gallery", "layers", "base") if key in tables}),
-            transport=_transport(tables.get("transport", "auto")),
+            transport=transport_from_dict(tables.get("transport", "auto")),
             noise=_noise(tables.get("noise", {})),
             scale=_scale(tables["scale"]) if "scale" in tables else None,
             objective=cast(Objective, choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
@@ -125,8 +125,7 @@ def write_problem(
     _require_known(stack, transport)
     tables: dict[str, Any] = {}
     if not isinstance(transport, str):
-        table = _module_to_dict(transport)
-        tables["transport"] = table if len(table) > 1 else table["kind"]
+        tables["transport"] = transport_to_dict(transport)
     if objective != "likelihood":
         tables["objective"] = objective
     tables |= stack_to_dict(stack)
@@ -277,12 +276,21 @@ def _scale(table: Any) -> Free:
     return scale
 
 
-def _transport(value: Any) -> lj.Transport | Literal["auto"]:
+def transport_from_dict(value: Any) -> lj.Transport | Literal["auto"]:
+    """The transport that a name, or a table with a `kind`, describes; "auto" for itself."""
     if value == "auto":
         return "auto"
     if isinstance(value, str):
         value = {"kind": choice("transport", value, ("auto", *_TRANSPORTS))}
     return cast(lj.Transport, _build("transport", value, _TRANSPORTS))
+
+
+def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[str, Any]:
+    """The inverse of `transport_from_dict`: a name where that says all."""
+    if isinstance(transport, str):
+        return transport
+    table = _module_to_dict(transport)
+    return table if len(table) > 1 else table["kind"]
 
 
 def _module_to_dict(module: Any) -> dict[str, Any]:

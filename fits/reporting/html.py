@@ -197,7 +197,8 @@ def _fitted(fit: "Fit") -> str:
         ("objective", problem.objective),
         ("common scale", verdicts.scale_in_words(problem)),
         ("starts", verdicts.starts_in_words(fit)),
-        ("transport", problem.transport if isinstance(problem.transport, str) else type(problem.transport).__name__),
+        ("transport", verdicts.transport_in_words(fit)),
+        *((("numerical error of the model", verdicts.numerical_error(fit)),) if fit.resolution else ()),
         *(("note", note) for note in data.source.notes),
         *((("attribution", data.source.attribution),) if data.source.attribution else ()),
     ]

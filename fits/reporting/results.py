@@ -78,7 +78,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
     """
     from fits.problem.parameters import Free
-    from fits.problem.stack_file import write_problem
+    from fits.problem.stack_file import transport_to_dict, write_problem
     from layerjax import Transport
 
     problem, transport = fit.problem, fit.problem.transport
@@ -103,6 +103,9 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "versions": versions(),
         "settings": fit.settings,
         "starts_ended": fit.ended,
+        "transport": transport_to_dict(transport),
+        "resolution": fit.resolution,
+        "numerical_error": fit.numerical_error,
         "source": asdict(problem.data.source),
         "fixed_scale": None if scale is not None else problem.scale,
         "parameters": [
@@ -137,7 +140,7 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.inference.fit_result import Fit, Minimum
     from fits.inference.identifiability import Combination
     from fits.problem.problem import Problem
-    from fits.problem.stack_file import read_problem
+    from fits.problem.stack_file import read_problem, transport_from_dict
 
     directory = Path(directory)
     content = _content(directory)
@@ -146,8 +149,10 @@ def load_fit(directory: str | Path) -> "Fit":
         source = content["source"] | {"notes": tuple(content["source"]["notes"])}
         data = replace(data, source=Source(**source))
         scale = given.scale if given.scale is not None else content["fixed_scale"]
-        problem = Problem(given.stack, data, given.transport, given.noise, scale, given.objective)
-        stored, count = content["fit"], len(problem.names)
+        # with the resolution that the fit chose; not in results of layerjax 0.1.0
+        transport = transport_from_dict(content["transport"]) if "transport" in content else given.transport
+        problem = Problem(given.stack, data, transport, given.noise, scale, given.objective)
+        stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
         minima = tuple(
             Minimum(values, _number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack)
             for one in content["minima"]
@@ -176,6 +181,8 @@ def load_fit(directory: str | Path) -> "Fit":
             without_influence=tuple(content.get("without_influence", ())),
             settings=content.get("settings", {}),
             ended=content.get("starts_ended", {}),
+            numerical_error=None if error is None else _number(error),
+            resolution=content.get("resolution"),
         )
     except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None

@@ -9,6 +9,7 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
+from fits.inference.resolution import ENOUGH
 from fits.reporting.diagnostics import ResidualStructure
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
 
 
 def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]:
-    """The verdict in at most four sentences, and whether it is without reservation."""
+    """The verdict in a few sentences, and whether it is without reservation."""
     sentences = [] if fit.converged else ["The fit did not converge: these are the best values seen, not a minimum."]
     if not fit.is_posterior:
         sentences.append("Fitted with a named residual, not a likelihood: the errors are only indicative.")
@@ -93,6 +94,8 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
+    if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
+        sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
     if fit.without_influence:
@@ -141,6 +144,19 @@ def scale_in_words(problem: "Problem") -> str:
     return (
         f"fixed at {problem.scale:g}" if isinstance(problem.scale, int | float) else "fitted, see the table of values"
     )
+
+
+def transport_in_words(fit: "Fit") -> str:
+    """The transport of a fit, and its resolution."""
+    transport = fit.problem.transport
+    name = transport if isinstance(transport, str) else type(transport).__name__
+    return name if fit.resolution is None else f"{name}, {fit.resolution}"
+
+
+def numerical_error(fit: "Fit") -> str:
+    """How far the resolution keeps the model from what it should be, in a few words."""
+    error = fit.numerical_error
+    return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"
 
 
 def listed(names: Sequence[str]) -> str:

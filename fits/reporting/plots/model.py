@@ -174,6 +174,9 @@ def assumed_sigma(fit: "Fit") -> Floats:
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
+    from fits.problem.compiled import run
+    from layerjax import known_directions
+
     data = fit.problem.data
     flat, signed = in_plane(data), signed_angle(data)
     angles, wi, wo = [], [], []
@@ -187,7 +190,10 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
-    values = np.asarray(fit.problem.call(_along, vectors, np.concatenate(wi), np.concatenate(wo)))
+    along = np.concatenate(wi), np.concatenate(wo)
+    # what is known of them counts as in the fit, so that curves run through its values
+    known = None if fit.problem.model.known is None else known_directions(*along)
+    values = np.asarray(run(_along, fit.problem.split_model, vectors, *along, known))
     values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
     band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
     ends = np.cumsum([len(angle) for angle in angles])
@@ -197,7 +203,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     ]
 
 
-def _along(model: Any, vectors: Any, wi: Any, wo: Any) -> Any:
+def _along(model: Any, vectors: Any, wi: Any, wo: Any, known: Any) -> Any:
     """Scaled BSDF (S, M, C) of the stacks that `vectors` (S, P) describe."""
     import jax
 
@@ -205,6 +211,6 @@ def _along(model: Any, vectors: Any, wi: Any, wo: Any) -> Any:
 
     def one(vector: Any) -> Any:
         parts = model.build(vector)
-        return parts.scale * forward(parts.stack, wi, wo, model.transport)
+        return parts.scale * forward(parts.stack, wi, wo, model.transport, known=known)
 
     return jax.lax.map(one, vectors)

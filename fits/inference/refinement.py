@@ -1,0 +1,129 @@
+"""From the ends of starts at a coarse resolution to the optimum at the one that the noise of the data asks for.
+
+Programs of a finer resolution take seconds to compile: which one is needed is found out by values alone, and only the
+minima that may be the best or as good as it are fitted again.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+import layerjax as lj
+from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
+from fits.inference.resolution import ENOUGH, Resolutions, Values
+from fits.inference.starts import End, Solver, bounded_end, least_squares_end, unit_of
+from fits.problem.model import Model
+from fits.problem.problem import Problem
+from fits.progress import Progress
+
+ALIKE = 0.01
+"""Of the box: ends that are closer in every parameter are fitted again as one."""
+
+MOST_MINIMA = 8
+"""Minima that are fitted again, at most, other than those that turn out to be the best."""
+
+
+class Accuracy(NamedTuple):
+    """The resolution of a fit in words, the numerical error there in standard deviations, and what is said of it."""
+
+    resolution: str
+    error: float
+    words: str
+
+
+def refined(at: Optimum, known: Resolutions, solver: Solver, progress: Progress) -> tuple[Optimum, Accuracy]:
+    """The optimum at the resolution that the noise asks for; at the given one where one is given."""
+    own = at.problem.transport if known.open else known.chosen
+    while True:
+        assert isinstance(own, lj.AddingDoubling)
+        values = Values(at.problem, own, at.lowest.vector, at.predicted)
+        needed, error, finest = _needed(known, own, values, progress)
+        if needed == own:
+            return at, _accuracy(known, own, error, finest)
+        problem, own = replace(at.problem, transport=needed), needed
+        again = optimum(problem, _fitted_again(at, problem, solver, known.in_words(needed), progress), solver)
+        at = again._replace(improved=again.improved or at.improved)
+
+
+def _needed(
+    known: Resolutions, own: lj.AddingDoubling, values: Values, progress: Progress
+) -> tuple[lj.AddingDoubling, float, bool]:
+    """The coarsest resolution from its own on that is fine enough, its error, and whether it is the finest there is."""
+
+    def error(one: lj.AddingDoubling, other: lj.AddingDoubling) -> float:
+        found = values.error(one, other)
+        progress("numerical error", values.count, None, f"{found:.2g} sigma at {known.in_words(own)}")
+        return found
+
+    finer = known.finer(own)
+    if finer is None:
+        return own, error(known.coarser(own), own), True
+    found = error(own, finer)
+    while known.open and found > ENOUGH:
+        own, finer = finer, known.finer(finer)
+        if finer is None:
+            return own, found, True
+        found = error(own, finer)
+    return own, found, False
+
+
+def _accuracy(known: Resolutions, own: lj.AddingDoubling, error: float, finest: bool) -> Accuracy:
+    resolution = known.in_words(own)
+    if not np.isfinite(error):
+        words = f"not known at {resolution}"
+    elif finest:
+        words = f"up to {error:.2g} sigma at {resolution}{', the finest tried' if known.open else ''}"
+    else:
+        words = f"{error:.2g} sigma at most at {resolution}{'' if known.open else ', as given'}"
+    return Accuracy(resolution, error, f"numerical error of the model: {words}")
+
+
+def _fitted_again(at: Optimum, problem: Problem, solver: Solver, words: str, progress: Progress) -> list[End]:
+    """The ends at another resolution: those that matter fitted again, the cost of the others there."""
+    solve = least_squares_end if solver == "least_squares" else bounded_end
+    groups = _alike(at)
+    before = [at.ends[group[0]] for group in groups]
+    ends = [end._replace(cost=_cost(problem, end)) for end in before]
+    moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
+    behind = np.array([end.cost - before[0].cost for end in before])
+    matter = np.flatnonzero(~(behind > EQUALLY_WELL * at.excess + np.fmax(moved, moved[0])))
+    wanted, done = [int(index) for index in matter[:MOST_MINIMA]], 0
+    fitted: set[int] = set()
+    while wanted:
+        for index in wanted:
+            end = solve(problem, unit_of(problem, before[index].vector), False)
+            ends[index] = end._replace(steps=before[index].steps + end.steps)
+            fitted.add(index)
+            done += 1
+            progress(f"fit at {words}", done, len(fitted | set(wanted)), f"best cost {min(e.cost for e in ends):.6g}")
+        lowest = int(np.argmin([end.cost for end in ends]))
+        wanted = [] if lowest in fitted else [lowest]
+    result = list(at.ends)
+    for group, end in zip(groups, ends, strict=True):
+        for index in group:
+            result[index] = end
+    return result
+
+
+def _alike(at: Optimum) -> list[list[int]]:
+    """Places of the ends with a finite cost, in groups of ends that lie close together, lowest first."""
+    groups: list[list[int]] = []
+    units = [unit_of(at.problem, end.vector) for end in at.ends]
+    order = sorted(range(len(at.ends)), key=lambda index: (index != at.best, at.ends[index].cost))
+    for index in order:
+        if not np.isfinite(at.ends[index].cost):
+            continue
+        for group in groups:
+            if np.max(np.abs(units[index] - units[group[0]])) < ALIKE:
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    return groups
+
+
+def _cost(problem: Problem, end: End) -> float:
+    """What the end of another resolution costs at the problem's own; infinite where that is not finite."""
+    cost = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
+    return cost if np.isfinite(cost) else np.inf
