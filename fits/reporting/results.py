@@ -141,6 +141,7 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.inference.identifiability import Combination
     from fits.problem.problem import Problem
     from fits.problem.stack_file import read_problem, transport_from_dict
+    from fits.reporting.earlier import transport_meant
 
     directory = Path(directory)
     content = _content(directory)
@@ -149,8 +150,10 @@ def load_fit(directory: str | Path) -> "Fit":
         source = content["source"] | {"notes": tuple(content["source"]["notes"])}
         data = replace(data, source=Source(**source))
         scale = given.scale if given.scale is not None else content["fixed_scale"]
-        # with the resolution that the fit chose; not in results of layerjax 0.1.0
-        transport = transport_from_dict(content["transport"]) if "transport" in content else given.transport
+        if "transport" in content:  # with the resolution that the fit chose
+            transport = transport_from_dict(content["transport"])
+        else:
+            transport = transport_meant(given.stack, given.transport)
         problem = Problem(given.stack, data, transport, given.noise, scale, given.objective)
         stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
         minima = tuple(

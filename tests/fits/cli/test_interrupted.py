@@ -266,8 +266,8 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
     kept = before.count(b"\n") - 1
     assert 2 < kept < 12
     done.write_bytes(before + b'00000000 {"start": 11, ')  # as if it had been killed in the middle of a line
-    solve, solved = starts._bounded_end, []
-    monkeypatch.setattr(starts, "_bounded_end", lambda *given: solved.append(given) or solve(*given))
+    solve, solved = starts.bounded_end, []
+    monkeypatch.setattr(starts, "bounded_end", lambda *given: solved.append(given) or solve(*given))
     assert main(BOUNDED) == 0
     assert len(solved) == 12 - kept
     assert not list(work.glob(".*"))

@@ -147,7 +147,7 @@ def test_what_auto_is_does_not_follow_from_the_start():
     assert passing.open
     assert not passing.tilted
     assert passing.chosen.nodes > passing.far.nodes == resolution_module.FAR["nodes"]
-    bare = lj.Stack([lj.Medium(thickness=Free(0.0, 0.0, 1.0), albedo=0.9)], base=lj.Lambertian(albedo=0.5))
+    bare = lj.Stack([lj.Medium(thickness=Free(0.0, 0.0, 1.0), albedo=0.0)], base=lj.Lambertian(albedo=0.5))
     assert resolutions(Problem(bare, data)) is None
 
 
