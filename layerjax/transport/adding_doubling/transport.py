@@ -157,7 +157,7 @@ class AddingDoubling(DeterministicTransport):
         return self._at(self._given().coarser())
 
     def finer(self) -> "AddingDoubling":
-        """The same at about three halves of the resolution."""
+        """The same at about four thirds of the resolution."""
         return self._at(self._given().finer())
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
