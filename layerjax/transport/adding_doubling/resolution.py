@@ -2,7 +2,9 @@
 
 Light that an interface lets in, a medium scatters and a base reflects is smooth in direction where one of them
 scatters widely. What nodes and modes must resolve are narrow lobes behind one another: the number of nodes goes with
-one over the width of the narrowest. The figures are measured, over random stacks, by the benchmark ``resolution``.
+one over the width of the narrowest. Errors of random stacks, as they were measured along known directions: paint under
+an interface of any roughness 5e-4 at 6 nodes; metal of alpha 0.13 1e-3 at 16 nodes, of 0.06 2e-3 at 32; flakes of alpha
+0.07 to 0.14 1e-3 at 16 nodes. Read off tables, haze over paint has 2e-3 at 12 nodes.
 """
 
 from collections.abc import Iterator

@@ -1,0 +1,101 @@
+"""The resolution that a stack gets when none is given, and what error it leaves."""
+
+import jax
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADDER, Resolution, chosen, rungs
+
+FACE, PAINT = lj.Interface(1.5, 0.05), lj.Lambertian(0.5)
+HAZE = lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.9))
+FIBERS = lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.3, (1.0, 0.0, 0.0)))
+
+
+def flakes(alpha):
+    return lj.Medium(1.0, 0.9, lj.SGGX("surface", alpha))
+
+
+@pytest.mark.parametrize(
+    ("stack", "followed", "least"),
+    [
+        (lj.Stack([FACE, HAZE], PAINT), True, 6),
+        (lj.Stack([FACE, HAZE], PAINT), False, 12),
+        (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 0.5)), True, 6),
+        (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 0.12)), True, 20),
+        (lj.Stack([FACE, flakes(0.1)], PAINT), True, 24),
+        (lj.Stack([FACE, lj.Medium(1.0, 0.0, lj.SGGX("surface", 0.1))], PAINT), True, 6),
+        (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, FINEST[0]),
+    ],
+)
+def test_narrow_lobes_behind_others_decide(stack, followed, least):
+    found = chosen(lj.stack.simplify(stack), followed)
+    assert least <= found.nodes <= max(least, 4 * least // 3)
+    assert found.modes >= found.nodes
+
+
+def test_traced_lobes_count_as_rather_narrow():
+    def nodes(alpha):
+        return chosen(lj.Stack([FACE], lj.Conductor(0.4, 3.0, alpha)), followed=True).nodes
+
+    seen = []
+    jax.eval_shape(lambda alpha: seen.append(nodes(alpha)) or alpha, 0.5)
+    assert nodes(0.5) < seen[0] < nodes(0.03)
+
+
+def test_what_is_chosen_is_told_and_what_is_given_stays():
+    stack = lj.Stack([FACE, HAZE], PAINT)
+    told = lj.choose_transport(stack)
+    assert (told.nodes, told.modes) == (12, 16)
+    assert lj.prepare(stack).transport == told
+    assert lj.choose_transport(stack, lj.AddingDoubling(nodes=10)).modes == 15
+    assert lj.choose_transport(stack, lj.AddingDoubling(modes=10)).modes == 10
+    wi, wo = lj.direction([0.2, 0.3], 0.0), lj.direction(0.4, 1.0)
+    assert lj.choose_transport(stack, known=lj.known_directions(wi, wo)).nodes == 6
+    with pytest.raises(ValueError, match=r"AddingDoubling.nodes: none are given; choose_transport"):
+        lj.AddingDoubling().finer()
+
+
+def test_neighbours_are_coarser_and_finer():
+    for resolution in rungs(lj.Stack([FACE, HAZE], PAINT)):
+        coarse, fine = resolution.coarser(), resolution.finer()
+        assert coarse.nodes < resolution.nodes < fine.nodes
+        assert coarse.modes < resolution.modes < fine.modes
+    ordinates = [resolution.ordinates for resolution in rungs(lj.Stack([FIBERS]))]
+    assert tuple(ordinates) == ORDINATES_LADDER
+    assert Resolution(2, 1, (2, 4)).coarser() == Resolution(2, 1, (2, 4))
+
+
+def random_stack(kind, seed):
+    random = np.random.default_rng(seed)
+    face = lj.Interface(random.uniform(1.2, 1.9), np.exp(random.uniform(np.log(0.02), np.log(0.8))))
+    haze = lj.Medium(
+        np.exp(random.uniform(-2.0, 2.0)), random.uniform(0.3, 1.0), lj.HenyeyGreenstein(random.uniform(-0.5, 0.9))
+    )
+    below = lj.Interface(random.uniform(1.2, 1.9), random.uniform(0.15, 0.8))
+    alpha = random.uniform(0.12, 0.8)
+    return {
+        "paint": lj.Stack([face, haze], lj.Lambertian(random.uniform(0.1, 0.95))),
+        "coated metal": lj.Stack([face], lj.Conductor(random.uniform(0.2, 2.0), random.uniform(1.5, 5.0), alpha)),
+        "flakes": lj.Stack([face, flakes(alpha)], lj.Lambertian(random.uniform(0.1, 0.95))),
+        "slab": lj.Stack([face, haze, below]),
+    }[kind]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["paint", "coated metal", "flakes", "slab"])
+def test_errors_of_random_stacks(kind):
+    """1e-3 is what is aimed at: half of the stacks are below it, and none is beyond ten times that."""
+    theta, phi = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0])
+    errors = []
+    for seed in range(8):
+        stack = random_stack(kind, seed)
+        outgoing = theta if stack.base is not None else np.concatenate([theta, np.pi - theta])
+        wi, wo = lj.direction(theta[:, None, None], 0.0), lj.direction(outgoing[:, None], phi)
+        found, exact = (
+            np.asarray(lj.evaluate(stack, wi, wo, transport))
+            for transport in (lj.AddingDoubling(), lj.AddingDoubling(nodes=40, modes=56))
+        )
+        errors.append(np.max(np.abs(found - exact) / (exact + 0.1 * np.mean(exact))))
+    assert np.median(errors) < 1e-3
+    assert np.max(errors) < 1e-2
