@@ -109,7 +109,9 @@ def passed(cosine, ior):
     return 1.0 - 0.5 * (s**2 + p**2)
 
 
-@pytest.mark.parametrize("transport", ["auto", lj.Statistical()], ids=["auto", "Statistical"])
+@pytest.mark.parametrize(
+    "transport", ["auto", pytest.param(lj.Statistical(), marks=pytest.mark.slow)], ids=["auto", "Statistical"]
+)
 def test_no_value_is_negative(transport):
     """Also where the index steps down, and little passes beyond the critical angle."""
     generator = np.random.default_rng(5)

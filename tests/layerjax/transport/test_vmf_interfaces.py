@@ -298,7 +298,7 @@ def test_references_are_finite_over_the_box(dtype):
 
 
 @pytest.mark.parametrize(
-    "transport", [lj.AddingDoubling(nodes=8, modes=8), pytest.param("auto", marks=pytest.mark.slow)], ids=["8", "auto"]
+    "transport", [lj.AddingDoubling(nodes=4, modes=4), pytest.param("auto", marks=pytest.mark.slow)], ids=["4", "auto"]
 )
 def test_reverse_mode_of_a_varnish(transport):
     """Against central differences: half of their step changes them by less than 1e-4."""

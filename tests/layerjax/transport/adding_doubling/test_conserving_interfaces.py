@@ -60,7 +60,9 @@ WHOLE = {
 }
 
 
-@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize(
+    "name", ["varnish", "metal", *(pytest.param(name, marks=pytest.mark.slow) for name in ("face", "haze on metal"))]
+)
 def test_values_hold_the_energy_that_is_told(name):
     """All that facets give back is in the values, outside too: 1e-2 is what 32 x 32 directions and 12 nodes err."""
     x, weight = np.polynomial.legendre.leggauss(32)

@@ -38,6 +38,7 @@ def test_agrees_with_tables_of_a_finer_grid(name):
     np.testing.assert_array_less(np.abs(followed - tables), 4e-3 * (tables + 0.1 * tables.mean()))
 
 
+@pytest.mark.slow
 def test_agrees_with_the_walk_through_a_slab():
     """Where light that passes both interfaces straight is narrower than the grid: tables are off by 2 % there."""
     stack = STACKS["slab"]

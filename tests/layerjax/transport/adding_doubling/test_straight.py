@@ -21,7 +21,13 @@ def slab(ior, alpha, ior_below, alpha_below):
     return lj.Stack([lj.Interface(ior, alpha), dye, lj.Interface(ior_below, alpha_below)])
 
 
-@pytest.mark.parametrize("numbers", [(1.29, 0.24, 1.9, 0.75), (1.5, 0.05, 1.2, 0.1), (0.8, 0.3, 1.0, 0.02)])
+SLABS = [
+    (1.5, 0.05, 1.2, 0.1),
+    *(pytest.param(n, marks=pytest.mark.slow) for n in ((1.29, 0.24, 1.9, 0.75), (0.8, 0.3, 1.0, 0.02))),
+]
+
+
+@pytest.mark.parametrize("numbers", SLABS)
 def test_agrees_with_the_walk(numbers):
     """4 standard errors, and 1e-3 of the values for the solver at 6 nodes."""
     stack = slab(*numbers)

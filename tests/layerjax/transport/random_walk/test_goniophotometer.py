@@ -125,7 +125,6 @@ COATED = {
         ("paint", "multiple", 100),
         pytest.param("paint", "multiple", 400, marks=pytest.mark.slow),
         pytest.param("haze on varnish", "single", 400, marks=pytest.mark.slow),
-        ("plate", "multiple", 100),
         pytest.param("plate", "multiple", 400, marks=pytest.mark.slow),
         pytest.param("two coats on metal", "single", 400, marks=pytest.mark.slow),
         pytest.param("two coats on metal", "multiple", 400, marks=pytest.mark.slow),
