@@ -10,7 +10,7 @@ rest is read off tables, or, where directions are known and the stack lets them,
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -219,11 +219,15 @@ class AddingDoubling(DeterministicTransport):
     def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         """The coarsest resolution that agrees with the one before to `tolerance`, at the directions asked for if
         light is followed along them, else all over the hemispheres."""
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(stack)):
+        if _is_traced(stack):
             raise ValueError(
                 f"AddingDoubling.tolerance: {self.tolerance:g} needs concrete parameters: "
                 "prepare the stack outside jit, grad and vmap, or give nodes and modes"
             )
+        with jax.ensure_compile_time_eval():
+            return self._agreeing(stack, None if _is_traced(known) else known)
+
+    def _agreeing(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         assert self.tolerance is not None
         wi, wo = _probes(stack.base is not None, known)
         before: Array | None = None
@@ -241,6 +245,10 @@ class AddingDoubling(DeterministicTransport):
             f"AddingDoubling.tolerance: {self.tolerance:g} is not reached: "
             f"the last two resolutions differ by {change:.1g}"
         )
+
+
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 @eqx.filter_jit

@@ -190,6 +190,18 @@ def test_tolerance_picks_the_resolution():
         jax.jit(lambda t: lj.evaluate(Stack([Medium(t)]), wi, wo, lj.AddingDoubling(tolerance=0.1)))(1.0)
 
 
+@pytest.mark.slow
+def test_tolerance_of_a_concrete_stack_holds_within_jit():
+    """Directions that are traced are read off tables, unless they are known: to four thirds of the tolerance."""
+    stack = Stack([lj.Interface(1.5, 0.2), Medium(1.0, 0.95, HenyeyGreenstein(0.5))], lj.Lambertian(0.3))
+    wi, wo = lj.direction([0.3, 0.8], 0.0), lj.direction([0.2, 0.7], [1.0, 3.0])
+    transport, known = lj.AddingDoubling(tolerance=0.03), lj.known_directions(wi, wo)
+    values = lj.evaluate(stack, wi, wo, transport)
+    within = jax.jit(lambda wi, wo, known: lj.evaluate(stack, wi, wo, transport, known=known))
+    np.testing.assert_allclose(within(wi, wo, None), values, rtol=0.04)
+    np.testing.assert_allclose(within(wi, wo, known), values, rtol=0.04)
+
+
 @pytest.mark.parametrize(
     ("options", "name"),
     [
