@@ -34,14 +34,9 @@ by quotients of energies that nearly cancel. Slopes of `Statistical` over a hazy
 TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 """Where ends of integrals coincide, and which of them moves depends on rounding: modes agree less well."""
 
-JITTERY = {
-    ("Statistical", "two coats on paint"),
-    ("Statistical, forward", "plate"),
-    ("AddingDoubling", "hazy varnish"),
-}
+JITTERY = {("Statistical", "two coats on paint"), ("Statistical, forward", "plate")}
 """At equal indices caps of facets coincide: values jitter by 3e-4 there, or step by 2e-5 times the root of what the
-indices differ by, and no difference converges to the derivative. In the last of them the points of facets move at
-once to where the critical angle appears: values step by 3e-5, below what these points err."""
+indices differ by, and no difference converges to the derivative."""
 
 QUICK = {
     ("SingleScattering", "haze over metal"),

@@ -94,7 +94,7 @@ def polar_angles(cosine: Array, sine: Array, alpha: Array, ratio: Array, way: Wa
     cut = at_most(cut, end)
     low, high = jnp.where(cut < inner, cut, inner), jnp.where(cut < inner, inner, cut)
     edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end][: 4 if way == "reflected" else 3], axis=1)
-    root = total & (edges[:, 1:] == critical)
+    root = edges[:, 1:] == inner  # also where nothing is totally reflected: points move smoothly as that begins
     places = _place((edges - theta) / alpha)
     first, width = places[:, :-1, None], (places[:, 1:] - places[:, :-1])[..., None]
     x, w = (jnp.asarray(array, theta.dtype) for array in gauss_legendre(points))
