@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-from layerjax.transport.adding_doubling.resolution import is_tilted
+from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADDER, is_tilted
 
 ENOUGH = 0.1
 """Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
@@ -24,8 +24,8 @@ ENOUGH = 0.1
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
 """The finest resolution of starts: what is finer costs more than it tells far away from the data."""
 
-FINEST_NODES, FINEST_COSINES = 48, 16
-"""What is chosen at most: more takes minutes and gigabytes."""
+FINEST_NODES, FINEST_COSINES = FINEST[0], ORDINATES_LADDER[-1][0]
+"""What is chosen at most."""
 
 LEAST_SCATTER = 0.01
 """Of the data's root mean square: less scatter about a named objective counts as this, so that an error of a thousandth

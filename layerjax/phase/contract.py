@@ -78,6 +78,11 @@ class PhaseFunction(eqx.Module):
         return 1.0
 
     @property
+    def onward_width(self) -> Parameter:
+        """The same of the peak that may go straight on, for whoever looks through the medium; 1 while g is traced."""
+        return 1.0
+
+    @property
     def is_upright(self) -> bool:
         """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
         return True

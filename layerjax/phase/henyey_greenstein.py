@@ -1,6 +1,8 @@
 """The phase function of Henyey & Greenstein (1941): haze, pigment and tissue."""
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax._parameters import Parameter, parameter
@@ -44,5 +46,21 @@ class HenyeyGreenstein(PhaseFunction):
         return henyey_greenstein_rule(wi, self.g, nodes)
 
     @property
+    def width(self) -> Parameter:
+        return _width(self.g, -1.0)
+
+    @property
+    def onward_width(self) -> Parameter:
+        return _width(self.g, 1.0)
+
+    @property
     def forward_lobe(self) -> Parameter:
         return self.g
+
+
+def _width(g: Parameter, side: float) -> Parameter:
+    """Of the peak on the side that the sign tells: where p has fallen to about a third."""
+    if isinstance(g, jax.core.Tracer):
+        return 1.0
+    peaked = np.maximum(side * np.asarray(g), 1e-9)
+    return np.minimum((1.0 - peaked) / np.sqrt(peaked), 1.0)

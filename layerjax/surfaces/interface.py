@@ -58,7 +58,7 @@ def refraction_lobe(
     # (wi.v, wo.v) as sums that keep their digits where wo is near -wi
     towards_i, towards_o = 0.5 * ior * squared - step, 0.5 * squared + step
     exists = (towards_i * towards_o < 0) & (towards_i * v[2] > 0)
-    exists = exists & (jnp.abs(step) > 64.0 * jnp.finfo(squared.dtype).eps)
+    exists = exists & ~is_straight(ior)
     a = jnp.where(exists, jnp.abs(towards_i), 1.0)
     b = jnp.where(exists, jnp.abs(towards_o), 1.0)
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
@@ -72,6 +72,11 @@ def refraction_lobe(
         gain = (ior * a * inverse) * inverse * (ior * b * inverse) * inverse
         lobe = facets.density((x * inverse, y * inverse, jnp.abs(z) * inverse), alpha, distribution) * gain
     return jnp.where(exists, lobe, 0.0), transmitted
+
+
+def is_straight(ior: Array) -> Array:
+    """Whether the indices are so nearly equal that light passes straight, and the BTDF is a delta."""
+    return jnp.abs(ior - 1.0) <= 64.0 * jnp.finfo(jnp.result_type(ior)).eps
 
 
 def interface_sample(

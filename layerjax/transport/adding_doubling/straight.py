@@ -16,7 +16,7 @@ from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, each, total
 from layerjax.directions import Vector, flip, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces.interface import interface_transmission
+from layerjax.surfaces.interface import interface_transmission, is_straight
 from layerjax.transport.adding_doubling.asked import asked_region, turn
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
@@ -103,42 +103,54 @@ def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
     outside = total(
         [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
     )
-    below = jnp.where(downward, 1.0, 1.0 / state.lower.ior**2)  # f / ior_o^2 is reciprocal
+    level = jnp.where(downward, 1.0, 1.0 / state.lower.ior**2)  # f / ior_o^2 is reciprocal
 
     def value(passed: Array, depth: Array) -> Array:
-        return jnp.where(valid, passed.reshape(shape) * below * jnp.exp(-depth), 0.0)
+        return jnp.where(valid, passed.reshape(shape) * level * jnp.exp(-depth), 0.0)
 
     return each(value, found, outside)
 
 
-def _column(x: Array, y: Array, z: Array) -> Vector:
-    return x[:, None], y[:, None], z[:, None]
-
-
 def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
-    """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each."""
+    """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each.
+
+    With m between, g_i and g_o the BTDFs from m out along either direction, f = n^2 * integral of g_i g_o cos(m). Rays
+    from above have the density n^2 g_i cos(m) of m, those from below n^2 g_o cos(m) / n_below^2.
+    """
     inner, below = state.upper.ior, state.lower.ior
-    normals = [Normals(face.alpha, face.distribution) for face in (state.upper, state.lower)]
+    faces = [Normals(face.alpha, face.distribution) for face in (state.upper, state.lower)]
     sine_i, sine_o = (safe_sqrt((1.0 - c) * (1.0 + c)) for c in (cosine_i, cosine_o))
-    cos_phi, sin_phi = jnp.cos(azimuth), jnp.sin(azimuth)
-    over = _column(-sine_i, jnp.zeros_like(sine_i), -cosine_i)
-    under = _column(sine_o * cos_phi, sine_o * sin_phi, -cosine_o)
-    sums = []
-    for ends in (0, 1):
-        cosine, ratio = ((cosine_i, inner), (cosine_o, inner / below))[ends]
-        travel, share = refracted_rays(asked_region(cosine, jnp.ones_like(inner)), ratio, normals[ends], POINTS)
-        # shares stand for mirror images too
-        x, y, z = (
-            jnp.concatenate([part, sign * part], axis=-1) for part, sign in zip(travel, (1.0, -1.0, 1.0), strict=True)
-        )
-        share = 0.5 * jnp.concatenate([share, share], axis=-1)
-        if ends:  # followed backwards, from where it leaves
-            x, y = x * cos_phi[:, None] - y * sin_phi[:, None], x * sin_phi[:, None] + y * cos_phi[:, None]
+    cos_phi, sin_phi = jnp.cos(azimuth)[:, None], jnp.sin(azimuth)[:, None]
+    over: Vector = (-sine_i[:, None], jnp.zeros_like(cos_phi), -cosine_i[:, None])
+    under: Vector = (sine_o[:, None] * cos_phi, sine_o[:, None] * sin_phi, -cosine_o[:, None])
+
+    def parts(x: Array, y: Array, z: Array) -> tuple[Array, Array, Channels]:
+        """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
-        g_i = interface_transmission((x, y, z), over, 1.0 / inner, *normals[0])
-        g_o = interface_transmission(middle, under, below / inner, *normals[1])
-        mine, other = ((g_i, g_o / below**2), (g_o / below**2, g_i))[ends]
-        value = (g_o, g_i * below**2)[ends] * safe_div(mine, mine + other)
+        g_i = interface_transmission((x, y, z), over, 1.0 / inner, *faces[0])
+        g_o = interface_transmission(middle, under, below / inner, *faces[1])
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
-        sums.append(tuple(jnp.sum(share * value * jnp.exp(-depth), axis=-1) for depth in depths))
-    return total(sums)
+        return g_i, g_o / below**2, tuple(jnp.exp(-depth) for depth in depths)
+
+    # a BTDF at equal indices is a delta: then the rays of its own side are the whole
+    delta_i, delta_o = is_straight(inner), is_straight(inner / below)
+    (x, y, z), share = _rays(cosine_i, inner, faces[0])
+    g_i, g_o, passed = parts(x, y, z)
+    counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, safe_div(g_i, g_i + g_o)))
+    from_above = [jnp.sum(share * below**2 * g_o * counted * level, axis=-1) for level in passed]
+    (x, y, z), share = _rays(cosine_o, inner / below, faces[1])
+    # followed backwards, from where it leaves
+    g_i, g_o, passed = parts(x * cos_phi - y * sin_phi, x * sin_phi + y * cos_phi, z)
+    counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, safe_div(g_o, g_i + g_o)))
+    from_below = [jnp.sum(share * below**2 * g_i * counted * level, axis=-1) for level in passed]
+    return total([from_above, from_below])
+
+
+def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:
+    """Where facets refract light along (-sin, 0, cos) to, z counted on the far side, and its shares."""
+    (x, y, z), share = refracted_rays(asked_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
+
+    def both(part: Array, mirrored: Array) -> Array:  # shares stand for mirror images too
+        return jnp.concatenate([part, mirrored], axis=-1)
+
+    return (both(x, x), both(y, -y), both(z, z)), 0.5 * both(share, share)

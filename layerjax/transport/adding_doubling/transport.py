@@ -25,7 +25,7 @@ from layerjax.stack import Stack, channel_count
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
-from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, rungs, suiting
+from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, modes_for, rungs
 from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
@@ -204,13 +204,13 @@ class AddingDoubling(DeterministicTransport):
     def _given(self) -> Resolution:
         if self.nodes is None:
             raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
-        return Resolution(self.nodes, self.modes or suiting(self.nodes), self.ordinates or ORDINATES_LADDER[0])
+        return Resolution(self.nodes, self.modes or modes_for(self.nodes), self.ordinates or ORDINATES_LADDER[0])
 
     def _resolution(self, stack: Stack, followed: bool) -> Resolution:
         """What is given, and for the rest what is chosen."""
         by_stack = chosen(stack, followed)
         nodes = by_stack.nodes if self.nodes is None else self.nodes
-        modes = by_stack.modes if self.nodes is None else suiting(self.nodes)
+        modes = by_stack.modes if self.nodes is None else modes_for(self.nodes)
         return Resolution(nodes, self.modes or modes, self.ordinates or by_stack.ordinates)
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:

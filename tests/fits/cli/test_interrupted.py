@@ -26,38 +26,12 @@ from fits.problem.likelihood import Noise
 from fits.problem.problem import Problem
 from fits.reporting.plots.data import data_picture
 from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
-from tests.helpers.files import contents, largest_file
+from tests.helpers.files import contents, largest_file, mounted, read_only
 from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT
 
 MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
 BOUNDED = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "12", "--solver", "bounded"]
-
-
-@contextmanager
-def mounted(folder: Path, *options: str) -> Iterator[None]:
-    try:
-        done = subprocess.run(["mount", *options, str(folder)], capture_output=True, check=False)
-    except FileNotFoundError:
-        pytest.skip("there is no mount")
-    if done.returncode:
-        pytest.skip("mounting is not permitted")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", str(folder)], check=True)
-
-
-@contextmanager
-def read_only(folder: Path) -> Iterator[None]:
-    if os.geteuid() == 0:  # whom permissions do not stop
-        with mounted(folder, "--bind", str(folder)):
-            subprocess.run(["mount", "-o", "remount,ro,bind", str(folder)], check=True)
-            yield
-        return
-    folder.chmod(0o555)
-    yield
-    folder.chmod(0o755)
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

@@ -26,6 +26,10 @@ def flakes(alpha):
         (lj.Stack([FACE, flakes(0.1)], PAINT), True, 24),
         (lj.Stack([FACE, lj.Medium(1.0, 0.0, lj.SGGX("surface", 0.1))], PAINT), True, 6),
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, FINEST[0]),
+        (lj.Stack([lj.Interface(1.1, 0.05)], lj.Conductor(0.4, 3.0, 0.5)), True, 12),
+        (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 12),
+        (lj.Stack([FACE, HAZE, lj.Interface(1.0, 0.6)]), True, 24),
+        (lj.Stack([FACE, lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(-0.9))], PAINT), True, 24),
     ],
 )
 def test_narrow_lobes_behind_others_decide(stack, followed, least):
@@ -85,7 +89,7 @@ def random_stack(kind, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["paint", "coated metal", "flakes", "slab"])
 def test_errors_of_random_stacks(kind):
-    """1e-3 is what is aimed at: half of the stacks are below it, and none is beyond ten times that."""
+    """1e-3 is what is aimed at: half of the stacks are below it, and none is beyond five times that."""
     theta, phi = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0])
     errors = []
     for seed in range(8):
@@ -98,4 +102,4 @@ def test_errors_of_random_stacks(kind):
         )
         errors.append(np.max(np.abs(found - exact) / (exact + 0.1 * np.mean(exact))))
     assert np.median(errors) < 1e-3
-    assert np.max(errors) < 1e-2
+    assert np.max(errors) < 5e-3

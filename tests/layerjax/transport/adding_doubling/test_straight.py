@@ -14,6 +14,7 @@ THETA_I, THETA_O, PHI = (
     np.array([0.0, 0.1, 2.0, 0.0, 0.1, 1.0]),
 )
 WI, WO = lj.direction(THETA_I, 0.0), lj.direction(THETA_O, PHI)
+KNOWN = lj.known_directions(WI, WO)
 
 
 def slab(ior, alpha, ior_below, alpha_below):
@@ -29,13 +30,13 @@ SLABS = [
 
 @pytest.mark.parametrize("numbers", SLABS)
 def test_agrees_with_the_walk(numbers):
-    """4 standard errors, and 1e-3 of the values for the solver at 6 nodes."""
+    """4 standard errors, and for the solver at 6 nodes 1e-3 of the values and of a tenth of the largest."""
     stack = slab(*numbers)
     values = np.asarray(lj.evaluate(stack, WI, WO, SOLVER))
     walked, errors = map(
         np.asarray, lj.evaluate_with_error(stack, WI, WO, lj.RandomWalk(paths=1 << 13), key=jax.random.key(1))
     )
-    assert np.all(np.abs(values - walked) < 4.0 * errors + 1e-3 * np.max(walked))
+    assert np.all(np.abs(values - walked) < 4.0 * errors + 1e-3 * (walked + 0.1 * np.max(walked)))
 
 
 def test_is_reciprocal_and_turns_upside_down():
@@ -45,13 +46,28 @@ def test_is_reciprocal_and_turns_upside_down():
     np.testing.assert_allclose(forth, ratio * back, rtol=1e-9)
 
 
+def test_is_continuous_at_equal_indices():
+    """An interface without effect refracts to one direction alone: nothing is lost or counted twice there.
+
+    Values change by some 1e-6 of themselves over the steps of 1e-6. What is scattered besides steps by 6e-4 at normal
+    incidence, where the solver's error at 6 nodes is 9e-3 (2e-5 at 12 nodes).
+    """
+    values = jax.jit(lambda ior, below: lj.evaluate(slab(ior, 0.3, below, 0.2), WI, WO, SOLVER, known=KNOWN))
+    for equal, near in (
+        ((1.0, 1.4), (1.0 + 1e-6, 1.4)),
+        ((1.4, 1.4), (1.4, 1.4 - 1e-6)),
+        ((0.8, 0.8), (0.8, 0.8 + 1e-6)),
+    ):
+        np.testing.assert_allclose(values(*equal), values(*near), rtol=1e-3, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     """Central differences of step 1e-5: 1e-10 of the curvature, and rounding of 1e-11."""
     start = jnp.asarray([1.5, 0.05, 1.2, 0.1])
 
     def values(numbers):
-        return lj.evaluate(slab(*numbers), WI, WO, SOLVER, known=lj.known_directions(WI, WO))
+        return lj.evaluate(slab(*numbers), WI, WO, SOLVER, known=KNOWN)
 
     slopes = jax.jit(jax.jacfwd(values))(start)
     compiled = jax.jit(values)
