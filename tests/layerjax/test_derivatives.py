@@ -34,9 +34,14 @@ by quotients of energies that nearly cancel. Slopes of `Statistical` over a hazy
 TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 """Where ends of integrals coincide, and which of them moves depends on rounding: modes agree less well."""
 
-JITTERY = {("Statistical", "two coats on paint"), ("Statistical, forward", "plate")}
-"""At equal indices caps of facets coincide: values jitter by 3e-4 there, or step by 2e-5 times the root of what the
-indices differ by, and no difference converges to the derivative."""
+JITTERY = {
+    ("Statistical", "two coats on paint"),
+    ("Statistical", "hazy varnish"),
+    ("Statistical, forward", "hazy varnish"),
+    ("Statistical, forward", "plate"),
+}
+"""At equal indices caps of facets coincide: values jitter there by 3e-4 under two coats and 2e-5 under haze, or step by
+2e-5 times the root of what the indices differ by, and no difference converges to the derivative."""
 
 QUICK = {
     ("SingleScattering", "haze over metal"),
@@ -73,13 +78,14 @@ def test_derivatives(name, kind):
     fixed = asked_to_be_known(name, kind)
     start, build = vector_and_build(stack, fixed)
     wi, wo = pairs(stack)
+    # cast here, as constants: directions that are known while tracing
+    directions = {np.dtype(dtype): (wi.astype(dtype), wo.astype(dtype)) for dtype in (jnp.float64, jnp.float32)}
     weight = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.0, len(wi)))
     # the programs of single precision take as long to compile
     dtypes = (jnp.float64,) if (name, kind) == ("AddingDoubling", "haze over paint") else (jnp.float64, jnp.float32)
 
     def reflected(vector):
-        i, o = (w.astype(vector.dtype) for w in (wi, wo))
-        return lj.evaluate(build(vector), i, o, transport)[:, 0]
+        return lj.evaluate(build(vector), *directions[vector.dtype], transport)[:, 0]
 
     @jax.jit
     def forward(vector, direction):
@@ -114,8 +120,8 @@ def test_derivatives(name, kind):
             continue
         single, small = vector.astype(jnp.float32), direction.astype(jnp.float32)
         ahead, back = np.asarray(forward(single, small)[1]), np.asarray(reverse(single))
-        # rounding of values is divided by what a parameter is measured in
-        rounding = 64 * np.finfo(np.float32).eps * float(weight @ np.abs(values(vector))) / point.length
+        # rounding of values, or of energies that cancel to them, is divided by what a parameter is measured in
+        rounding = 64 * np.finfo(np.float32).eps * max(1.0, float(weight @ np.abs(values(vector)))) / point.length
         if not np.isfinite(ahead).all() or not np.isfinite(back).all():
             wrong.append(f"{where}: not finite in single precision")
         elif abs(back[point.place] - float(weight @ ahead)) > 1e-3 * size + rounding:

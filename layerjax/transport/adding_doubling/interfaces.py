@@ -35,6 +35,9 @@ LEAST_POINTS = (12, 6)
 AT_ONCE = 1 << 20
 """Numbers that arrays of facets hold at most."""
 
+ROUNDED = 0.01
+"""Times the root of the precision: a share of energy below it is only what rounding leaves of tables."""
+
 AGREEING, RESOLVED, MOST_OFF = 0.3, 0.2, 50.0
 """Energies of light deposited on nodes are put right where they are off by a share that is well below the first.
 
@@ -221,9 +224,18 @@ def _given_back(
     sums = [jnp.sum(weight * t) for weight, t in zip(weights, crossing, strict=True)]
     least = jnp.where(sums[0] < sums[1], sums[0], sums[1])
     crossing = [t * safe_div(least, total) for t, total in zip(crossing, sums, strict=True)]
-    staying = [l - t for l, t in zip(lost, crossing, strict=True)]
-    given = []
-    for out, into in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        parts, mean = (staying, jnp.sum(weights[out] * staying[out])) if out == into else (crossing, least)
-        given.append(safe_div(jnp.outer(leaving[out] * parts[out], parts[into]), mean))
-    return given
+    down, up = (
+        safe_div(jnp.outer(leaving[out] * crossing[out], crossing[into]), least) for out, into in ((1, 0), (0, 1))
+    )
+    near, far = (_staying(*side) for side in zip(lost, crossing, weights, leaving, strict=True))
+    return [near, down, up, far]
+
+
+def _staying(lost: Array, crossing: Array, weight: Array, leaving: Array) -> Array:
+    """What comes back on its own side. Where nothing does, at equal indices, it comes back like all that is lost:
+    the product has no derivative there, and energy needs one."""
+    staying = lost - crossing
+    mean, whole = jnp.sum(weight * staying), jnp.sum(weight * lost)
+    some = mean > ROUNDED * np.sqrt(jnp.finfo(mean.dtype).eps) * whole
+    profile = jnp.where(some, staying / jnp.where(some, mean, 1.0), safe_div(lost, whole))
+    return jnp.outer(leaving * profile, staying)
