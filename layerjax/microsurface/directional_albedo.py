@@ -76,9 +76,9 @@ def interface_energies(
     if microfacets == "single":
         cap = make_cap(cosine, alpha)
         return _reflected(cap, ior, points), _passing(cap, ior, points)[1]
-    first, kept, stuck = first_event(cosine, alpha, ior, points=points)
+    first, reflected_on, refracted_on = first_event(cosine, alpha, ior, points=points)
     returned = interface_multiple_reflectance(cosine, alpha, ior)
-    reflected = _share(first + kept * returned[0] + stuck * returned[1])
+    reflected = _share(first + reflected_on * returned[0] + refracted_on * returned[1])
     return reflected, 1.0 - reflected
 
 
@@ -104,8 +104,8 @@ def conductor_energy(
         upper = _upper(make_cap(cosine, alpha), points)
         reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
         return upper.mean(reflectance * _masking(upper.reflected(), upper.alpha))
-    first, kept = first_mirror(cosine, alpha, ior, k, points=points)
-    return _share(first + kept * conductor_multiple_reflectance(cosine, alpha, ior, k))
+    first, reflected_on = first_mirror(cosine, alpha, ior, k, points=points)
+    return _share(first + reflected_on * conductor_multiple_reflectance(cosine, alpha, ior, k))
 
 
 @partial(jax.jit, static_argnames="points")

@@ -72,19 +72,19 @@ def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, pa
             (reflect(wi, m), height, weight * reflectance),
             (refracted, below, weight * (1.0 - reflectance)),
         ]
-        kept, sums = [], []
+        blocked, sums = [], []
         for w, h, energy in ways:
             free = optical_depth(w, h, alpha)
             powers = jnp.exp(-depths / jnp.where(w[2] > 1e-6, w[2], 1e-6))
             out = jnp.where(first, 0.0, energy * jnp.exp(-free))
             sums.append((powers @ jnp.where(far, 0.0, out), powers @ jnp.where(far, out, 0.0)))
-            kept.append(energy * -jnp.expm1(-free))
-        weight = kept[0] + kept[1]
-        crosses = u3 * weight > kept[0]
+            blocked.append(energy * -jnp.expm1(-free))
+        weight = blocked[0] + blocked[1]
+        crosses = u3 * weight > blocked[0]
         travel = select(crosses, ways[1][0], ways[0][0])
         height = jnp.where(crosses, ways[1][1], height)
-        (near_kept, far_kept), (near_crossed, far_crossed) = sums
-        energies = energies + jnp.stack([near_kept + far_crossed, far_kept + near_crossed])
+        (near_reflected, far_reflected), (near_crossed, far_crossed) = sums
+        energies = energies + jnp.stack([near_reflected + far_crossed, far_reflected + near_crossed])
         most = jnp.where(first, jnp.sum(weight), most)
         return number + 1, travel, height, weight, far ^ crosses, energies, most
 

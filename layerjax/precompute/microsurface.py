@@ -91,22 +91,26 @@ def _fit(
 def _dielectric(
     cosine: Array, alpha: Array, ior: Array, k: Array, near: Array, far: Array, first: First
 ) -> tuple[Array, Array, Array]:
-    _, kept, stuck = first_event(cosine, alpha, ior)
+    _, reflected_on, refracted_on = first_event(cosine, alpha, ior)
     basis = interface_bases(cosine, alpha, ior)[first]
     if first == "reflected":
         away = near + far
-        return kept[:, None] * basis, kept * near / jnp.where(away > 0, away, 1.0), kept
-    return stuck[:, None] * basis, near, stuck
+        return reflected_on[:, None] * basis, reflected_on * near / jnp.where(away > 0, away, 1.0), reflected_on
+    return refracted_on[:, None] * basis, near, refracted_on
 
 
 @functools.partial(jax.jit, static_argnames="first")
 def _conductor(
     cosine: Array, alpha: Array, ior: Array, k: Array, near: Array, far: Array, first: First
 ) -> tuple[Array, Array, Array]:
-    _, kept = first_mirror(cosine, alpha, ior, k)
-    _, all_kept = first_mirror(cosine, alpha, 1e-9 * jnp.ones_like(ior), jnp.zeros_like(k))
+    _, reflected_on = first_mirror(cosine, alpha, ior, k)
+    _, all_reflected_on = first_mirror(cosine, alpha, 1e-9 * jnp.ones_like(ior), jnp.zeros_like(k))
     basis, mean = conductor_basis(cosine, alpha, ior, k)
-    return kept[:, None] * basis, all_kept * near / jnp.where(far > 0, far, 1.0) - kept * mean, kept
+    return (
+        reflected_on[:, None] * basis,
+        all_reflected_on * near / jnp.where(far > 0, far, 1.0) - reflected_on * mean,
+        reflected_on,
+    )
 
 
 def _spread(count: int, dimensions: int) -> np.ndarray:

@@ -103,13 +103,13 @@ def evaluate_first(state: FirstOrder, wi: Vector, wo: Vector, side: Side) -> Cha
 
 
 def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
-    """Probability that light along w meets an event at all, per channel; None: it is 1. See `share_met`."""
+    """Probability that light along w meets an event at all, per channel; None: it is 1. See `colliding_share`."""
     if state.layered or state.opaque:
         return None
-    return share_met(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
+    return colliding_share(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
 
 
-def share_met(media: Sequence[Medium], w: Vector) -> Channels:
+def colliding_share(media: Sequence[Medium], w: Vector) -> Channels:
     """Share of light along w that collides in media, 1 - exp(-depth), per channel.
 
     In media of thickness 0 it is what that is in proportion to: quantities that vanish with it are interpolated as

@@ -84,10 +84,10 @@ class WeidlichWilkie(DeterministicTransport):
         return wo
 
     def pdf(self, state: Stack, wi: Vector, wo: Vector) -> Array:
-        lifted_i, lifted_o = sanitised(wi), sanitised(wo)
+        safe_i, safe_o = sanitised(wi), sanitised(wo)
         density = jnp.zeros_like(wi[2] * wo[2])
-        for probability, surface in _choices(state, lifted_i):
-            density = density + probability * surface.pdf(lifted_i, lifted_o)
+        for probability, surface in _choices(state, safe_i):
+            density = density + probability * surface.pdf(safe_i, safe_o)
         return jnp.where(is_above(wi) & is_above(wo), density, 0.0)
 
     def albedo(self, state: Stack, wi: Vector, nodes: int) -> tuple[Channels, Channels]:

@@ -47,10 +47,10 @@ def seen_facets(
     c = at_least(mu * cos_apart - sin_w * sin_apart, LEAST_COSINE)
     s = at_least(sin_w * cos_apart + mu * sin_apart, 0.0)
     # the density of normals is that of 1 / (near + (far - near) sin(psi/2)^2)^2, nearly
-    bend = 1.0 / (1.0 + 0.5 * alpha * alpha)
-    least = 0.5 * alpha * alpha * bend
-    near = least + bend * sin_apart * sin_apart / (1.0 + at_least(cos_apart, 0.0))
-    far = least + bend * at_least(1.0 - mu * c + sin_w * s, 0.0)
+    scale = 1.0 / (1.0 + 0.5 * alpha * alpha)
+    least = 0.5 * alpha * alpha * scale
+    near = least + scale * sin_apart * sin_apart / (1.0 + at_least(cos_apart, 0.0))
+    far = least + scale * at_least(1.0 - mu * c + sin_w * s, 0.0)
     squeeze = jnp.sqrt(near / far)
     # psi ends where the normal, or the light mirrored at it, reaches the horizon
     level, swing = mu * c - (0.5 * mu / c if way == "reflected" else 0.0), sin_w * s

@@ -242,7 +242,7 @@ def table_region(grid: Grid, region: Region) -> Region:
     return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one, one > 0)
 
 
-def lifted(grid: Grid, values: Array) -> Array:
+def at_table_points(grid: Grid, values: Array) -> Array:
     """Values (..., nodes) at the points of a table, by polynomials in each panel."""
     _, matrix = table_matrix(grid.nodes)
     split = values.reshape(*values.shape[:-1], -1, grid.nodes) @ jnp.asarray(matrix.T, values.dtype)

@@ -30,11 +30,11 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
 from layerjax.transport.adding_doubling.facet_light import Normals, facet_energies
-from layerjax.transport.adding_doubling.grid import Grid, Region, interpolated, lifted, table_region
+from layerjax.transport.adding_doubling.grid import Grid, Region, at_table_points, interpolated, table_region
 from layerjax.transport.adding_doubling.operators import Parts
 from layerjax.transport.adding_doubling.resolution import Resolution
 from layerjax.transport.adding_doubling.solve import Plan, make_plan, solve
-from layerjax.transport.first_order import share_met
+from layerjax.transport.first_order import colliding_share
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
 from layerjax.transport.statistical.lobes import precision
 
@@ -123,7 +123,7 @@ def _refracted_table(bare: Stack, grid: Grid, there: Array, plan: Plan) -> Array
     at_nodes, at_points = entering(top), entering(table_region(grid, top))
     typical = safe_div(there @ top.weight, at_nodes @ top.weight)[:, None]
     behind = (there + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
-    return lifted(grid, behind) * at_points
+    return at_table_points(grid, behind) * at_points
 
 
 def _straight_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
@@ -135,11 +135,11 @@ def _straight_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) ->
         return region.sine, jnp.zeros_like(region.sine), region.cosine
 
     points = table_region(grid, top)
-    at_nodes, at_points = (jnp.stack(share_met(media, along(region))) for region in (top, points))
+    at_nodes, at_points = (jnp.stack(colliding_share(media, along(region))) for region in (top, points))
     depths = [jnp.stack(depth) for depth in optical_depths(media, along(points))]
     straight = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
     scattered, at_nodes = _alike(scattered, at_nodes)
-    return lifted(grid, scattered / at_nodes) * at_points + straight
+    return at_table_points(grid, scattered / at_nodes) * at_points + straight
 
 
 def _alike(a: Array, b: Array) -> tuple[Array, Array]:
