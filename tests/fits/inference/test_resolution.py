@@ -26,7 +26,7 @@ from tests.helpers.models import LINE, TRUTH, line, line_data
 
 GEOMETRY = slices(incidence=(20, 50), outgoing=np.arange(-60, 61, 20))
 NARROW, WIDE = 0.15, 0.45
-COARSE = lj.AddingDoubling(nodes=6, modes=8, ordinates=(6, 8))
+COARSE = lj.AddingDoubling(nodes=6, modes=12, ordinates=(6, 8))
 
 
 def lacquered(alpha):
