@@ -80,7 +80,7 @@ def test_a_resolution_that_is_given_stays_and_its_error_is_told(sharp):
     found = fit(STACK, sharp, transport=COARSE, starts=1)
     assert found.problem.transport == COARSE
     assert found.numerical_error > ENOUGH
-    assert "sigma at most at 6 nodes, 8 modes, as given" in found.status
+    assert "sigma at most at 6 nodes, 12 modes, as given" in found.status
     sentences, fine = verdicts.in_short(found, residual_structure(found.problem.data, standardised(found)))
     assert not fine
     assert any("numerical error" in sentence for sentence in sentences)
@@ -90,7 +90,7 @@ def test_the_finest_resolution_is_told(sharp, monkeypatch):
     monkeypatch.setattr(resolution_module, "FINEST_NODES", 6)
     found = fit(STACK, sharp, starts=1)
     assert found.problem.transport == COARSE
-    assert re.search(r"up to .* sigma at 6 nodes, 8 modes, the finest tried", found.status)
+    assert re.search(r"up to .* sigma at 6 nodes, 12 modes, the finest tried", found.status)
 
 
 def test_a_fit_goes_on_with_the_starts_that_are_done(refined, sharp, monkeypatch):
