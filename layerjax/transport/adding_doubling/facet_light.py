@@ -13,7 +13,7 @@ from jax import Array
 
 from layerjax import fresnel
 from layerjax._batching import by_rows
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
 from layerjax.normals import facets
 from layerjax.quadrature import gauss_legendre
@@ -38,9 +38,8 @@ def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, 
     """Of light from every near node: the energy that facets reflect, that they refract, and that masking takes."""
     reflected = reflected_energy(near, far.ior / near.ior, normals)
     _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
-    refracted = jnp.sum(passed, axis=-1)
-    lost = at_least(1.0 - reflected - refracted, 0.0)
-    return reflected, refracted, jnp.where(near.exists, lost, 0.0)
+    refracted = at_most(jnp.sum(passed, axis=-1), 1.0 - reflected)
+    return reflected, refracted, jnp.where(near.exists, 1.0 - reflected - refracted, 0.0)
 
 
 def reflected_energy(region: Region, ratio: Array, normals: Normals) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._batching import by_rows
-from layerjax._numerics import at_least, safe_div, safe_sqrt
+from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
@@ -28,6 +28,9 @@ from layerjax.transport.adding_doubling.facet_light import (
 from layerjax.transport.adding_doubling.grid import Grid, Region, joined, spread
 from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import BALANCING, cosines, modes_at_nodes, scaled_to_energy
+
+STRONG = 5.0
+"""One over what an interface reflects of which all may be put right; of less, a share in proportion."""
 
 LEAST_POINTS = (12, 6)
 """Points a panel, and in azimuth, of light let in along few directions, at least (see `seen_facets`)."""
@@ -100,11 +103,10 @@ def _operators(
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
     outer = None
     if not asked:
-        reflect_near = _face(near, outside, far.ior / near.ior, normals, modes)
-        outer = reflect_near + unresolved * _left_over(near, outside, down, jnp.sum(through[0], axis=-2))
-    passed = safe_div(through[0] @ near.weight, far.weight)
-    reflect_far = _face(far, inside, near.ior / far.ior, normals, modes)
-    inner = reflect_far + unresolved * _left_over(far, inside, up, passed)
+        rest = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
+        outer = _reflection(near, outside, rest, unresolved, far.ior / near.ior, normals, modes)
+    rest = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
+    inner = _reflection(far, inside, rest, unresolved, near.ior / far.ior, normals, modes)
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
     given: list[Array | None] = [None] * 4
     if microfacets == "multiple":
@@ -198,10 +200,18 @@ def _scale(wanted: Array, found: Array, agreeing: Array) -> Array:
     return 1.0 + excess * jnp.exp(-((excess / agreeing) ** 2))
 
 
-def _left_over(region: Region, level: Array, wanted: Array, passed: Array) -> Array:
-    """What nodes that do not resolve an interface let pass too little or too much: it is reflected like by a mirror."""
-    rest = jnp.where(region.weight > 0, wanted - passed, 0.0)
-    return jnp.diag(at_least(rest, -level))
+def _reflection(
+    region: Region, level: Array, rest: Array, unresolved: Array, ior: Array, normals: Normals, modes: int
+) -> Array:
+    """Reflection on one side, with the rest that nodes let pass too little or too much: none of it is lost.
+
+    Of an interface that they do not resolve it is reflected like by a mirror, else with the lobe: a weak one is left as
+    it is, and may change by a larger share the stronger it is.
+    """
+    most = level * at_most(STRONG * level, 1.0)
+    resolved = (1.0 - unresolved) * at_most(at_least(rest, -most), most)
+    lobe = _face(region, level + resolved, ior, normals, modes)
+    return lobe + unresolved * jnp.diag(at_least(rest, -level))
 
 
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:

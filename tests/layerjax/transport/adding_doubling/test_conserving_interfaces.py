@@ -32,9 +32,9 @@ def test_what_crosses_is_what_the_walk_counts(ior, alpha):
 
 ENDS = {
     "smooth in dense, on the dense side": ([(2.0, 0.002)], 1e-3),
-    "hazy varnish": ([(3.027, 0.00137), 0.9], 1e-3),
+    "hazy varnish": ([(3.027, 0.00137), 0.9], 1e-9),
     "hardly there, peaked back, steps down": ([(1.0001, 0.01), -0.999, (0.25, 1e-4)], 2e-2),
-    "steps down, rough": ([(0.25, 1.0), 0.0], 5e-3),
+    "steps down, rough": ([(0.25, 1.0), 0.0], 1e-9),
 }
 """Interfaces (index, alpha) and media of depth 1 with this g, and by how much lossless energy is off at most."""
 

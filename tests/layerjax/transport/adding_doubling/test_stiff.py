@@ -1,0 +1,75 @@
+"""Stiff and extreme stacks: lossless ones keep all energy, and many layers stay finite with their derivatives."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+
+SOLVER = lj.AddingDoubling(nodes=12, modes=1, microfacets="multiple")
+ANGLES = jnp.concatenate([polar := jnp.linspace(0.0, 1.56, 9), np.pi - polar])
+
+WEAK = (1.2, 0.25)
+"""Indices at which a node beside the critical angle reflects too little for all it lacks to be put on that: see
+`interfaces.STRONG`."""
+
+
+@jax.jit
+def missing(ior, alpha, below, thickness, g):
+    """Energy that a lossless slab loses or gains, for light from either side."""
+    medium = lj.Medium(thickness, jnp.ones_like(thickness), lj.HenyeyGreenstein(g))
+    stack = lj.Stack([lj.Interface(ior, alpha), medium, lj.Interface(below, alpha)])
+    reflected, transmitted = lj.albedo(stack, lj.direction(ANGLES, 0.2), SOLVER)
+    return jnp.max(jnp.abs(reflected + transmitted - 1.0))
+
+
+@pytest.mark.parametrize("alpha", [1e-4, 0.02, 0.1, 0.3, 1.0])
+def test_lossless_slabs_keep_their_energy(alpha):
+    """Of everything that nodes let pass too little or too much nothing is lost: 1e-12, and 6e-6 next to an
+    index of 1, where what is turned back is known to a table's rounding."""
+    for ior, below in ((1.5, 1.0), (4.0, 1.0), (1.5, 1.5 + 1e-7), (1.0 + 1e-7, 1.0), (1.0 - 1e-7, 1.0), (1.0, 1.0)):
+        assert missing(ior, alpha, below, 1.0, 0.3) < 1e-5, (ior, below)
+    for ior in WEAK:
+        assert missing(ior, alpha, 1.0, 1.0, 0.3) < 1e-3, ior
+
+
+def test_lossless_media_in_a_slab_keep_their_energy():
+    for thickness, g in itertools.product((1e-8, 1.0, 1e4), (-0.999, 0.0, 0.999)):
+        assert missing(1.5, 0.3, 1.0, thickness, g) < 1e-6, (thickness, g)
+
+
+@pytest.mark.slow
+def test_twelve_layers():
+    """Extreme ones upon one another: finite values and gradients, and no energy from nowhere."""
+    numbers = jnp.asarray([1.5, 1e-4, 1e4, 0.25, 1.0, 1e-8, 4.0, 0.1, 1.0, 1.0 + 1e-7, 0.5, 1e-3])
+    peaks = jnp.asarray([0.999, -0.999, 0.0, 0.5, 0.9, -0.5])
+
+    def stack(numbers, peaks):
+        layers = []
+        for k in range(6):
+            ior, alpha = (numbers[(3 * k) % 12], numbers[(3 * k + 1) % 12]) if k % 2 == 0 else (1.3, 0.2)
+            layers.append(lj.Interface(jnp.clip(ior, 0.25, 4.0), jnp.clip(alpha, 1e-4, 1.0)))
+            layers.append(lj.Medium(numbers[(3 * k + 2) % 12], 1.0, lj.HenyeyGreenstein(peaks[k])))
+        return lj.Stack(layers, lj.Lambertian(1.0))
+
+    solver = lj.AddingDoubling(nodes=6, modes=4, microfacets="multiple")
+    wi, wo = lj.direction(jnp.asarray([0.0, 0.7, 1.5]), 0.0), lj.direction(jnp.asarray([0.1, 0.7, 1.4]), 2.0)
+
+    @jax.jit
+    def both(numbers, peaks):
+        def total(numbers, peaks):
+            values = lj.evaluate(stack(numbers, peaks), wi, wo, solver)
+            return jnp.sum(values), values
+
+        return jax.grad(total, (0, 1), has_aux=True)(numbers, peaks)
+
+    slopes, values = both(numbers, peaks)
+    assert np.isfinite(values).all()
+    assert (np.asarray(values) >= 0).all()
+    for slope in slopes:
+        assert np.isfinite(slope).all()
+    reflected, _ = lj.albedo(stack(numbers, peaks), wi, solver)
+    assert np.all(np.asarray(reflected) < 1.0 + 1e-3)
