@@ -79,7 +79,10 @@ class PhaseFunction(eqx.Module):
 
     @property
     def onward_width(self) -> Parameter:
-        """The same of the peak that may go straight on, for whoever looks through the medium; 1 while g is traced."""
+        """About the angle, in radians and up to 1, within which a peak that goes straight on falls off.
+
+        It counts where one looks through the medium, beside `width`; 1 where it is not known while tracing.
+        """
         return 1.0
 
     @property

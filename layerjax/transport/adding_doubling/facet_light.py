@@ -38,6 +38,7 @@ def facet_energies(near: Region, far: Region, normals: Normals) -> tuple[Array, 
     """Of light from every near node: the energy that facets reflect, that they refract, and that masking takes."""
     reflected = reflected_energy(near, far.ior / near.ior, normals)
     _, passed = refracted_rays(near, far.ior / near.ior, normals, ENERGY_POINTS)
+    # by quadrature it may be a little more than there is
     refracted = at_most(jnp.sum(passed, axis=-1), 1.0 - reflected)
     return reflected, refracted, jnp.where(near.exists, 1.0 - reflected - refracted, 0.0)
 

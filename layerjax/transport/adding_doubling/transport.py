@@ -83,7 +83,7 @@ class AddingDoubling(DeterministicTransport):
             and at the ends of the box (index 0.25 or 1.0001, light within a degree of grazing) to 2 %.
 
     Raises:
-        ValueError: an option is out of its range; or `tolerance` cannot be reached, or is used while tracing.
+        ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.
     """
 
     uses_known: ClassVar[bool] = True
