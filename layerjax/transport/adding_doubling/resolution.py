@@ -79,6 +79,8 @@ def chosen(stack: Stack, followed: bool) -> Resolution:
     """
     nodes, modes = map(float, FOLLOWED if followed else READ)
     for width, index in _lobes(stack):
+        if width >= 1.0:  # broad: smooth at any resolution
+            continue
         cosine = max(LEAST_COSINE, math.sqrt(max(0.0, 1.0 - 1.0 / index**2)))
         nodes = max(nodes, NODES / (width * cosine))
         modes = max(modes, MODES / (width * cosine * index))

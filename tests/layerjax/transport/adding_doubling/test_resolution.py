@@ -27,6 +27,7 @@ def flakes(alpha):
         (lj.Stack([FACE, lj.Medium(1.0, 0.0, lj.SGGX("surface", 0.1))], PAINT), True, 6),
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, FINEST[0]),
         (lj.Stack([lj.Interface(1.1, 0.05)], lj.Conductor(0.4, 3.0, 0.5)), True, 12),
+        (lj.Stack([lj.Interface(1.1, 0.05), lj.Medium(1.0, 0.9)], PAINT), True, 6),
         (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 12),
         (lj.Stack([FACE, HAZE, lj.Interface(1.0, 0.6)]), True, 24),
         (lj.Stack([FACE, lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(-0.9))], PAINT), True, 24),

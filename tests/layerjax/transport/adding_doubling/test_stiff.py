@@ -16,6 +16,9 @@ WEAK = (1.2, 0.25)
 """Indices at which a node beside the critical angle reflects too little for all it lacks to be put on that: see
 `interfaces.STRONG`."""
 
+COARSE = 5e-3
+"""Energy that 6 nodes may lose: 2.5e-3 go at 4 over 1 with alpha 0.3, where the most grazing node passes too much."""
+
 
 @jax.jit
 def missing(ior, alpha, below, thickness, g):
@@ -43,33 +46,35 @@ def test_lossless_media_in_a_slab_keep_their_energy():
 
 @pytest.mark.slow
 def test_twelve_layers():
-    """Extreme ones upon one another: finite values and gradients, and no energy from nowhere."""
-    numbers = jnp.asarray([1.5, 1e-4, 1e4, 0.25, 1.0, 1e-8, 4.0, 0.1, 1.0, 1.0 + 1e-7, 0.5, 1e-3])
+    """Extreme ones upon one another: finite values and gradients, and all energy is kept."""
+    iors = jnp.asarray([1.5, 4.0, 1.5, 1.5 + 1e-7, 4.0, 1.0])
+    alphas = jnp.asarray([1e-4, 0.1, 1.0, 0.2, 1e-3, 0.3])
+    thicknesses = jnp.asarray([1e4, 1e-8, 1.0, 1e-3, 0.0, 10.0])
     peaks = jnp.asarray([0.999, -0.999, 0.0, 0.5, 0.9, -0.5])
+    given = (iors, alphas, thicknesses, peaks)
 
-    def stack(numbers, peaks):
+    def stack(iors, alphas, thicknesses, peaks):
         layers = []
         for k in range(6):
-            ior, alpha = (numbers[(3 * k) % 12], numbers[(3 * k + 1) % 12]) if k % 2 == 0 else (1.3, 0.2)
-            layers.append(lj.Interface(jnp.clip(ior, 0.25, 4.0), jnp.clip(alpha, 1e-4, 1.0)))
-            layers.append(lj.Medium(numbers[(3 * k + 2) % 12], 1.0, lj.HenyeyGreenstein(peaks[k])))
+            layers.append(lj.Interface(iors[k], alphas[k]))
+            layers.append(lj.Medium(thicknesses[k], jnp.ones(()), lj.HenyeyGreenstein(peaks[k])))
         return lj.Stack(layers, lj.Lambertian(1.0))
 
     solver = lj.AddingDoubling(nodes=6, modes=4, microfacets="multiple")
     wi, wo = lj.direction(jnp.asarray([0.0, 0.7, 1.5]), 0.0), lj.direction(jnp.asarray([0.1, 0.7, 1.4]), 2.0)
 
     @jax.jit
-    def both(numbers, peaks):
-        def total(numbers, peaks):
-            values = lj.evaluate(stack(numbers, peaks), wi, wo, solver)
+    def both(*given):
+        def total(*given):
+            values = lj.evaluate(stack(*given), wi, wo, solver)
             return jnp.sum(values), values
 
-        return jax.grad(total, (0, 1), has_aux=True)(numbers, peaks)
+        return jax.grad(total, (0, 1, 2, 3), has_aux=True)(*given)
 
-    slopes, values = both(numbers, peaks)
+    slopes, values = both(*given)
     assert np.isfinite(values).all()
     assert (np.asarray(values) >= 0).all()
     for slope in slopes:
         assert np.isfinite(slope).all()
-    reflected, _ = lj.albedo(stack(numbers, peaks), wi, solver)
-    assert np.all(np.asarray(reflected) < 1.0 + 1e-3)
+    reflected, _ = jax.jit(lambda *given: lj.albedo(stack(*given), wi, solver))(*given)
+    np.testing.assert_allclose(reflected, 1.0, atol=COARSE)
