@@ -26,8 +26,9 @@ from layerjax.transport.adding_doubling.facet_light import (
     refracted_rays,
 )
 from layerjax.transport.adding_doubling.grid import Grid, Region, joined, spread
+from layerjax.transport.adding_doubling.inverse import inverse
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import BALANCING, cosines, modes_at_nodes, scaled_to_energy
+from layerjax.transport.adding_doubling.sampling import cosines, modes_at_nodes, scaled_to_energy
 
 STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
@@ -41,12 +42,11 @@ AT_ONCE = 1 << 20
 ROUNDED = 0.01
 """Times the root of the precision: a share of energy below it is only what rounding leaves of tables."""
 
-AGREEING, RESOLVED, MOST_OFF = 0.3, 0.2, 50.0
-"""Energies of light deposited on nodes are put right where they are off by a share that is well below the first.
+RESOLVED = 0.2
+"""Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
-It grows with the width of the lobe in distances between nodes, alpha times their number, above the second: what nodes
-resolve is wrong only where little light passes. More times wrong than the third is only what rounding leaves.
-"""
+LITTLE, RIDGE, TINY = 0.01, 1e-6, 1e-18
+"""Of a typical flux, what counts as none of it; of an energy, what may be missing where nothing can be put right."""
 
 
 def interface_layer(
@@ -99,7 +99,7 @@ def _operators(
     inside, up, lost_inside = facet_energies(far, near, normals)
     unresolved = 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
     through = _deposit(grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes)
-    through = _balanced(through, near, far, down, up, AGREEING / unresolved)
+    through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
     outer = None
     if not asked:
@@ -179,25 +179,46 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)
 
 
-def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array, agreeing: Array) -> Array:
-    """Deposited flux, scaled towards passing the energy `down` of light from near nodes, and its adjoint `up` from far
-    ones.
+def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) -> Array:
+    """Deposited flux F, changed least so that it passes the energy `down` of light from near nodes, and its adjoint
+    `up` from far ones.
 
-    Both are known by quadrature at the nodes. Where nodes do not resolve what happens between them (next to a critical
-    angle, on a smooth interface) the two do not agree: there it is left as it is deposited.
+    Polynomials put negative energies on some nodes, too, so that factors could be of any size. What is added goes with
+    the size of what is there, F_ij + |F_ij| (a_i + b_j), all modes alike: a and b solve a symmetric positive system.
     """
-    into, out = jnp.ones_like(down), jnp.ones_like(up)
-    for _ in range(BALANCING):
-        out = _scale(up * far.weight, flux[0] @ (near.weight * into), agreeing)
-        into = _scale(down, out @ flux[0], 10.0 * agreeing)  # it is deposited with the right energy
-    return out[:, None] * flux * into
+    up = up * far.weight
+    typical = safe_div(jnp.outer(up, down), jnp.sum(up))
+    sign = flux[0] / safe_sqrt(flux[0] ** 2 + at_least(LITTLE * typical, TINY) ** 2)  # without a step
+    size = flux[0] * sign
+    crossing = size * near.weight
+    ridge = max(RIDGE, np.sqrt(jnp.finfo(size.dtype).eps))
+    rows = at_least(jnp.sum(crossing, axis=1) + ridge * up, TINY)
+    columns = jnp.sum(crossing, axis=0) + ridge * down * near.weight
+    lack = up - flux[0] @ near.weight
+    # rows are eliminated: columns alone are left
+    wanted = (down - jnp.sum(flux[0], axis=0)) * near.weight - (lack / rows) @ crossing
+    schur = jnp.diag(jnp.where(columns > 0, columns, 1.0)) - crossing.T @ (crossing / rows[:, None])
+    a = (lack - crossing @ (inverse(schur) @ wanted)) / rows
+    # directions of no weight, too, are to pass the right energy
+    b = safe_div(down - jnp.sum(flux[0] + size * a[:, None], axis=0), jnp.sum(size, axis=0))
+    return flux * (1.0 + sign * (a[:, None] + b))
 
 
-def _scale(wanted: Array, found: Array, agreeing: Array) -> Array:
-    """Their quotient; it fades to 1 where they differ by a share as large as `agreeing`."""
-    near = (found > 0.0) & (wanted < MOST_OFF * found) & (found < MOST_OFF * wanted)
-    excess = jnp.where(near, (wanted - found) / jnp.where(near, found, 1.0), 0.0)
-    return 1.0 + excess * jnp.exp(-((excess / agreeing) ** 2))
+def _agreed(
+    near: Region, far: Region, energies: tuple[Array, Array], reflected: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """Energies that pass both ways, made equal in total: the rest counts as reflected, where much is."""
+    down, up = energies
+    rest = up @ far.weight - down @ near.weight
+    most = [_most(level) for level in reflected]
+    whole = most[0] @ near.weight + most[1] @ far.weight
+    step = safe_div(rest, at_least(whole, jnp.abs(rest)))
+    return down + step * most[0], up - step * most[1]
+
+
+def _most(level: Array) -> Array:
+    """By how much what is reflected may be changed: a weak reflection by a small share alone."""
+    return level * at_most(STRONG * level, 1.0)
 
 
 def _reflection(
@@ -208,7 +229,7 @@ def _reflection(
     Of an interface that they do not resolve it is reflected like by a mirror, else with the lobe: a weak one is left as
     it is, and may change by a larger share the stronger it is.
     """
-    most = level * at_most(STRONG * level, 1.0)
+    most = _most(level)
     resolved = (1.0 - unresolved) * at_most(at_least(rest, -most), most)
     lobe = _face(region, level + resolved, ior, normals, modes)
     return lobe + unresolved * jnp.diag(at_least(rest, -level))

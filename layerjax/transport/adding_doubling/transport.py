@@ -79,8 +79,8 @@ class AddingDoubling(DeterministicTransport):
             the base.
         microfacets: ``"single"``, Walter 2007: light that a facet sends into another is lost; or ``"multiple"``: it is
             given back diffusely, so that interfaces conserve energy (after Kulla & Conty 2017): lossless stacks return
-            what meets them to 1e-9 as a rule, to 1e-3 where an index of 1.3 or less has nodes beside a critical angle,
-            and at the ends of the box (index 0.25 or 1.0001, light within a degree of grazing) to 2 %.
+            what meets them to 1e-9 as a rule, next to an index of 1 to 1e-5, and with 6 nodes at an index of 0.25 or
+            1.05 to 4e-3.
 
     Raises:
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.

@@ -11,11 +11,11 @@ SOLVER = lj.AddingDoubling(nodes=24, modes=1, microfacets="multiple")
 
 
 def test_energy_from_the_denser_side():
-    """Index 2, roughness 0.3: nothing is lost, at the critical angle (30 degrees) neither; 1e-3 is what facets err."""
+    """Index 2, roughness 0.3: nothing is lost, at the critical angle (30 degrees) neither."""
     angle = np.radians([0.0, 10.0, 29.9, 30.0, 30.1, 35.0, 60.0, 85.0])
     inside = lj.direction(np.pi - angle, 0.0)
     reflected, transmitted = lj.albedo(lj.Stack([lj.Interface(2.0, 0.3)]), inside, SOLVER)
-    np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-3)
+    np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("ior", "alpha"), [(1.5, 0.1), (1.5, 0.6)])
@@ -31,9 +31,9 @@ def test_what_crosses_is_what_the_walk_counts(ior, alpha):
 
 
 ENDS = {
-    "smooth in dense, on the dense side": ([(2.0, 0.002)], 1e-3),
+    "smooth in dense, on the dense side": ([(2.0, 0.002)], 1e-9),
     "hazy varnish": ([(3.027, 0.00137), 0.9], 1e-9),
-    "hardly there, peaked back, steps down": ([(1.0001, 0.01), -0.999, (0.25, 1e-4)], 2e-2),
+    "hardly there, peaked back, steps down": ([(1.0001, 0.01), -0.999, (0.25, 1e-4)], 1e-5),
     "steps down, rough": ([(0.25, 1.0), 0.0], 1e-9),
 }
 """Interfaces (index, alpha) and media of depth 1 with this g, and by how much lossless energy is off at most."""

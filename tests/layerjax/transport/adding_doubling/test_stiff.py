@@ -12,10 +12,6 @@ import layerjax as lj
 SOLVER = lj.AddingDoubling(nodes=12, modes=1, microfacets="multiple")
 ANGLES = jnp.concatenate([polar := jnp.linspace(0.0, 1.56, 9), np.pi - polar])
 
-WEAK = (1.2, 0.25)
-"""Indices at which a node beside the critical angle reflects too little for all it lacks to be put on that: see
-`interfaces.STRONG`."""
-
 COARSE = 5e-3
 """Energy that 6 nodes may lose: 2.5e-3 go at 4 over 1 with alpha 0.3, where the most grazing node passes too much."""
 
@@ -31,12 +27,12 @@ def missing(ior, alpha, below, thickness, g):
 
 @pytest.mark.parametrize("alpha", [1e-4, 0.02, 0.1, 0.3, 1.0])
 def test_lossless_slabs_keep_their_energy(alpha):
-    """Of everything that nodes let pass too little or too much nothing is lost: 1e-12, and 6e-6 next to an
-    index of 1, where what is turned back is known to a table's rounding."""
-    for ior, below in ((1.5, 1.0), (4.0, 1.0), (1.5, 1.5 + 1e-7), (1.0 + 1e-7, 1.0), (1.0 - 1e-7, 1.0), (1.0, 1.0)):
+    """Rounding alone is lost: 1e-12, 4e-8 of the finest roughness, and 6e-6 next to an index of 1, where what is
+    turned back is known to a table's rounding."""
+    for ior, below in ((1.5, 1.0), (4.0, 1.0), (4.0, 1.5), (1.2, 1.0), (1.05, 1.0), (0.5, 1.0), (0.25, 1.0)):
+        assert missing(ior, alpha, below, 1.0, 0.3) < 1e-6, (ior, below)
+    for ior, below in ((1.5, 1.5 + 1e-7), (1.0 + 1e-7, 1.0), (1.0 - 1e-7, 1.0), (1.0, 1.0)):
         assert missing(ior, alpha, below, 1.0, 0.3) < 1e-5, (ior, below)
-    for ior in WEAK:
-        assert missing(ior, alpha, 1.0, 1.0, 0.3) < 1e-3, ior
 
 
 def test_lossless_media_in_a_slab_keep_their_energy():
