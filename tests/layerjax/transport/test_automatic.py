@@ -53,13 +53,8 @@ NEAR = {
 }
 
 
-GRAZING = pytest.mark.xfail(
-    strict=True, reason="6 % at the mirror direction of 75 degrees: light reflected by two flakes"
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(name, marks=GRAZING if name == "flakes" else ()) for name in NEAR])
+@pytest.mark.parametrize("name", NEAR)
 def test_it_is_within_a_hundredth_of_all_orders(name):
     stack = NEAR[name]
     theta, phi = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0])

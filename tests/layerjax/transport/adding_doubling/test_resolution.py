@@ -39,6 +39,13 @@ def test_narrow_lobes_behind_others_decide(stack, followed, least):
     assert found.modes >= found.nodes
 
 
+def test_bare_media_need_modes_rather_than_nodes():
+    """Light inclined to grazing sees lobes that are narrow in azimuth; a varnish keeps it away from there."""
+    bare, coated = (chosen(lj.Stack([*above, flakes(0.2)], PAINT), followed=False) for above in ((), (FACE,)))
+    assert bare.nodes == coated.nodes
+    assert bare.modes > 2 * coated.modes
+
+
 def test_traced_lobes_count_as_rather_narrow():
     def nodes(alpha):
         return chosen(lj.Stack([FACE], lj.Conductor(0.4, 3.0, alpha)), followed=True).nodes
