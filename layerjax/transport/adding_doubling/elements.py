@@ -18,7 +18,7 @@ from jax.custom_derivatives import SymbolicZero
 
 Scalars = tuple[Array, ...]
 
-MOST_SCALARS = 12
+MOST_SCALARS = 10
 """An element of more numbers is differentiated like anything else."""
 
 
