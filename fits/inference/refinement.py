@@ -20,6 +20,9 @@ from fits.progress import Progress
 ALIKE = 0.01
 """Of the box: ends that are closer in every parameter are fitted again as one."""
 
+SLIGHT = 0.5 * ENOUGH
+"""An error of nodes or of modes that is left where the other is what has to be finer."""
+
 MOST_MINIMA = 8
 """Minima that are fitted again, at most, other than those that turn out to be the best."""
 
@@ -61,7 +64,9 @@ def _needed(
         return own, error(known.coarser(own), own), True
     found = error(own, finer)
     while known.open and found > ENOUGH:
-        own, finer = finer, known.finer(finer)
+        parts = known.partly_finer(own, finer)
+        own = next((part for part in parts if error(part, finer) <= SLIGHT), finer)
+        finer = known.finer(own)
         if finer is None:
             return own, found, True
         found = error(own, finer)

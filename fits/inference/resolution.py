@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADDER, is_tilted
+from layerjax.transport.adding_doubling.resolution import FINEST, LADDER, ORDINATES_LADDER, is_tilted
 
 ENOUGH = 0.1
 """Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
@@ -24,7 +24,7 @@ ENOUGH = 0.1
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
 """The finest resolution of starts: what is finer costs more than it tells far away from the data."""
 
-FINEST_NODES, FINEST_COSINES = FINEST[0], ORDINATES_LADDER[-1][0]
+FINEST_NODES, FINEST_MODES, FINEST_COSINES = FINEST[0], LADDER[-1][1], ORDINATES_LADDER[-1][0]
 """What is chosen at most."""
 
 LEAST_SCATTER = 0.01
@@ -62,9 +62,23 @@ class Resolutions:
     def finer(self, transport: lj.AddingDoubling) -> lj.AddingDoubling | None:
         """The next one; None beyond the finest that is chosen."""
         finer = self._as_given(transport.finer())
-        if self._size(finer) > (FINEST_COSINES if self.tilted else FINEST_NODES) or finer == transport:
+        if self.open and not self.tilted:  # what is as fine as it gets stays, the other goes on
+            nodes, modes = transport.nodes or 0, transport.modes or 0
+            finer = replace(
+                transport,
+                nodes=max(nodes, min(finer.nodes or 0, FINEST_NODES)),
+                modes=max(modes, min(finer.modes or 0, FINEST_MODES)),
+            )
+        elif self._size(finer) > (FINEST_COSINES if self.tilted else FINEST_NODES):
             return None
-        return finer
+        return None if finer == transport else finer
+
+    def partly_finer(self, transport: lj.AddingDoubling, finer: lj.AddingDoubling) -> list[lj.AddingDoubling]:
+        """Those between the two: as fine as the second in modes alone, which cost less, and in nodes alone."""
+        if self.tilted:
+            return []
+        parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
+        return [part for part in parts if part not in (transport, finer)]
 
     def coarser(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
         """The one before."""

@@ -9,6 +9,7 @@ import pytest
 import layerjax as lj
 from fits._files import read_json, write_json
 from fits.data.geometry import slices
+from fits.inference import refinement
 from fits.inference import resolution as resolution_module
 from fits.inference import starts as starts_module
 from fits.inference.fit_result import Fit
@@ -88,6 +89,7 @@ def test_a_resolution_that_is_given_stays_and_its_error_is_told(sharp):
 
 def test_the_finest_resolution_is_told(sharp, monkeypatch):
     monkeypatch.setattr(resolution_module, "FINEST_NODES", 6)
+    monkeypatch.setattr(resolution_module, "FINEST_MODES", 12)
     found = fit(STACK, sharp, starts=1)
     assert found.problem.transport == COARSE
     assert re.search(r"up to .* sigma at 6 nodes, 12 modes, the finest tried", found.status)
@@ -149,6 +151,34 @@ def test_what_auto_is_does_not_follow_from_the_start():
     assert passing.chosen.nodes > passing.far.nodes == resolution_module.FAR["nodes"]
     bare = lj.Stack([lj.Medium(thickness=Free(0.0, 0.0, 1.0), albedo=0.0)], base=lj.Lambertian(albedo=0.5))
     assert resolutions(Problem(bare, data)) is None
+
+
+def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
+    """And nodes where modes will do; what is as fine as it gets stays."""
+    here = lj.AddingDoubling(nodes=12, modes=18, ordinates=(6, 8))
+    known = resolution_module.Resolutions(lj.AddingDoubling(), here, tilted=False)
+    finer = known.finer(here)
+    assert known.in_words(finer) == "16 nodes, 24 modes"
+    assert list(map(known.in_words, known.partly_finer(here, finer))) == ["12 nodes, 24 modes", "16 nodes, 18 modes"]
+    monkeypatch.setattr(resolution_module, "FINEST_NODES", 12)
+    only = known.finer(here)
+    assert known.in_words(only) == "12 nodes, 24 modes"
+    assert known.partly_finer(here, only) == []
+
+    class Alike(refinement.Values):
+        """Nodes change nothing, modes all."""
+
+        def __init__(self):
+            self._known = {}
+
+        def error(self, transport, other):
+            return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
+
+    monkeypatch.undo()
+    needed, error, finest = refinement._needed(known, here, Alike(), lambda *_: None)
+    assert (needed.nodes, finest) == (12, False)
+    assert needed.modes > 30
+    assert error <= ENOUGH
 
 
 def test_what_is_given_in_part_stays():
