@@ -92,18 +92,13 @@ def parts(name, dtype):
     return [np.asarray(part, float) for part in ALL[name](dtype)]
 
 
-NOISY = {"Statistical: hazy varnish, float32"}
-"""Gradients that rounding alone moves by some percent: another compiler gives others. Values are compared."""
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", ROUNDING)
 @pytest.mark.parametrize("name", ALL)
 def test_values_stay(name, dtype):
     key = f"{name}, {dtype}"
     stored = json.loads(FILE.read_text())[key]
-    compared = slice(1) if key in NOISY else slice(None)
-    for found, before in zip(parts(name, dtype)[compared], stored[compared], strict=True):
+    for found, before in zip(parts(name, dtype), stored, strict=True):
         np.testing.assert_allclose(found, before, rtol=0, atol=ROUNDING[dtype] * np.abs(before).max())
 
 
