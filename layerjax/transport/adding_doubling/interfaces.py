@@ -199,9 +199,10 @@ def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) ->
     wanted = (down - jnp.sum(flux[0], axis=0)) * near.weight - (lack / rows) @ crossing
     schur = jnp.diag(jnp.where(columns > 0, columns, 1.0)) - crossing.T @ (crossing / rows[:, None])
     a = (lack - crossing @ (inverse(schur) @ wanted)) / rows
-    # directions of no weight, too, are to pass the right energy
-    b = safe_div(down - jnp.sum(flux[0] + size * a[:, None], axis=0), jnp.sum(size, axis=0))
-    return flux * (1.0 + sign * (a[:, None] + b))
+    # only a_i + b_j of nodes that exchange light is known: directions of no weight have a b alone
+    of_nodes = jnp.where(near.weight > 0, a[:, None], 0.0)
+    b = safe_div(down - jnp.sum(flux[0] + size * of_nodes, axis=0), jnp.sum(size, axis=0))
+    return flux * (1.0 + sign * (of_nodes + b))
 
 
 def _agreed(
