@@ -46,7 +46,8 @@ RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
 LITTLE, RIDGE, TINY = 0.01, 1e-6, 1e-18
-"""Of a typical flux, what counts as none of it; of an energy, what may be missing where nothing can be put right."""
+"""Of a typical flux, what counts as none of it; of an energy, what may be missing where nothing can be put right (in
+single precision the root of its epsilon); and what keeps quotients finite, whose square is not 0 there either."""
 
 
 def interface_layer(

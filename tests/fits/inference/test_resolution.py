@@ -154,7 +154,7 @@ def test_what_auto_is_does_not_follow_from_the_start():
 
 
 def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
-    """And nodes where modes will do; what is as fine as it gets stays."""
+    """What is as fine as it gets stays, and the other goes on."""
     here = lj.AddingDoubling(nodes=12, modes=18, ordinates=(6, 8))
     known = resolution_module.Resolutions(lj.AddingDoubling(), here, tilted=False)
     finer = known.finer(here)
@@ -166,7 +166,7 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert known.partly_finer(here, only) == []
 
     class Alike(refinement.Values):
-        """Nodes change nothing, modes all."""
+        """A model that nodes change nothing of: its error falls with the modes."""
 
         def __init__(self):
             self._known = {}
