@@ -12,12 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._batching import by_rows
 from layerjax._numerics import at_least, safe_div
 from layerjax.directions import Vector
 from layerjax.transport.adding_doubling.grid import Region
 
 LEAST_SAMPLES = 96
 """Azimuths, over half a turn, at which a kernel is sampled at least."""
+
+AT_ONCE = 1 << 18
+"""Numbers that an array of kernels at azimuths holds at most."""
 
 UNROLLED = 8
 """Up to so many modes in a row, more in a loop."""
@@ -38,11 +42,17 @@ def modes_at_nodes(
     dtype = into.cosine.dtype
     cosines = jnp.asarray(np.cos(np.outer(phi, np.arange(modes))) / samples, dtype)
     mu_i, sin_i = into.cosine[None, :, None], into.sine[None, :, None]
-    mu_o, sin_o = out.cosine[:, None, None], out.sine[:, None, None]
     wi: Vector = (-sin_i, jnp.zeros_like(mu_i), mu_i)
-    wo: Vector = (sin_o * jnp.asarray(np.cos(phi), dtype), sin_o * jnp.asarray(np.sin(phi), dtype), mu_o)
-    shape = (out.cosine.shape[0], into.cosine.shape[0], samples)
-    return [jnp.moveaxis(jnp.broadcast_to(value, shape) @ cosines, -1, 0) for value in function(wi, wo)]
+
+    def of_rows(rows: tuple[Array, Array]) -> list[Array]:
+        mu_o, sin_o = (row[:, None, None] for row in rows)
+        wo: Vector = (sin_o * jnp.asarray(np.cos(phi), dtype), sin_o * jnp.asarray(np.sin(phi), dtype), mu_o)
+        shape = (mu_o.shape[0], mu_i.shape[1], samples)
+        return [jnp.broadcast_to(value, shape) @ cosines for value in function(wi, wo)]
+
+    chunks = out.cosine.size * into.cosine.size * samples // AT_ONCE
+    rows = out.cosine, out.sine
+    return [jnp.moveaxis(found, -1, 0) for found in (by_rows(of_rows, rows, chunks) if chunks > 1 else of_rows(rows))]
 
 
 def cosines(x: Array, count: int) -> Array:

@@ -4,7 +4,9 @@ Layers that are symmetric about the normal are solved as Fourier modes. Where a 
 below it is turned into ordinates first, and so is every layer on top.
 """
 
+from collections import defaultdict
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import equinox as eqx
@@ -19,15 +21,18 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
-from layerjax.transport.adding_doubling.elements import element
+from layerjax.transport.adding_doubling.elements import Scalars, element
 from layerjax.transport.adding_doubling.facet_light import Normals
-from layerjax.transport.adding_doubling.grid import Grid, make_grid
+from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
 from layerjax.transport.adding_doubling.straight import without_straight
 from layerjax.transport.known_directions import KnownDirections
+
+MANY = 3
+"""Interfaces of a kind from which on they share a program."""
 
 
 class Plan(eqx.Module):
@@ -60,17 +65,12 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
     dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
     indices = tuple(jnp.asarray(n, dtype) for n in (1.0, *(layer.ior for layer in interfaces)))
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
+    faces = _interfaces(stack, plan, indices, asked)
     solved: list[tuple[Layer, bool]] = []
     region, steps = 0, list(plan.steps)
-    for place, layer in enumerate(stack.layers):
+    for layer in stack.layers:
         if isinstance(layer, Interface):
-            leaves = stack.base is None and 1 < region + 1 == len(interfaces)
-            outside = None
-            if asked is not None and (place == 0 or leaves):
-                outside = asked.above if place == 0 else asked.below
-            diffuse = stack.base is not None and not isinstance(stack.base, Conductor)
-            build = partial(_interface, plan, region, layer.distribution, not leaves, diffuse, dtype)
-            solved.append((element(build, (indices, layer.alpha), outside, dtype), False))
+            solved.append((faces[region], False))
             region += 1
         else:
             tilted = plan.azimuths is not None and is_tilted(layer)
@@ -90,24 +90,68 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
     return grid, whole
 
 
+def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None) -> list[Layer]:
+    """Every interface of a stack as a layer. Many of a kind share one program, which is compiled once."""
+    interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    diffuse = stack.base is not None and not isinstance(stack.base, Conductor)
+    dtype = indices[0].dtype
+    found: dict[int, Layer] = {}
+    alike: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
+    for region, layer in enumerate(interfaces):
+        leaves = stack.base is None and 1 < region + 1 == len(interfaces)
+        if asked is not None and (layer is stack.layers[0] or leaves):
+            build = partial(_interface, plan, layer.distribution, not leaves, diffuse, dtype, region)
+            found[region] = element(build, (indices, layer.alpha), asked.below if leaves else asked.above, dtype)
+        else:
+            alike[layer.distribution, not leaves].append(region)
+    for kind, regions in alike.items():
+        alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
+        if len(regions) < MANY:
+            for region, alpha in zip(regions, alphas, strict=True):
+                build = partial(_interface, plan, *kind, diffuse, dtype, region)
+                found[region] = element(build, (indices, alpha), None, dtype)
+        else:
+            build = partial(_numbered_interface, plan, *kind, diffuse, dtype)
+            layers = jax.lax.map(
+                lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
+                (jnp.asarray(regions), jnp.stack(alphas)),
+            )
+            found.update((region, jax.tree.map(itemgetter(k), layers)) for k, region in enumerate(regions))
+    return [found[region] for region in range(len(interfaces))]
+
+
 def _interface(
     plan: Plan,
-    region: int,
     distribution: Distribution,
     enters: bool,
     diffuse: bool,
     dtype: Any,
+    region: int | Array,
     numbers: Any,
     asked: Array | None,
 ) -> Layer:
     indices, alpha = numbers
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
-    above, below = grid.regions[region], grid.regions[region + 1]
+    above, below = (_region(grid, place) for place in (region, region + 1))
     outside = None if asked is None else asked_region(asked, (above if enters else below).ior)
     normals = Normals(jnp.asarray(alpha, dtype), distribution)
     return interface_layer(
         grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, asked=outside, diffuse=diffuse
     )
+
+
+def _numbered_interface(
+    plan: Plan, distribution: Distribution, enters: bool, diffuse: bool, dtype: Any, numbers: Any, region: Array
+) -> Layer:
+    """That under a region whose number is traced."""
+    return _interface(plan, distribution, enters, diffuse, dtype, region, numbers, None)
+
+
+def _region(grid: Grid, place: int | Array) -> Region:
+    """Of the grid, by a place that may be traced."""
+    if isinstance(place, int):
+        return grid.regions[place]
+    return jax.tree.map(lambda *parts: jnp.stack(parts)[place], *grid.regions)
 
 
 def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, numbers: Any, _: None) -> Kernel:

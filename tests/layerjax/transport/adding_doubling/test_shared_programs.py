@@ -1,0 +1,32 @@
+"""Interfaces that share a program are what they are with one each."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax.transport.adding_doubling import solve
+from layerjax.transport.adding_doubling.resolution import Resolution
+
+NUMBERS = jnp.asarray([1.5, 1.2, 1.7, 0.3, 0.2, 0.5])
+
+
+def operators(numbers):
+    """Of three interfaces over paint."""
+    layers = [lj.Interface(numbers[k], numbers[3 + k]) for k in range(3)]
+    stack = lj.Stack(layers, lj.Lambertian(0.5))
+    return solve.solve(stack, solve.make_plan(stack, Resolution(2, 1, (2, 4)), "single"))[1]
+
+
+def slopes(numbers):
+    return jax.jvp(operators, (numbers,), (jnp.ones_like(numbers),))[1]
+
+
+@pytest.mark.parametrize("function", [operators, pytest.param(slopes, marks=pytest.mark.slow)])
+def test_many_interfaces_are_what_each_is_alone(function, monkeypatch):
+    shared = jax.jit(lambda numbers: function(numbers))(NUMBERS)
+    monkeypatch.setattr(solve, "MANY", 99)
+    alone = jax.jit(lambda numbers: function(numbers))(NUMBERS)
+    for found, expected in zip(jax.tree.leaves(shared), jax.tree.leaves(alone), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
