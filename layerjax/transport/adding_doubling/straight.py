@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._batching import by_rows
-from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax._numerics import horizon, safe_sqrt
 from layerjax.channels import Channels, each, total
-from layerjax.directions import Vector, flip, select
+from layerjax.directions import Vector, flip, sanitised, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
 from layerjax.surfaces.interface import interface_transmission, is_straight
 from layerjax.transport.adding_doubling.asked import asked_region, turn
@@ -26,6 +26,9 @@ POINTS = (16, 12)
 
 AT_ONCE = 1 << 19
 """Rays that are followed together."""
+
+TINY = 1e-18
+"""1/sr: of two lobes that are less the weights do not matter; their squares are none in single precision."""
 
 
 class Straight(eqx.Module):
@@ -136,19 +139,20 @@ def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -
     delta_i, delta_o = is_straight(inner), is_straight(inner / below)
     (x, y, z), share = _rays(cosine_i, inner, faces[0])
     g_i, g_o, passed = parts(x, y, z)
-    counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, safe_div(g_i, g_i + g_o)))
+    counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, g_i / (g_i + g_o + TINY)))
     from_above = [jnp.sum(share * below**2 * g_o * counted * level, axis=-1) for level in passed]
     (x, y, z), share = _rays(cosine_o, inner / below, faces[1])
     # followed backwards, from where it leaves
     g_i, g_o, passed = parts(x * cos_phi - y * sin_phi, x * sin_phi + y * cos_phi, z)
-    counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, safe_div(g_o, g_i + g_o)))
+    counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, g_o / (g_i + g_o + TINY)))
     from_below = [jnp.sum(share * below**2 * g_i * counted * level, axis=-1) for level in passed]
     return total([from_above, from_below])
 
 
 def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:
     """Where facets refract light along (-sin, 0, cos) to, z counted on the far side, and its shares."""
-    (x, y, z), share = refracted_rays(asked_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
+    rays, share = refracted_rays(asked_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
+    x, y, z = sanitised(rays, rays[2] > 0)  # of rays back up, whose share is 0, masking has no meaning
 
     def both(part: Array, mirrored: Array) -> Array:  # shares stand for mirror images too
         return jnp.concatenate([part, mirrored], axis=-1)
