@@ -78,7 +78,8 @@ def picture(ranks: Mapping[str, Ranks]) -> Figure:
             edges = np.linspace(0, DRAWS + 1, len(counts) + 1)
             low, high = stats.binom.interval(BAND, len(found), 1 / len(counts))
             panel.stairs(counts, edges, fill=True, color=colour, alpha=0.75)
-            panel.axhspan(low, high, color=INK, alpha=0.15, linewidth=0)
+            for level in (low, high):
+                panel.axhline(level, color=INK, linewidth=0.8, linestyle="dashed")
             panel.axhline(len(found) / len(counts), color=INK, linewidth=0.8)
             panel.grid(visible=False)
             panel.set(title=label, xlim=(0, DRAWS + 1), ylim=(0, None))
