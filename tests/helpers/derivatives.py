@@ -86,31 +86,77 @@ class Point(NamedTuple):
     unbounded: bool
 
 
-def points_of(stack, fixed=None):
-    """Every parameter inside its range, exactly at both its ends, and where it is 0, 1 or the index beside it."""
-    found, place = [], 0
+class Field(NamedTuple):
+    """A parameter of a stack: path, place in the vector, value, and of which range it is (None: an axis)."""
+
+    path: str
+    place: int
+    value: np.ndarray
+    key: str | None
+    range: tuple[float, float]
+
+
+def fields_of(stack, fixed=None):
+    """Every parameter but the fixed one."""
+    place = 0
     for path, leaf in leaves_with_names(stack):
         owner = stack
         *parents, field = path.replace("]", "").replace("[", ".").split(".")
         for part in parents:
             owner = owner[int(part)] if part.isdigit() else getattr(owner, part)
         key = f"{type(owner).__name__}.{field}"
-        if path != fixed and key in RANGES:
-            vmf = field == "alpha" and getattr(owner, "distribution", "ggx") == "vmf"
-            low, high = RANGES[f"{key}, vmf" if vmf else key]
-            inside = float(leaf)
-            beside = (1.0, 1.5) if key == "Interface.ior" else ()
-            values = {low, high, inside, *beside, *(number for number in (0.0, 1.0) if low < number < high)}
-            for value in sorted(values):
-                sides = (-1.0,) if value == high else (1.0,) if value == low else (1.0, -1.0)
-                kinked = value in beside and (value == 1.0 or value != inside)
-                end = (key, value) in UNBOUNDED
-                found.append(Point(path, place, value, _length(field, value), sides, kinked, end))
-        elif path != fixed:  # an axis
-            for k, value in enumerate(np.ravel(leaf)):
-                found.append(Point(f"{path}[{k}]", place + k, float(value), 1.0, (1.0, -1.0), False, False))
+        vmf = field == "alpha" and getattr(owner, "distribution", "ggx") == "vmf"
+        bounds = RANGES.get(f"{key}, vmf" if vmf else key)
+        if path != fixed:
+            yield Field(path, place, np.asarray(leaf), key if bounds else None, bounds or (-1.0, 1.0))
         place += np.size(leaf)
-    return found
+
+
+def points_of(stack, fixed=None):
+    """Every parameter inside its range, exactly at both its ends, and where it is 0, 1 or the index beside it."""
+    found = []
+    for field in fields_of(stack, fixed):
+        if field.key is None:
+            for k, value in enumerate(np.ravel(field.value)):
+                found.append(Point(f"{field.path}[{k}]", field.place + k, float(value), 1.0, (1.0, -1.0), False, False))
+            continue
+        (low, high), inside = field.range, float(field.value)
+        beside = (1.0, 1.5) if field.key == "Interface.ior" else ()
+        values = {low, high, inside, *beside, *(number for number in (0.0, 1.0) if low < number < high)}
+        found += [_point(field, value, value in beside and (value == 1.0 or value != inside)) for value in values]
+    return sorted(found, key=lambda point: (point.place, point.value))
+
+
+def _point(field, value, kinked):
+    low, high = field.range
+    sides = (-1.0,) if value == high else (1.0,) if value == low else (1.0, -1.0)
+    length = _length(field.path.split(".")[-1], value)
+    return Point(field.path, field.place, value, length, sides, kinked, (field.key, value) in UNBOUNDED)
+
+
+def random_points(stack, fixed=None, count=17, ends=0.25):
+    """Stacks of one structure with random parameters all over their ranges, of which a share is exactly at an end, at
+    0, at 1 or at the index of what is outside: vectors, and a parameter of each to differentiate by."""
+    rng = np.random.default_rng(len(jax.tree.leaves(stack)))
+    fields = [field for field in fields_of(stack, fixed) if field.key is not None]
+    start = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(stack)])
+    for _ in range(count):
+        vector = start.copy()
+        for field in fields:
+            low, high = field.range
+            if rng.random() < ends:
+                vector[field.place] = rng.choice([low, high, *(n for n in (0.0, 1.0) if low < n < high)])
+            elif field.key.endswith((".alpha", ".ior")):
+                vector[field.place] = np.exp(rng.uniform(np.log(low), np.log(high)))
+            elif field.key.endswith(".thickness"):
+                vector[field.place] = 10.0 ** rng.uniform(-3.0, 2.0)
+            else:
+                vector[field.place] = rng.uniform(low, high)
+        chosen = fields[rng.integers(len(fields))]
+        indices = [1.0, *(vector[field.place] for field in fields if field.key == "Interface.ior")]
+        value = float(vector[chosen.place])
+        kinked = chosen.key == "Interface.ior" and indices.count(value) > 1
+        yield jnp.asarray(vector), _point(chosen, value, kinked)
 
 
 def _length(field, value):

@@ -10,7 +10,15 @@ import pytest
 
 import layerjax as lj
 from layerjax.stack import simplify_and_name
-from tests.helpers.derivatives import STACKS, agrees, asked_to_be_known, pairs, points_of, vector_and_build
+from tests.helpers.derivatives import (
+    STACKS,
+    agrees,
+    asked_to_be_known,
+    pairs,
+    points_of,
+    random_points,
+    vector_and_build,
+)
 
 SOLVER = lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6))
 TRANSPORTS = {
@@ -60,6 +68,10 @@ SOME = {
 """Structures of transports that are others but for one option."""
 
 
+RANDOMLY = ("AddingDoubling",)
+"""Transports whose derivatives are also tried on 17 random stacks of every structure, ends of ranges included."""
+
+
 def carried():
     for name, transport in TRANSPORTS.items():
         for kind in SOME.get(name, STACKS):
@@ -101,11 +113,11 @@ def test_derivatives(name, kind):
     faces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
     compared = not (faces and name.startswith(ILL_CONDITIONED))
     wrong = []
-    for point in points_of(stack, fixed):
-        vector = start.at[point.place].set(point.value)
+    points = [(start.at[point.place].set(point.value), point) for point in points_of(stack, fixed)]
+    for vector, point in points + (list(random_points(stack, fixed)) if name in RANDOMLY else []):
         direction = jnp.zeros_like(start).at[point.place].set(1.0)
         slope, gradient = np.asarray(forward(vector, direction)[1]), np.asarray(reverse(vector))
-        where = f"{point.name} = {point.value:g}"
+        where = f"{point.name} = {point.value:g} of {vector}"
         if not np.isfinite(slope).all() or not np.isfinite(gradient).all():
             wrong.append(f"{where}: not finite")
             continue
