@@ -2,19 +2,29 @@
 
 The steps are reversible for the surrogate's posterior s, which is fixed before sampling begins; taking where they end
 with the chance p(y) s(x) / (p(x) s(y)) is therefore Metropolis' rule for the exact posterior p, however good s is.
+
+A step is a draw of a Gaussian whose covariance is the surrogate's own where the step begins (as Girolami & Calderhead
+2011, without drift). One covariance for all of a posterior will not do: where data know a product of parameters a
+hundred times better than each of them, it is a thin curved sheet, and of steps as long as it is wide none is taken.
 """
+
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.linalg import solve_triangular
 from numpy.typing import NDArray
 
 from fits.inference.surrogate import Surrogate
 from fits.problem.compiled import Static, run
 
-STEPS_A_PARAMETER, FEWEST_STEPS, MOST_STEPS = 80, 100, 1000
+STEPS_A_PARAMETER, FEWEST_STEPS, MOST_STEPS = 30, 200, 400
+WIDE = 0.15  # share of steps with the covariance of the whole posterior: they leap from one part of it to another
+RESIDUALS = 8  # that the covariance is made of: those that change most
 STEP = 2.4  # standard deviations over the square root of their number: a random walk's best, for a Gaussian
 SPREAD = 0.7  # of the logarithm of the length of its steps
 
@@ -59,23 +69,54 @@ def _heights(model: Surrogate, positions: Array) -> Array:
     return jax.vmap(model.log_posterior_unconstrained)(positions)
 
 
+class _At(NamedTuple):
+    """A walker: where it is in units of the root, the log-posterior there, and the root of the inverse covariance."""
+
+    place: Array
+    height: Array
+    inverse_root: Array
+
+
+def _log_density(step: Array, inverse_root: Array) -> Array:
+    """Of a draw of the Gaussian with this root of the inverse covariance."""
+    white = inverse_root.T @ step
+    return jnp.sum(jnp.log(jnp.diagonal(inverse_root))) - 0.5 * jnp.sum(white**2)
+
+
 def _walk(
     model: Surrogate, positions: Array, seed: Array, root: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
     count, dimension = positions.shape
     steps = walk_length(dimension)
-    of_moves, of_lengths, of_levels = jax.random.split(jax.random.key(seed), 3)
-    lengths = jnp.exp(SPREAD * jax.random.normal(of_lengths, (steps, count, 1), positions.dtype))
-    moves = jax.random.normal(of_moves, (steps, count, dimension), positions.dtype) @ root.T
+    of_moves, of_lengths, of_levels, of_kinds = jax.random.split(jax.random.key(seed), 4)
+    lengths = jnp.exp(SPREAD * jax.random.normal(of_lengths, (steps, count), positions.dtype))
+    moves = jax.random.normal(of_moves, (steps, count, dimension), positions.dtype)
     levels = jnp.log(jax.random.uniform(of_levels, (steps, count), positions.dtype))
 
-    def step(state: tuple[Array, Array], given: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
-        (here, height), (move, level) = state, given
-        there = here + move
-        other = _heights(model, there)
-        taken = level < (other - height) / temperature
-        return (jnp.where(taken[:, None], there, here), jnp.where(taken, other, height)), None
+    wide = jax.random.uniform(of_kinds, (steps, count), positions.dtype) < WIDE
 
-    first = _heights(model, positions)
-    (ends, last), _ = jax.lax.scan(step, (positions, first), (STEP / jnp.sqrt(dimension) * lengths * moves, levels))
-    return ends, first, last
+    def at(place: Array) -> _At:
+        def residuals(place: Array) -> Array:
+            return model.rotated_residuals(root @ place, RESIDUALS)[0]
+
+        slopes = jax.jacfwd(residuals)(place)
+        precision = jnp.eye(dimension, dtype=place.dtype) + slopes.T @ slopes
+        return _At(place, model.log_posterior_unconstrained(root @ place), jnp.linalg.cholesky(precision))
+
+    def moved(here: _At, move: Array, length: Array, level: Array, wide: Array) -> _At:
+        def root_at(end: _At) -> Array:
+            return jnp.where(wide, jnp.eye(dimension, dtype=end.place.dtype), end.inverse_root)
+
+        step = solve_triangular(root_at(here), move, lower=True, trans=1)
+        there = at(here.place + length * step)
+        back, forth = (_log_density(step, root_at(end)) for end in (there, here))
+        gain = (there.height - here.height) / temperature + back - forth
+        return jax.tree.map(partial(jnp.where, level < gain), there, here)
+
+    def together(state: _At, given: tuple[Array, ...]) -> tuple[_At, None]:
+        return jax.vmap(moved)(state, *given), None
+
+    first = jax.vmap(at)(jnp.linalg.solve(root, positions.T).T)
+    scale = STEP * jnp.sqrt(temperature / dimension)
+    last, _ = jax.lax.scan(together, first, (moves, scale * lengths, levels, wide))
+    return last.place @ root.T, first.height, last.height

@@ -18,7 +18,7 @@ from fits._files import write_bytes
 from fits.inference.delayed_acceptance import DelayedAcceptance
 from fits.inference.laplace import Approximation
 from fits.inference.mixture import Mixture
-from fits.inference.surrogate import Evaluated, Surrogate, affordable_degrees, evaluate, fitted, term_count
+from fits.inference.surrogate import Evaluated, Surrogate, affordable_degrees, evaluate_many, fitted, term_count
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
@@ -168,7 +168,7 @@ class Design:
         del self.kept.rounds[number:]
         found = []
         for part in np.split(positions, len(positions) // self.walkers):
-            found.append([np.asarray(one, float) for one in self.problem.call(evaluate, part)])
+            found.append(evaluate_many(self.problem, part, self.walkers))
             self.evaluations += len(part)
             if self.progress is not None:
                 self.progress("surrogate", self.evaluations, None, self.note)

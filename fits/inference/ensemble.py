@@ -21,7 +21,7 @@ from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.length import last_checks
 from fits.inference.mixture import Mixture
-from fits.inference.surrogate import evaluate, with_polynomials
+from fits.inference.surrogate import evaluate_many, with_polynomials
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -83,7 +83,7 @@ class Ensemble:
 
     def _log_posteriors(self, positions: Floats) -> Floats:
         if self._delayed is not None:  # the program that the surrogate was built with: compiled already
-            return np.asarray(self.problem.call(evaluate, positions)[1], float)
+            return evaluate_many(self.problem, positions, self.chain.shape[0])[1]
         return np.asarray(self.problem.call(log_posteriors, positions), float)
 
     def _first_state(self) -> emcee.State:

@@ -1,7 +1,5 @@
 """Fitting: many starts through one compiled program, then what the best minimum is worth."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
@@ -22,6 +20,7 @@ from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import at_start, resolutions
 from fits.inference.starts import MOST_STEPS, End, Solver, run_starts, start_points
 from fits.inference.uncertainty import Uncertainty
+from fits.problem.compiled import cores, in_shares
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Transport
 from fits.problem.parameters import Free
@@ -184,19 +183,9 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
     if values.ndim != 3 or values.shape[1:] != expected:
         raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")
     points = start_points(problem, starts, seed)
-    # a fit keeps one core busy: equal shares (the last one padded) of one program, the first of which compiles it
-    workers = max(1, min(os.cpu_count() or 1, len(values)))
+    workers = max(1, min(cores(), len(values)))
     share = -(-len(values) // (4 * workers)) if workers > 1 else len(values)
-    firsts = range(0, len(values), share)
-
-    def solve(first: int) -> list[NDArray[Any]]:
-        part = values[first : first + share]
-        padded = np.concatenate([part, np.repeat(part[-1:], share - len(part), axis=0)])
-        return [np.asarray(result)[: len(part)] for result in problem.call(_solve_repeats, points, padded)]
-
-    with ThreadPoolExecutor(workers) as pool:
-        shares = [solve(firsts[0]), *pool.map(solve, firsts[1:])]
-    return Repeats(*map(np.concatenate, zip(*shares, strict=True)))
+    return Repeats(*in_shares(lambda part: problem.call(_solve_repeats, points, part), values, share))
 
 
 def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:

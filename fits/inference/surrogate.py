@@ -16,7 +16,9 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from fits.problem.compiled import cores, in_shares
 from fits.problem.model import Model
+from fits.problem.problem import Problem
 
 DEGREES = (2, 3, 4)
 MOST_TERMS = 500
@@ -62,6 +64,13 @@ def evaluate(model: Model, positions: Array) -> tuple[Array, Array]:
     return jax.lax.map(one, positions)
 
 
+def evaluate_many(problem: Problem, positions: Floats, walkers: int) -> tuple[Floats, Floats]:
+    """`evaluate` at positions (n, P) on all cores: half of the walkers, which move together, are a share for each."""
+    at_once = max(1, walkers // (2 * min(cores(), walkers // 2)))
+    residuals, log_posterior = in_shares(lambda part: problem.call(evaluate, part), positions, at_once)
+    return residuals, log_posterior
+
+
 class Surrogate(Model):
     """A `Model` whose likelihood comes from polynomials in P whitened coordinates of the box: K of them, of T terms.
 
@@ -80,14 +89,18 @@ class Surrogate(Model):
 
     def log_posterior_unconstrained(self, u: Array) -> Array:
         """Log-posterior, not normalised, over the unconstrained vector."""
-        z = self.whiten @ (jax.nn.sigmoid(u) - self.centre)
-        distance = jnp.sqrt(jnp.sum(z**2))
+        residuals, distance = self.rotated_residuals(u, self.weights.shape[1])
         beyond = jnp.maximum(distance - self.radius, 0.0)
-        inside = z * (self.radius / jnp.maximum(distance, self.radius))
-        residuals = monomials(inside, self.degree) @ self.weights
         prior = self.box.log_prior(self.box.constrain(u)) + self.box.log_determinant(u)
         total = prior - 0.5 * jnp.sum(residuals**2) - 0.5 * beyond**2
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def rotated_residuals(self, u: Array, count: int) -> tuple[Array, Array]:
+        """The first `count` of them, which change most, and how far from the centre that is."""
+        z = self.whiten @ (jax.nn.sigmoid(u) - self.centre)
+        distance = jnp.sqrt(jnp.sum(z**2))
+        inside = z * (self.radius / jnp.maximum(distance, self.radius))
+        return monomials(inside, self.degree) @ self.weights[:, :count], distance
 
     def arrays(self) -> dict[str, Any]:
         """What `with_polynomials` makes it of."""

@@ -1,11 +1,15 @@
 """One compiled program for every model of the same structure and shape: numbers are traced, the rest is its key."""
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
+import numpy as np
+from numpy.typing import NDArray
 
 
 class Static:
@@ -31,3 +35,25 @@ def run(function: Callable[..., Any], split_model: tuple[Any, Static], *argument
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(function: Callable[..., Any], static: Static, arrays: Any, *arguments: Any) -> Any:
     return function(eqx.combine(arrays, static.tree), *arguments)
+
+
+def cores() -> int:
+    """Of this machine."""
+    return os.cpu_count() or 1
+
+
+def in_shares(call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: int) -> list[NDArray[Any]]:
+    """The arrays that call(rows) gives, by so many rows at a time, on all cores: a program keeps but one busy.
+
+    The last share is padded, so that all have one program; the first runs alone, and compiles it.
+    """
+
+    def of(first: int) -> list[NDArray[Any]]:
+        part = rows[first : first + share]
+        padded = np.concatenate([part, np.repeat(part[-1:], share - len(part), axis=0)])
+        return [np.asarray(result)[: len(part)] for result in call(padded)]
+
+    firsts = range(0, len(rows), share)
+    with ThreadPoolExecutor(cores()) as pool:
+        parts = [of(firsts[0]), *pool.map(of, firsts[1:])]
+    return [np.concatenate(results) for results in zip(*parts, strict=True)]

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from scipy import special, stats
 
+from fits.inference.delayed_acceptance import DelayedAcceptance
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
 from fits.inference.posterior import Posterior
 from fits.inference.sampling import sample
+from fits.inference.surrogate import Evaluated, evaluate
+from fits.inference.surrogate import fitted as with_polynomial
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from tests.helpers.models import COUNT, LINE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
@@ -82,3 +86,29 @@ def test_a_direction_that_is_open_fills_its_box(name: str) -> None:
     error = 5 / np.sqrt(posterior.effective_samples.min())
     assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
     assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
+
+
+def product(stack, wi, wo):
+    """Data that know a product of two parameters alone."""
+    return stack["a"] * stack["b"] * (1.0 + 0.0 * wo[:, :1])
+
+
+def test_walks_of_a_surrogate_follow_a_thin_curved_ridge() -> None:
+    """Hundreds of times as long as it is wide: walks forget where along it they began, and leave the posterior as it
+    is, whose marginal is known by sums over a grid."""
+    data = measured(np.full((COUNT, 1), 0.5), 0.01)
+    fitted = fit({"a": Free(0.7, 0.3, 1.5), "b": Free(0.7, 0.3, 1.5)}, data, transport=product, starts=2)
+    a, b = np.linspace(0.334, 1.499, 2001), np.linspace(0.3, 1.5, 4001)
+    density = np.exp(-0.5 * COUNT * ((a[:, None] * b - 0.5) / 0.01) ** 2).sum(axis=1)
+    cumulated = np.cumsum(density) / density.sum()
+    generator = np.random.RandomState(0)
+    along = np.interp(generator.uniform(size=512), cumulated, a)
+    vectors = np.stack([along, (0.5 + 0.001 * generator.standard_normal(512)) / along], axis=-1)
+    positions = special.logit((np.clip(vectors, 0.3001, 1.4999) - 0.3) / 1.2)
+    exact = fitted.problem.call(evaluate, positions)
+    model = with_polynomial(fitted.problem.model, 2, Evaluated(positions, *(np.asarray(part) for part in exact)))
+    root = np.linalg.cholesky(np.cov(positions.T))
+    ends, _, _ = DelayedAcceptance(model, root).walk(positions, generator)
+    after = 0.3 + 1.2 * special.expit(ends[:, 0])
+    assert abs(np.corrcoef(along, after)[0, 1]) < 0.9
+    assert stats.kstest(np.interp(after, a, cumulated), "uniform").pvalue > 1e-3
