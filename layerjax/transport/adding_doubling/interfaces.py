@@ -45,6 +45,9 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
+LEAK = 16.0
+"""Times the precision: of light that is totally reflected what is lost at least."""
+
 LITTLE, RIDGE, TINY = 0.01, 1e-6, 1e-18
 """Of a typical flux, what counts as none of it; of an energy, what may be missing where nothing can be put right (in
 single precision the root of its epsilon); and what keeps quotients finite, whose square is not 0 there either."""
@@ -142,7 +145,11 @@ def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes:
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:
-    """Reflection at an interface, seen from one side."""
+    """Reflection at an interface, seen from one side.
+
+    Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
+    """
+    energy = at_most(energy, 1.0 - LEAK * jnp.finfo(energy.dtype).eps)
     (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, *normals)], region, region, modes)
     return scaled_to_energy(region, kernel, energy)
 
