@@ -14,6 +14,7 @@ from tests.helpers.derivatives import (
     STACKS,
     agrees,
     asked_to_be_known,
+    fields_of,
     pairs,
     points_of,
     random_points,
@@ -114,7 +115,9 @@ def test_derivatives(name, kind):
     compared = not (faces and name.startswith(ILL_CONDITIONED))
     wrong = []
     points = [(start.at[point.place].set(point.value), point) for point in points_of(stack, fixed)]
-    for vector, point in points + (list(random_points(stack, fixed)) if name in RANDOMLY else []):
+    drawn = list(random_points(stack, fixed)) if name in RANDOMLY else []
+    widths = [field.place for field in fields_of(stack, fixed) if field.path.endswith("alpha")]
+    for number, (vector, point) in enumerate(points + drawn):
         direction = jnp.zeros_like(start).at[point.place].set(1.0)
         slope, gradient = np.asarray(forward(vector, direction)[1]), np.asarray(reverse(vector))
         where = f"{point.name} = {point.value:g} of {vector}"
@@ -133,11 +136,16 @@ def test_derivatives(name, kind):
         single, small = vector.astype(jnp.float32), direction.astype(jnp.float32)
         ahead, back = np.asarray(forward(single, small)[1]), np.asarray(reverse(single))
         # rounding of values, or of energies that cancel to them, is divided by what a parameter is measured in
-        rounding = 64 * np.finfo(np.float32).eps * max(1.0, float(weight @ np.abs(values(vector)))) / point.length
+        eps = np.finfo(np.float32).eps
+        rounding = 64 * eps * max(1.0, float(weight @ np.abs(values(vector)))) / point.length
+        # and numbers that are rounded belong to another stack: where nothing is absorbed, thick media tell them apart
+        rounding += 4 * float(weight @ np.abs(forward(vector * (1 - eps), direction)[1] - slope))
+        # and of lobes narrower than directions are rounded to, values far off the peak are noise
+        seen = number < len(points) or all(vector[place] ** 2 > 64 * eps for place in widths)
         if not np.isfinite(ahead).all() or not np.isfinite(back).all():
             wrong.append(f"{where}: not finite in single precision")
         elif abs(back[point.place] - float(weight @ ahead)) > 1e-3 * size + rounding:
             wrong.append(f"{where}: in single precision reverse {back[point.place]:.4g}, forward {weight @ ahead:.4g}")
-        elif compared and weight @ np.abs(ahead - slope) > SINGLE * size + rounding:
+        elif compared and seen and weight @ np.abs(ahead - slope) > SINGLE * size + rounding:
             wrong.append(f"{where}: in single precision off by {weight @ np.abs(ahead - slope):.2g} of {size:.2g}")
     assert not wrong, "\n".join(wrong)
