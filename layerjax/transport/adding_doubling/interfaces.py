@@ -149,7 +149,7 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
-    energy = at_most(energy, 1.0 - LEAK * jnp.finfo(energy.dtype).eps)
+    energy = at_most(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
     (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, *normals)], region, region, modes)
     return scaled_to_energy(region, kernel, energy)
 
