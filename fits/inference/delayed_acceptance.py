@@ -3,9 +3,9 @@
 The steps are reversible for the surrogate's posterior s, which is fixed before sampling begins; taking where they end
 with the chance p(y) s(x) / (p(x) s(y)) is therefore Metropolis' rule for the exact posterior p, however good s is.
 
-A step is a draw of a Gaussian whose covariance is the surrogate's own where the step begins (as Girolami & Calderhead
-2011, without drift). One covariance for all of a posterior will not do: where data know a product of parameters a
-hundred times better than each of them, it is a thin curved sheet, and of steps as long as it is wide none is taken.
+A step has the covariance of the posterior, or, where that is thin, mostly the surrogate's own where the step begins (as
+Girolami & Calderhead 2011, without drift). Where data know a product of parameters a hundred times better than each of
+them, the posterior is a thin curved sheet, and of steps as long as it is wide none is taken.
 """
 
 from functools import partial
@@ -18,11 +18,14 @@ import numpy as np
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 from numpy.typing import NDArray
+from scipy import special
 
 from fits.inference.surrogate import Surrogate
 from fits.problem.compiled import Static, run
 
-STEPS_A_PARAMETER, FEWEST_STEPS, MOST_STEPS = 30, 200, 400
+STEPS_A_PARAMETER, FEWEST_STEPS, MOST_STEPS = 80, 100, 1000
+FEWER = 0.375  # times as many, of those that follow the surrogate's covariance
+THIN = 5.0  # times narrower at its centre than as a whole: a thin posterior
 WIDE = 0.15  # share of steps with the covariance of the whole posterior: they leap from one part of it to another
 RESIDUALS = 8  # that the covariance is made of: those that change most
 STEP = 2.4  # standard deviations over the square root of their number: a random walk's best, for a Gaussian
@@ -41,6 +44,8 @@ class DelayedAcceptance:
         arrays, static = eqx.partition(surrogate, eqx.is_array)
         self._split = arrays, Static(static)
         self._root = jnp.asarray(root)
+        precision = np.asarray(run(_precision, self._split, jnp.asarray(special.logit(surrogate.centre)), self._root))
+        self._walk = _walk_along if np.linalg.eigvalsh(precision)[-1] > THIN**2 else _walk
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
         """Where walks from positions (n, P) end, and the log-ratio of densities that `emcee` asks for."""
@@ -52,7 +57,7 @@ class DelayedAcceptance:
     ) -> tuple[Floats, Floats, Floats]:
         """Ends of walks for the surrogate's posterior at a temperature, and its log there before and after."""
         seed = jnp.asarray(generator.randint(2**31))
-        ends, before, after = run(_walk, self._split, jnp.asarray(positions), seed, self._root, temperature)
+        ends, before, after = run(self._walk, self._split, jnp.asarray(positions), seed, self._root, temperature)
         return np.asarray(ends), np.asarray(before), np.asarray(after)
 
     def heights(self, positions: Floats) -> Floats:
@@ -69,6 +74,34 @@ def _heights(model: Surrogate, positions: Array) -> Array:
     return jax.vmap(model.log_posterior_unconstrained)(positions)
 
 
+def _walk(
+    model: Surrogate, positions: Array, seed: Array, root: Array, temperature: Array
+) -> tuple[Array, Array, Array]:
+    count, dimension = positions.shape
+    steps = walk_length(dimension)
+    of_moves, of_lengths, of_levels = jax.random.split(jax.random.key(seed), 3)
+    lengths = jnp.exp(SPREAD * jax.random.normal(of_lengths, (steps, count, 1), positions.dtype))
+    moves = jax.random.normal(of_moves, (steps, count, dimension), positions.dtype) @ root.T
+    levels = jnp.log(jax.random.uniform(of_levels, (steps, count), positions.dtype))
+
+    def step(state: tuple[Array, Array], given: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+        (here, height), (move, level) = state, given
+        there = here + move
+        other = _heights(model, there)
+        taken = level < (other - height) / temperature
+        return (jnp.where(taken[:, None], there, here), jnp.where(taken, other, height)), None
+
+    first = _heights(model, positions)
+    (ends, last), _ = jax.lax.scan(step, (positions, first), (STEP / jnp.sqrt(dimension) * lengths * moves, levels))
+    return ends, first, last
+
+
+def _precision(model: Surrogate, position: Array, root: Array) -> Array:
+    """Inverse covariance of the surrogate about a position (P,), and of one unit more, in units of the root."""
+    slopes = jax.jacfwd(lambda u: model.rotated_residuals(u, RESIDUALS)[0])(position) @ root
+    return jnp.eye(len(position), dtype=position.dtype) + slopes.T @ slopes
+
+
 class _At(NamedTuple):
     """A walker: where it is in units of the root, the log-posterior there, and the root of the inverse covariance."""
 
@@ -83,11 +116,12 @@ def _log_density(step: Array, inverse_root: Array) -> Array:
     return jnp.sum(jnp.log(jnp.diagonal(inverse_root))) - 0.5 * jnp.sum(white**2)
 
 
-def _walk(
+def _walk_along(
     model: Surrogate, positions: Array, seed: Array, root: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
+    """The same with steps that follow the surrogate's covariance."""
     count, dimension = positions.shape
-    steps = walk_length(dimension)
+    steps = max(FEWEST_STEPS, int(FEWER * walk_length(dimension)))
     of_moves, of_lengths, of_levels, of_kinds = jax.random.split(jax.random.key(seed), 4)
     lengths = jnp.exp(SPREAD * jax.random.normal(of_lengths, (steps, count), positions.dtype))
     moves = jax.random.normal(of_moves, (steps, count, dimension), positions.dtype)
@@ -96,11 +130,7 @@ def _walk(
     wide = jax.random.uniform(of_kinds, (steps, count), positions.dtype) < WIDE
 
     def at(place: Array) -> _At:
-        def residuals(place: Array) -> Array:
-            return model.rotated_residuals(root @ place, RESIDUALS)[0]
-
-        slopes = jax.jacfwd(residuals)(place)
-        precision = jnp.eye(dimension, dtype=place.dtype) + slopes.T @ slopes
+        precision = _precision(model, root @ place, root)
         return _At(place, model.log_posterior_unconstrained(root @ place), jnp.linalg.cholesky(precision))
 
     def moved(here: _At, move: Array, length: Array, level: Array, wide: Array) -> _At:

@@ -29,6 +29,7 @@ COUNTS = 0.05  # weight from which the radius takes a point in
 BEYOND = 1.2  # of the farthest such point: the radius
 NARROWEST = 1e-12  # boxes
 RANK = 1e-10
+TINY = 1e-300  # under a root, which has no derivative at 0
 WIDTH = 16  # K is a multiple: programs are compiled for few widths, and run as fast
 
 Floats = NDArray[np.float64]
@@ -98,7 +99,7 @@ class Surrogate(Model):
     def rotated_residuals(self, u: Array, count: int) -> tuple[Array, Array]:
         """The first `count` of them, which change most, and how far from the centre that is."""
         z = self.whiten @ (jax.nn.sigmoid(u) - self.centre)
-        distance = jnp.sqrt(jnp.sum(z**2))
+        distance = jnp.sqrt(jnp.sum(z**2) + TINY)
         inside = z * (self.radius / jnp.maximum(distance, self.radius))
         return monomials(inside, self.degree) @ self.weights[:, :count], distance
 

@@ -235,9 +235,8 @@ CASES = [(1.5, 100.0, 100.0, 30), (1.5, 1e4, 1e3, 60), (1.5, 1e3, 30.0, 0), (2.0
 CASES += [(1.5, 30.0, None, 20), (1.5, 3.0, None, 70)]
 
 
-@pytest.mark.parametrize(
-    ("eta", "top", "base", "degrees"), [CASES[0], *(pytest.param(*case, marks=pytest.mark.slow) for case in CASES[1:])]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("eta", "top", "base", "degrees"), CASES)
 def test_both_references_have_the_energy_of_the_walk_in_numpy(eta, top, base, degrees):
     theta, paths, coarse = np.deg2rad(degrees), 50_000, (eta, top, base, degrees) == CASES[0]
     parts = coated_energies(theta, eta, top, base, 40, DRAWS // 2, 1, COPPER)
@@ -297,9 +296,8 @@ def test_references_are_finite_over_the_box(dtype):
                 assert np.isfinite(leaf).all(), (ior, kappas)
 
 
-@pytest.mark.parametrize(
-    "transport", [lj.AddingDoubling(nodes=4, modes=4), pytest.param("auto", marks=pytest.mark.slow)], ids=["4", "auto"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("transport", [lj.AddingDoubling(nodes=4, modes=4), "auto"], ids=["4", "auto"])
 def test_reverse_mode_of_a_varnish(transport):
     """Against central differences: half of their step changes them by less than 1e-4."""
 

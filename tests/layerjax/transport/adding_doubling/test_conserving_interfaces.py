@@ -39,7 +39,10 @@ ENDS = {
 """Interfaces (index, alpha) and media of depth 1 with this g, and by how much lossless energy is off at most."""
 
 
-@pytest.mark.parametrize("name", ENDS)
+SLOW = "hardly there, peaked back, steps down"
+
+
+@pytest.mark.parametrize("name", [pytest.param(SLOW, marks=pytest.mark.slow), *(name for name in ENDS if name != SLOW)])
 def test_nothing_is_lost_at_the_ends(name):
     parts, error = ENDS[name]
     layers = [

@@ -122,7 +122,6 @@ COATED = {
     [
         ("two media", "single", 400),
         pytest.param("paint", "single", 400, marks=pytest.mark.slow),
-        ("paint", "multiple", 100),
         pytest.param("paint", "multiple", 400, marks=pytest.mark.slow),
         pytest.param("haze on varnish", "single", 400, marks=pytest.mark.slow),
         pytest.param("plate", "multiple", 400, marks=pytest.mark.slow),

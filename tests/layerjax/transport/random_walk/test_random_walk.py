@@ -53,6 +53,7 @@ def test_first_order(stack, pairs):
         assert_mean(repeated(stack, wi, wo, orders="first")[0], lj.evaluate(stack, wi, wo, lj.SingleScattering()))
 
 
+@pytest.mark.slow
 def test_orders_add_up():
     stack = lj.Stack([lj.Interface(1.5, 0.3), haze(0.3, 0.8, 0.9)], lj.Lambertian(0.6))
     every, first, rest = (repeated(stack, WI, ABOVE, orders=orders)[0] for orders in ("all", "first", "multiple"))
