@@ -28,6 +28,7 @@ FEWER = 0.375  # times as many, of those that follow the surrogate's covariance
 THIN = 5.0  # times narrower at its centre than as a whole: a thin posterior
 WIDE = 0.15  # share of steps with the covariance of the whole posterior: they leap from one part of it to another
 RESIDUALS = 8  # that the covariance is made of: those that change most
+EDGE = 1e-12  # boxes: the centre of a posterior on a bound may be rounded to it
 STEP = 2.4  # standard deviations over the square root of their number: a random walk's best, for a Gaussian
 SPREAD = 0.7  # of the logarithm of the length of its steps
 
@@ -44,7 +45,8 @@ class DelayedAcceptance:
         arrays, static = eqx.partition(surrogate, eqx.is_array)
         self._split = arrays, Static(static)
         self._root = jnp.asarray(root)
-        precision = np.asarray(run(_precision, self._split, jnp.asarray(special.logit(surrogate.centre)), self._root))
+        centre = special.logit(np.clip(surrogate.centre, EDGE, 1.0 - EDGE))
+        precision = np.asarray(run(_precision, self._split, jnp.asarray(centre), self._root))
         self._walk = _walk_along if np.linalg.eigvalsh(precision)[-1] > THIN**2 else _walk
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
@@ -77,6 +79,7 @@ def _heights(model: Surrogate, positions: Array) -> Array:
 def _walk(
     model: Surrogate, positions: Array, seed: Array, root: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
+    """Ends of walks whose steps have one covariance, and heights before and after."""
     count, dimension = positions.shape
     steps = walk_length(dimension)
     of_moves, of_lengths, of_levels = jax.random.split(jax.random.key(seed), 3)
@@ -119,14 +122,13 @@ def _log_density(step: Array, inverse_root: Array) -> Array:
 def _walk_along(
     model: Surrogate, positions: Array, seed: Array, root: Array, temperature: Array
 ) -> tuple[Array, Array, Array]:
-    """The same with steps that follow the surrogate's covariance."""
+    """Ends of walks whose steps have the surrogate's covariance where they begin, and heights before and after."""
     count, dimension = positions.shape
     steps = max(FEWEST_STEPS, int(FEWER * walk_length(dimension)))
     of_moves, of_lengths, of_levels, of_kinds = jax.random.split(jax.random.key(seed), 4)
     lengths = jnp.exp(SPREAD * jax.random.normal(of_lengths, (steps, count), positions.dtype))
     moves = jax.random.normal(of_moves, (steps, count, dimension), positions.dtype)
     levels = jnp.log(jax.random.uniform(of_levels, (steps, count), positions.dtype))
-
     wide = jax.random.uniform(of_kinds, (steps, count), positions.dtype) < WIDE
 
     def at(place: Array) -> _At:

@@ -4,7 +4,6 @@ A start that runs out of steps goes on for as long as that is worth something: t
 how good its end is.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from scipy.stats import qmc
 from fits.inference.bounded import cost_and_gradient, minimise_in_box
 from fits.inference.descent import PROMISE, descent, here
 from fits.inference.starts_file import End, Floats, Solver, StartsFile
+from fits.problem.compiled import cores
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
@@ -51,7 +51,7 @@ def run_starts(
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, solve(problem, points[index]))
-    pool = ThreadPoolExecutor(os.cpu_count())
+    pool = ThreadPoolExecutor(cores())
     try:
         running = {pool.submit(solve, problem, points[index]): index for index in left[1:]}
         for future in as_completed(running):

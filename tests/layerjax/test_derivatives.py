@@ -138,10 +138,12 @@ def test_derivatives(name, kind):
         # rounding of values, or of energies that cancel to them, is divided by what a parameter is measured in
         eps = np.finfo(np.float32).eps
         rounding = 64 * eps * max(1.0, float(weight @ np.abs(values(vector)))) / point.length
-        # and numbers that are rounded belong to another stack: where nothing is absorbed, thick media tell them apart
-        rounding += 4 * float(weight @ np.abs(forward(vector * (1 - eps), direction)[1] - slope))
-        # and of lobes narrower than directions are rounded to, values far off the peak are noise
-        seen = number < len(points) or all(vector[place] ** 2 > 64 * eps for place in widths)
+        seen = True
+        if number >= len(points):
+            # numbers that are rounded belong to another stack: where nothing is absorbed, thick media tell them apart
+            rounding += 4 * float(weight @ np.abs(forward(vector * (1 - eps), direction)[1] - slope))
+            # and of lobes narrower than directions are rounded to, values far off the peak are noise
+            seen = all(vector[place] ** 2 > 64 * eps for place in widths)
         if not np.isfinite(ahead).all() or not np.isfinite(back).all():
             wrong.append(f"{where}: not finite in single precision")
         elif abs(back[point.place] - float(weight @ ahead)) > 1e-3 * size + rounding:

@@ -94,8 +94,8 @@ def product(stack, wi, wo):
 
 
 def test_walks_of_a_surrogate_follow_a_thin_curved_ridge() -> None:
-    """Hundreds of times as long as it is wide: walks forget where along it they began, and leave the posterior as it
-    is, whose marginal is known by sums over a grid."""
+    """Hundreds of times as long as it is wide: walks move along it, and leave the posterior as it is, whose
+    marginal is known by sums over a grid."""
     data = measured(np.full((COUNT, 1), 0.5), 0.01)
     fitted = fit({"a": Free(0.7, 0.3, 1.5), "b": Free(0.7, 0.3, 1.5)}, data, transport=product, starts=2)
     a, b = np.linspace(0.334, 1.499, 2001), np.linspace(0.3, 1.5, 4001)
