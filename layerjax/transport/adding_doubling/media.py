@@ -130,15 +130,23 @@ def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
     return Kernel(balanced(kernel.plain), schlick, kernel.area, kernel.cosine, kernel.solid, kernel.azimuths)
 
 
-def medium_layer(medium: Medium, kernel: Kernel, steps: int | None) -> Layer:
-    """The medium as a layer: by eigenvectors, or in single precision by so many doublings (see `doublings`)."""
+def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: bool | None = None) -> Layer:
+    """The medium as a layer: by eigenvectors, or (if None: in single precision) by so many doublings.
+
+    steps: see `doublings`; None: decided at run time.
+    """
     thickness = _column(medium.thickness, kernel)
     direct = _direct(kernel, thickness)
     if is_known(medium.albedo, 0.0):
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
-    if thickness.dtype == jnp.float64:
-        return _by_eigenvectors(kernel, strength, thickness, direct)
+    if thickness.dtype != jnp.float64 if doubled is None else doubled:
+        return _by_doublings(kernel, strength, thickness, direct, steps)
+    return _by_eigenvectors(kernel, strength, thickness, direct)
+
+
+def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array, steps: int | None) -> Layer:
+    """The medium doubled up from a thin slab."""
 
     @jax.checkpoint
     def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
