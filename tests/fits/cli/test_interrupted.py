@@ -199,7 +199,7 @@ def test_beside_a_running_sampler_others_only_read(
     assert not (directory / "chain.lock").exists()
 
 
-@pytest.mark.parametrize("moment", ["chain.surrogate", "chain.journal"])
+@pytest.mark.parametrize("moment", [pytest.param("chain.surrogate", marks=pytest.mark.slow), "chain.journal"])
 def test_a_killed_sampler_goes_on_with_its_surrogate(
     work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, tmp_path_factory: pytest.TempPathFactory, moment: str
 ) -> None:

@@ -76,7 +76,7 @@ def test_turned_about_the_normal_is_the_same():
     )
 
 
-@pytest.mark.parametrize("name", ["haze", "flakes over fibers"])
+@pytest.mark.parametrize("name", [pytest.param("haze", marks=pytest.mark.slow), "flakes over fibers"])
 def test_white_where_nothing_absorbs(name):
     """As exact as 95 of 100 materials never seen; what absorbs much is left as it is learned."""
     medium = STACKS[name].layers

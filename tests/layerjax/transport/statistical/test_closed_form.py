@@ -30,6 +30,7 @@ def stacks(ior, alpha, absorbing, count, albedo):
     return [lj.Stack(layers, lj.Lambertian(share)) for share in (albedo, 0.0)]
 
 
+@pytest.mark.slow
 def test_values():
     """What two coats reflect themselves is taken off both: 4 standard errors and 0.3 %."""
     wi = lj.direction(jnp.array([0.3, 1.0]), 0.0)
