@@ -84,13 +84,15 @@ class Directions:
 
 @dataclass(frozen=True)
 class Case:
-    """A stack of the suite. family: key of `FAMILIES`; source: the paper and figure, or "this suite"."""
+    """A stack of the suite. family: key of `FAMILIES`; source: the paper and figure, or "this suite"; differs: why
+    solver and walk do not agree on it, if that is known."""
 
     name: str
     family: str
     source: str
     remark: str
     stack: lj.Stack
+    differs: str = ""
 
     @cached_property
     def directions(self) -> Directions:
@@ -119,7 +121,7 @@ def load(families: Sequence[str] | None = None) -> list[Case]:
 
 def _read(path: Path) -> Case:
     problem = read_problem(path)
-    about = {key: problem.about.get(key, "") for key in ("source", "remark")}
+    about = {key: problem.about.get(key, "") for key in ("source", "remark", "differs")}
     return Case(path.stem, path.parent.name, stack=problem.stack, **about)
 
 

@@ -103,11 +103,14 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert all(row["nanoseconds_per_value"] > 0 and row["operations"] > 0 for row in rows.values())
     assert rows["thin_haze", "walk"]["pairs"] == 8
     before = rows["coat", "walk"]
+    models.append(Model("called", {"8": solver}, called=True))
     models.append(Model("coarse", {"5": solver.coarser()}))  # its programs are there, for the error of the truth
     study("coat", "plastics_and_paints", coat)  # a model that joins: the rest stands as it was
     content = json.loads((directory / "error-vs-time.json").read_text())
     rows = {(row["stack"], row["model"]): row for row in content["rows"]}
     assert rows["coat", "walk"] == before
+    assert rows["coat", "called"]["l2"] < 1e-12  # the truth is called, too
+    assert rows["coat", "called"]["prepare_seconds"] > 0
     assert 0 < rows["coat", "coarse"]["l2"] < 0.1
     with pytest.raises(ValueError, match="measured with other settings"):
         error_vs_time.study(directory=directory, cases=[], models=models, references=references, resume=True)

@@ -15,7 +15,7 @@ import layerjax as lj
 from benchmarks.measuring import operations, timing
 from benchmarks.measuring.accuracy import relative_l2, scale, worst
 from benchmarks.studies.error_vs_time.truth import Truth, albedos, key_of
-from benchmarks.suite.cases import Case
+from benchmarks.suite.cases import Case, Directions
 from layerjax.stack import simplify, simplify_and_name
 
 Result = TypeVar("Result")
@@ -23,10 +23,14 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Model:
-    """A way of solving a stack, at one resolution or at several, from coarse to fine, each with a label."""
+    """A way of solving a stack, at one resolution or at several, from coarse to fine, each with a label.
+
+    called: whether the stack itself is evaluated, so that its directions are known, in place of a prepared one.
+    """
 
     name: str
     steps: Mapping[str, lj.Transport]
+    called: bool = False
 
 
 MODELS = (
@@ -44,6 +48,12 @@ MODELS = (
             for nodes, ordinates in ((8, (6, 12)), (16, (8, 16)), (32, (10, 24)))
         },
     ),
+    Model(
+        "solver, directions known",
+        {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (6, 12, 24)},
+        called=True,
+    ),
+    Model("solver as it chooses", {"default": lj.AddingDoubling()}, called=True),
     Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14)}),
 )
 """What is compared. A model joins by a line here."""
@@ -145,20 +155,21 @@ def run(case: Case, model: Model, size: Size, programs: Programs) -> list[Run]:
     for label, transport in model.steps.items():
         if not supports(transport, case.stack):
             break
-        runs.append(_run(case, model.name, label, transport, size, programs))
+        measure = _called if model.called else _prepared
+        runs.append(measure(case, model.name, label, transport, size, programs))
         if STEP * runs[-1].seconds > size.longest:
             break
     return runs
 
 
-def _run(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+def _prepared(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+    """Of a stack that is prepared once."""
     directions = case.directions
     if transport.random:
         indices = turns = directions.some(size.walked(case))
         key = key_of(case.name, 2)
     else:
-        indices = np.arange(len(directions.wi))
-        turns = np.arange(max(size.batch, len(indices))) % len(indices)
+        indices, turns = _in_turn(directions, size)
         key = None
     wi, wo = jnp.asarray(directions.wi[turns]), jnp.asarray(directions.wo[turns])
 
@@ -186,6 +197,47 @@ def _run(case: Case, name: str, label: str, transport: lj.Transport, size: Size,
         operations=counted,
         seconds=prepare_seconds + seconds,
     )
+
+
+def _called(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+    """Of a stack that is evaluated as it is: once it costs what a call for its own pairs does."""
+    directions = case.directions
+    indices, turns = _in_turn(directions, size)
+
+    def call(wi: NDArray[np.float64], wo: NDArray[np.float64]) -> jax.Array:
+        return jax.block_until_ready(lj.evaluate(case.stack, wi, wo, transport))
+
+    values, calling, few = _first_and_again(lambda: call(directions.wi, directions.wo), size.rounds)
+    _, _, many = _first_and_again(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
+    arrays, others = eqx.partition(case.stack, eqx.is_array_like)
+    compile_seconds, counted = programs.of(
+        _structure(case.stack, label, name, len(indices)),
+        max(calling - few, 0.0),
+        lambda: operations.total(
+            lambda arrays: lj.evaluate(
+                eqx.combine(arrays, others), directions.wi, directions.wo, lj.choose_transport(case.stack, transport)
+            ),
+            arrays,
+        ),
+    )
+    return Run(
+        model=name,
+        step=label,
+        indices=indices,
+        values=np.asarray(values),
+        albedo=albedos(case.stack, directions, transport),
+        nanoseconds_per_value=1e9 * max(many - few, 0.0) / (len(turns) - len(indices)),
+        prepare_seconds=few,
+        compile_seconds=compile_seconds,
+        operations=counted,
+        seconds=many,
+    )
+
+
+def _in_turn(directions: Directions, size: Size) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """All pairs of a stack, and as many as a timed evaluation has."""
+    indices = np.arange(len(directions.wi))
+    return indices, np.arange(max(size.batch, 2 * len(indices))) % len(indices)
 
 
 def row(case: Case, run: Run, truth: Truth, limit: float) -> Row:

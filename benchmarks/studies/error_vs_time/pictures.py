@@ -14,7 +14,7 @@ from benchmarks.studies.error_vs_time.truth import Judged
 from benchmarks.suite.cases import FAMILIES
 from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
 
-MARKERS = "osD^v<>P*"
+MARKERS = "osD^v<>P*Xp"
 HIGHEST = 10.0
 """Larger errors are drawn as this: they only say that the model is of no use there."""
 

@@ -84,7 +84,7 @@ def markdown(
         errors=STANDARD_ERRORS,
         tolerance=100 * TOLERANCE,
         agree=len(judged) - len(failing),
-        disagree=" Those that do not:" if failing else "",
+        disagree=" Those that do not, and why:" if failing else "",
         agreement=_agreement(failing) if failing else "",
         details=_details(models, judged, rows),
     )
@@ -145,20 +145,19 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
 
 def _agreement(failing: Sequence[Judged]) -> str:
     header = ("stack", "values", "beyond, same side", "beyond, other side", "largest, %", "truth to, %", "truth z rms")
-    return table(
-        header,
-        [
-            (
-                judgement.stack,
-                str(judgement.compared),
-                *map(str, judgement.failures),
-                _percent(judgement.worst),
-                _percent(judgement.limit),
-                f"{judgement.z_root_mean_square:.2f}",
-            )
-            for judgement in failing
-        ],
-    )
+    rows = [
+        (
+            judgement.stack,
+            str(judgement.compared),
+            *map(str, judgement.failures),
+            _percent(judgement.worst),
+            _percent(judgement.limit),
+            f"{judgement.z_root_mean_square:.2f}",
+        )
+        for judgement in failing
+    ]
+    causes = "".join(f"- {judgement.stack}: {judgement.cause or 'not known'}\n" for judgement in failing)
+    return f"{table(header, rows)}\n{causes}"
 
 
 def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:

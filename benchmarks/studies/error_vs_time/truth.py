@@ -80,7 +80,8 @@ class Judged:
 
     uncertainty: of the relative L2, of the worst value and of the albedo, by two resolutions. bias: relative L2 that
     the walk finds beyond its noise, at `walked` pairs. z: root mean square and largest, truth against walk. compared,
-    failures, worst: values of the default solver against the default walk of so many paths (see `Check`).
+    failures, worst: values of the default solver against the default walk of so many paths (see `Check`); cause: why
+    they differ, if that is known.
     """
 
     stack: str
@@ -101,6 +102,7 @@ class Judged:
     paths: int
     date: str
     seconds: float
+    cause: str = ""
 
     @property
     def limit(self) -> float:
@@ -152,6 +154,7 @@ def judge(case: Case, references: References, walked: int, longest: float = np.i
         paths=getattr(default_walk, "paths", 0),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         seconds=time.perf_counter() - began,
+        cause=case.differs,
     ), truth
 
 

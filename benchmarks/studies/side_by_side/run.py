@@ -125,6 +125,11 @@ WORDS = {
     ),
     "Weidlich & Wilkie": "coats over a base without inter-reflection, to compare with what was used before",
     "adding-doubling": "everything, exactly; the choice for stacks that are asked for more than a few hundred values",
+    "solver, directions known": (
+        "the same along directions that `evaluate` can see beforehand, as in a fit: under an interface light is "
+        "followed along them, and read off no table"
+    ),
+    "solver as it chooses": "the same at the resolution that a stack is given by default, for errors of about 1e-3",
     "random walk": "everything, with standard errors; to check the others",
 }
 

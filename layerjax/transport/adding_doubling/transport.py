@@ -79,8 +79,9 @@ class AddingDoubling(DeterministicTransport):
             the base.
         microfacets: ``"single"``, Walter 2007: light that a facet sends into another is lost; or ``"multiple"``: it is
             given back diffusely, so that interfaces conserve energy (after Kulla & Conty 2017): lossless stacks return
-            what meets them to 1e-9 as a rule, next to an index of 1 to 1e-5, and with 6 nodes at an index of 0.25 or
-            1.05 to 4e-3.
+            what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within 1 % of an index
+            of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface at grazing, below
+            a cosine of 0.05, may lose or gain a quarter.
 
     Raises:
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.
