@@ -48,7 +48,7 @@ RESOLVED = 0.2
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
 
-LITTLE, RIDGE, TINY = 0.01, 1e-6, 1e-18
+LITTLE, RIDGE, TINY = 0.01, 1e-8, 1e-18
 """Of a typical flux, what counts as none of it; of an energy, what may be missing where nothing can be put right (in
 single precision the root of its epsilon); and what keeps quotients finite, whose square is not 0 there either."""
 

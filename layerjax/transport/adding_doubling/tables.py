@@ -214,11 +214,18 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     row = jnp.where(above | tables.opaque, 0, 1)
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
     axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
-    energies: list[Channels] = []
-    for table in (tables.near, tables.far):
-        found = _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
-        energies.append(tuple(jnp.where(valid, not_negative(value), 0.0) for value in found))
-    return energies[0], energies[1]
+    near, far = (
+        _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in (tables.near, tables.far)
+    )
+    energies = [_shared(*pair) for pair in zip(near, far, strict=True)]
+    sides = (tuple(jnp.where(valid, energy[side], 0.0) for energy in energies) for side in range(2))
+    return next(sides), next(sides)
+
+
+def _shared(near: Array, far: Array) -> tuple[Array, Array]:
+    """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
+    kept = not_negative(near), not_negative(far)
+    return not_negative(kept[0] + (far - kept[1])), not_negative(kept[1] + (near - kept[0]))
 
 
 def _node_directions(region: Region, azimuths: int | None, side: float) -> Vector:

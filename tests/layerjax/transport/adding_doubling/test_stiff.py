@@ -24,17 +24,19 @@ def missing(ior, alpha, below, thickness, g):
 
 @pytest.mark.parametrize("alpha", [1e-4, 0.02, 0.1, 0.3, 1.0])
 def test_lossless_slabs_keep_their_energy(alpha):
-    """Rounding alone is lost: 1e-12, 4e-8 of the finest roughness, and 6e-6 next to an index of 1, where what is
-    turned back is known to a table's rounding."""
-    for ior, below in ((1.5, 1.0), (4.0, 1.0), (4.0, 1.5), (1.2, 1.0), (1.05, 1.0), (0.5, 1.0), (0.25, 1.0)):
+    """Rounding alone is lost: 1e-12, and 3e-7 of the finest roughness next to an index of 1, where what is turned back
+    is known to a table's rounding."""
+    for ior, below in ((1.5, 1.0), (4.0, 1.0), (4.0, 1.5), (1.2, 1.0), (1.05, 1.0), (0.5, 1.0), (0.25, 1.0),
+                       (1.5, 1.5 + 1e-7), (1.0 + 1e-7, 1.0), (1.0 - 1e-7, 1.0), (1.0, 1.0)):  # fmt: skip
         assert missing(ior, alpha, below, 1.0, 0.3) < 1e-6, (ior, below)
-    for ior, below in ((1.5, 1.5 + 1e-7), (1.0 + 1e-7, 1.0), (1.0 - 1e-7, 1.0), (1.0, 1.0)):
-        assert missing(ior, alpha, below, 1.0, 0.3) < 1e-5, (ior, below)
 
 
-def test_lossless_media_in_a_slab_keep_their_energy():
+@pytest.mark.parametrize("alpha", [1e-4, 1.0])
+def test_lossless_media_in_a_slab_keep_their_energy(alpha):
+    """Peaks too narrow for the nodes among them, whose energy interpolation takes below 0 on one side."""
     for thickness, g in itertools.product((1e-8, 1.0, 1e4), (-0.999, 0.0, 0.999)):
-        assert missing(1.5, 0.3, 1.0, thickness, g) < 1e-6, (thickness, g)
+        for ior, below in ((1.5, 1.0), (1.0, 1.0), (4.0, 1.5)):
+            assert missing(ior, alpha, below, thickness, g) < 1e-6, (ior, below, thickness, g)
 
 
 @pytest.mark.slow
