@@ -215,7 +215,8 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
     axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
     near, far = (
-        _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in (tables.near, tables.far)
+        _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
+        for table in (tables.near, tables.far)
     )
     energies = [_shared(*pair) for pair in zip(near, far, strict=True)]
     sides = (tuple(jnp.where(valid, energy[side], 0.0) for energy in energies) for side in range(2))
