@@ -21,6 +21,19 @@ class Aim(NamedTuple):
     density: Array
 
 
+class Relay(NamedTuple):
+    """A direction of travel to the surface opposite the exit, drawn once a path so that it is reflected along the aim
+    (along wo, where nothing lies between)."""
+
+    travel: Vector
+    rates: list[Array]
+    weight: Channels
+    """What arrives at wo of light that is reflected from it, over the density of the draws."""
+    rivals: Array
+    """Density with which walks find the same light, over that of the draws, for each unit of the density with which
+    they turn to `travel`."""
+
+
 class PathState(NamedTuple):
     """State of a path. What the scene or the question does not need is None or empty."""
 
@@ -38,8 +51,10 @@ class PathState(NamedTuple):
     aiming: Array | None
     """Whether it is not yet a path of light, but a ray from wo's side that draws the aim of the path to come."""
     aim: Aim | None
+    relay: Relay | None
     inverse_density: Array | None
-    """1 / density of the last direction if that light was aimed through the exit interface as well, else 0."""
+    """1 / density of the last direction if that light was aimed as well, through the exit interface or over the surface
+    opposite, else 0."""
     facet: Position | None
 
 
@@ -80,6 +95,12 @@ class Event(NamedTuple):
     """Whether a path at a surface is done with it, and not on to another facet of it."""
     exit_weight: Array | None = None
     """Weight of what the exit interface sends to wo, beside that of light which was aimed through it."""
+    relayed: Channels = ()
+    """Light sent along the relay, per solid angle."""
+    relayed_density: Array | None = None
+    """Density of the relay among the new directions."""
+    rivals: Array | None = None
+    """1 + density of relays that bring light from the old direction to the target, over that of the walk so far."""
 
 
 class Step(NamedTuple):
@@ -121,6 +142,9 @@ def merge(chosen: Array, a: Event, b: Event, channels: int) -> Event:
         either(a.next_density, b.next_density),
         either(a.leaves, b.leaves),
         either(a.exit_weight, b.exit_weight),
+        per_channel(a.relayed, b.relayed),
+        either(a.relayed_density, b.relayed_density),
+        either(a.rivals, b.rivals),
     )
 
 

@@ -165,6 +165,20 @@ def density(
     return value + DIFFUSE_SHARE * jnp.abs(wo[2]) / jnp.pi if diffuse else value
 
 
+def interface_towards(
+    scene: Scene, surface: Array | None, from_above: Array, travel: Vector, target: Vector
+) -> tuple[Array, Array]:
+    """What an interface sends to a direction of travel, per solid angle, and the density with which it is drawn."""
+    wi, towards = _facing(turned(travel, from_above, -1.0)), turned(target, from_above)
+    ior, alpha = scene.surface_ior(surface, from_above), roughness(scene, surface)
+
+    def sent(distribution: Distribution) -> tuple[Array, Array]:
+        value = _interface(wi, towards, ior, alpha, distribution)
+        return value * jnp.abs(towards[2]), interface_pdf(value, wi, towards, ior, alpha, distribution)
+
+    return _by_distribution(scene, surface, sent)
+
+
 def exit_density(
     scene: Scene, surface: Array, above: Array, leaving: Vector, inside: Vector, *, diffuse: bool
 ) -> tuple[Array, Array]:

@@ -28,8 +28,9 @@ from layerjax.transport.random_walk.walk import Orders, Walk
 class RandomWalk(RandomTransport):
     """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
 
-    Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. The same
-    key and the same shapes give the same numbers, bit for bit.
+    Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. Narrow lobes
+    are aimed at, not found by chance: of the interface that wo sees and, with ``microfacets="single"``, of the metal or
+    interface opposite. The same key and the same shapes give the same numbers, bit for bit.
 
     Args:
         paths: number of paths for each pair of directions (for each direction, if an albedo is asked for), >= 2.

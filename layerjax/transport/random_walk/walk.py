@@ -22,6 +22,7 @@ from jax import Array
 from layerjax.channels import Channels, largest, pick
 from layerjax.directions import Vector, scale, select
 from layerjax.microsurface import Microfacets
+from layerjax.surfaces import Conductor
 from layerjax.transport.random_walk import microsurface, surfaces
 from layerjax.transport.random_walk.flight import boundary, fly
 from layerjax.transport.random_walk.next_event import (
@@ -29,7 +30,10 @@ from layerjax.transport.random_walk.next_event import (
     make_goal,
     make_target,
     meet_exit,
+    meet_opposite,
     no_aim,
+    no_relay,
+    relayed,
     start_aiming,
 )
 from layerjax.transport.random_walk.scene import Scene
@@ -71,15 +75,16 @@ class Walk:
         self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other
         self.adjacent = self.aims and scene.surfaces > 1
+        self.relays = self._may_relay() and wo is not None and orders != "first" and not self.multiple
         # whether aimed light and light that walks on are weighed against each other
-        self.mixes = self.adjacent or (self.aims and bool(scene.media))
+        self.mixes = self.adjacent or self.relays or (self.aims and bool(scene.media))
         self.fades = bool(scene.surfaces) or not scene.lossless or scene.colored_depths
         self.blocks = 2 if scene.surfaces or scene.colored_depths else 1
 
     def start(self, u: Array) -> PathState:
         """Paths at their beginning; u draws the channel, where one is drawn."""
         path = self._start(u)
-        return path if not self.aims or self.goal is None else start_aiming(path, self.goal)
+        return path if path.aiming is None or self.goal is None else start_aiming(path, self.goal)
 
     def step(self, path: PathState, u: list[Array]) -> tuple[PathState, Step]:
         """One event: a collision, a bounce at a surface, or the way out. The caller restarts paths that end."""
@@ -90,10 +95,19 @@ class Walk:
         arrived: Channels = ()
         if self.goal is not None and target is not None:
             arrived = contribution(self.scene, self.goal, path, arrival, event, target, self.orders)
+            if self.relays:
+                more = relayed(self.scene, self.goal, path, arrival, event)
+                arrived = tuple(a + b for a, b in zip(arrived, more, strict=True))
         path, ends = self._continue(path, arrival, event, u)
         return path, Step(arrived, ends, *outside)
 
     # parts of a step
+
+    def _may_relay(self) -> bool:
+        """Whether there is an event before the reflection at a glossy surface that lies opposite the exit."""
+        scene = self.scene
+        glossy = isinstance(scene.base, Conductor) or len(scene.interfaces) > 1
+        return glossy and (scene.surfaces > 1 if scene.interfaces else bool(scene.media))
 
     def _start(self, u: Array) -> PathState:
         """Light along wi, as it enters the stack."""
@@ -113,8 +127,9 @@ class Walk:
             ratios=(one,) * scene.channels if scene.colored_depths else (),
             drawn_for=drawn if scene.colored_depths else None,
             order=index if self.counts else None,
-            aiming=above & ~above if self.aims else None,
+            aiming=above & ~above if self.aims or self.relays else None,
             aim=no_aim(scene, direction) if self.aims else None,
+            relay=no_relay(scene, direction) if self.relays else None,
             inverse_density=zero if self.mixes else None,
             facet=microsurface.away(direction) if self.multiple else None,
         )
@@ -157,7 +172,12 @@ class Walk:
         density, share = scene.collide(medium, wi, target.direction, area)
         sent = tuple(density * pick(share, c) for c in range(scene.channels))
         next_density = scene.collide(medium, wi, direction, area)[0] if self.mixes else None
-        return Event(direction, kept, arrival.collides, sent, density, next_density)
+        event = Event(direction, kept, arrival.collides, sent, density, next_density)
+        if path.relay is None:
+            return event
+        density, share = scene.collide(medium, wi, path.relay.travel, area)
+        sent = tuple(density * pick(share, c) for c in range(scene.channels))
+        return event._replace(relayed=sent, relayed_density=density)
 
     def _bounce(
         self, path: PathState, arrival: Arrival, target: Target | None, u: list[Array]
@@ -169,7 +189,8 @@ class Walk:
         leaves = at_surface
         from_above = jnp.ones_like(at_surface) if path.region is None else jnp.asarray(path.region == surface)
         towards = None if target is None else target.direction
-        refracts = None if self.multiple else path.aiming
+        at_exit = at_surface if path.region is None or self.goal is None else jnp.asarray(surface == self.goal.exit)
+        refracts = None if self.multiple or path.aiming is None else path.aiming & at_exit
         hit = surfaces.bounce(scene, surface, from_above, travel, towards, refracts, (u[1], u[2], u[4]))
         entry, entered_above = travel, from_above
         if path.facet is not None:
@@ -188,9 +209,28 @@ class Walk:
             event = event._replace(density=densities[0], next_density=densities[1])
         if self.aims:
             assert self.goal is not None
-            aim, weight = meet_exit(scene, self.goal, path, entry, hit, leaves, multiple=self.multiple)
+            aim, weight = meet_exit(scene, self.goal, path, entry, hit, leaves, at_exit, multiple=self.multiple)
             path, event = path._replace(aim=aim), event._replace(exit_weight=weight)
+        if self.relays and towards is not None:
+            path, event = self._relay(path, arrival, event, from_above, hit, towards)
         return path, event
+
+    def _relay(
+        self, path: PathState, arrival: Arrival, event: Event, from_above: Array, hit: surfaces.Bounce, towards: Vector
+    ) -> tuple[PathState, Event]:
+        """What a surface sends along the relay; at the one opposite the exit, what relays are weighed with."""
+        assert self.goal is not None
+        assert path.relay is not None
+        assert arrival.at_surface is not None
+        scene, surface, opposite = self.scene, arrival.surface, arrival.at_surface
+        if path.region is not None:
+            opposite = opposite & (surface == self.goal.opposite)
+        if scene.interfaces:
+            sent, density = surfaces.interface_towards(scene, surface, from_above, path.direction, path.relay.travel)
+            event = event._replace(relayed=(sent,), relayed_density=density)
+        relay, to_target, onward = meet_opposite(scene, self.goal, path, surface, from_above, hit, towards, opposite)
+        next_density = None if event.next_density is None else event.next_density / onward
+        return path._replace(relay=relay), event._replace(rivals=to_target, next_density=next_density)
 
     def _meet_facet(
         self,
@@ -245,7 +285,10 @@ class Walk:
         if path.aiming is not None:
             assert event.leaves is not None
             ready = path.aiming & event.leaves
-            begun = self._start(u[7])._replace(aim=path.aim)
+            begun = self._start(u[7])._replace(aim=path.aim, relay=path.relay)
+            if self.relays and path.aim is not None:  # the ray that has passed the exit goes on to draw the relay
+                assert self.goal is not None
+                ready = ready & ~((arrival.surface == self.goal.exit) & (after.region == self.goal.inner))
             after = jax.tree.map(lambda new, old: jnp.where(ready, new, old), begun, after)
             ends = ends & ~path.aiming
         return after, ends
@@ -254,8 +297,12 @@ class Walk:
         """1 / density of the new direction where the light of this event was aimed through the exit as well, else 0."""
         goal = self.goal
         assert goal is not None
-        adjacent = jnp.where(jnp.asarray(arrival.at_surface), arrival.surface == goal.opposite, True)
-        aimed = adjacent & (after.region == goal.inner)
+        at_surface = jnp.asarray(arrival.at_surface)
+        if after.region is None:
+            aimed = ~at_surface
+        else:
+            met = (arrival.surface == goal.opposite) | ((arrival.surface == goal.exit) if self.relays else False)
+            aimed = jnp.where(at_surface, met, True) & (after.region == goal.inner)
         return jnp.where(aimed, 1.0 / jnp.maximum(density, jnp.finfo(density.dtype).tiny * 1e4), 0.0)
 
 

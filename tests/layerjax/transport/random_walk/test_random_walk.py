@@ -54,8 +54,9 @@ def test_first_order(stack, pairs):
 
 
 @pytest.mark.slow
-def test_orders_add_up():
-    stack = lj.Stack([lj.Interface(1.5, 0.3), haze(0.3, 0.8, 0.9)], lj.Lambertian(0.6))
+@pytest.mark.parametrize("base", [lj.Lambertian(0.6), lj.Conductor(0.2, 3.9, 0.05)])
+def test_orders_add_up(base):
+    stack = lj.Stack([lj.Interface(1.5, 0.3), haze(0.3, 0.8, 0.9)], base)
     every, first, rest = (repeated(stack, WI, ABOVE, orders=orders)[0] for orders in ("all", "first", "multiple"))
     assert_mean(every - first - rest, 0.0)
     np.testing.assert_allclose(first, interface_reflection(split(WI), split(ABOVE), 1.5, 0.3), rtol=1e-9)
@@ -83,6 +84,11 @@ def test_one_interface(ior):
         (lj.Stack([lj.Interface(1.5, 0.4)], lj.Conductor(0.2, 3.9, 0.4)), {"microfacets": "multiple"}),
         pytest.param(
             *(lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Lambertian(0.8)), {}), marks=pytest.mark.slow
+        ),
+        pytest.param(
+            lj.Stack([lj.Interface(1.5, 0.2), haze(0.5, 1.0, 0.9)], lj.Conductor(0.2, 3.9, 0.01)),
+            {},
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -122,6 +128,21 @@ def test_a_narrow_interface_is_found():
     trapped = 1 - np.sum(0.5 * w * 2 * z * passes(z)) / 1.5**2
     expected = passes(float(WI[2])) * passes(float(ABOVE[2])) / 1.5**2 * 0.5 / np.pi / (1 - 0.5 * trapped)
     assert abs(values[0] - expected) < 4 * errors[0] + 1e-4 * expected
+
+
+@pytest.mark.parametrize("coated", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_narrow_metal_is_found(coated):
+    # a perfect mirror shows its surroundings once more: half of a stack that is the same from both sides
+    half, whole = haze(0.3, 0.7, 0.8), haze(0.3, 1.4, 0.8)
+    coats = [lj.Interface(1.5, 0.3), lj.Interface(1.0, 0.3)] if coated else []
+    mirror = lj.Stack([*coats[:1], half], lj.Conductor(0.01, 10.0, 1e-3))  # loses 4e-4
+    walk = lj.RandomWalk(paths=8192)
+    values, errors = lj.evaluate_with_error(mirror, WI, ABOVE, walk, key=KEY)
+    assert errors[0] < 0.02 * values[0]
+    both = jnp.stack([ABOVE, ABOVE * jnp.asarray([1.0, 1.0, -1.0])])
+    unfolded = lj.Stack([*coats[:1], whole, *coats[1:]])
+    halves, spreads = lj.evaluate_with_error(unfolded, WI, both, walk, key=KEY)
+    assert abs(values[0] - halves.sum()) < 4 * np.hypot(errors[0], np.hypot(*spreads[:, 0])) + 2e-3 * values[0]
 
 
 def test_a_metal_is_indexed_against_what_surrounds_the_stack():
