@@ -29,7 +29,7 @@ from fits.progress import Progress
 INDEPENDENT = 0.5
 BY_SURROGATE, BESIDE = 0.8, 0.1  # share of its moves, and of each of the other two beside them
 COSTLY = 200e-6  # seconds an evaluation: below, walks of a surrogate and their compilation take longer than they save
-TIMED = 3
+TRIES, ENOUGH = 3, 0.1  # that it is timed at least, and seconds after which it is timed no more
 
 Floats = NDArray[np.float64]
 Proposals = Approximation | Mixture
@@ -117,11 +117,15 @@ def log_posteriors(model: Model, positions: Array) -> Array:
     return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
 
 
-def seconds_an_evaluation(problem: Problem, positions: Floats) -> float:
-    """Time of one log-posterior by the clock, at its best, in a program that has been compiled before."""
-    best = np.inf
-    for _ in range(TIMED):
-        began = time.perf_counter()
+def is_costly(problem: Problem, positions: Floats) -> bool:
+    """Whether a log-posterior takes more than COSTLY by the clock, at its best, in a program compiled before.
+
+    One look under that ends it, and the others may be slow: another process may have had the processor.
+    """
+    began, tries = time.perf_counter(), 0
+    while tries < TRIES or time.perf_counter() - began < ENOUGH:
+        before, tries = time.perf_counter(), tries + 1
         np.asarray(problem.call(log_posteriors, positions))
-        best = min(best, time.perf_counter() - began)
-    return float(best) / len(positions)
+        if time.perf_counter() - before <= COSTLY * len(positions):
+            return False
+    return True

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.special import logit
 from scipy.stats import qmc
 
-from fits.inference import ensemble
 from fits.inference.chain import SURROGATE, FileChain, MemoryChain, another, stored_chain
 from fits.inference.design import Kept
-from fits.inference.ensemble import Ensemble, log_posteriors, seconds_an_evaluation
+from fits.inference.ensemble import Ensemble, is_costly, log_posteriors
 from fits.inference.fit_result import Fit
 from fits.inference.length import FIRST_CHECK, Outlook, finished, next_check
 from fits.inference.nuts import CHAINS, Nuts, require_blackjax
@@ -152,7 +151,7 @@ def _decide(
             raise ValueError(another(path or "memory", "surrogate"))
         return
     if surrogate is None:
-        surrogate = seconds_an_evaluation(sampler.problem, _fixed_points(sampler.problem)) > ensemble.COSTLY
+        surrogate = is_costly(sampler.problem, _fixed_points(sampler.problem))
     beside = None if path is None else Path(path).with_suffix(SURROGATE)
     sampler.decide(surrogate, Kept(beside, identity), progress)
 

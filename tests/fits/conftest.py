@@ -1,5 +1,7 @@
 """One small fit of simulated data that the tests of results, reports and the command line share."""
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -8,6 +10,7 @@ import layerjax as lj
 from fits.data.formats.csv import write_csv
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
+from fits.inference import ensemble
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
 from fits.problem.simulate import simulate
@@ -28,6 +31,14 @@ albedo = 0.8
 kind = "Lambertian"
 albedo = { start = 0.5, low = 0.0, high = 1.0 }
 """
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cheap() -> Iterator[None]:
+    """No model here is costly, however slow the machine: what a sampler proposes does not hang on the clock."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ensemble, "COSTLY", math.inf)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -140,6 +140,21 @@ def test_it_is_chosen_by_the_clock(result: Fit, monkeypatch: pytest.MonkeyPatch,
         sample(result, **options, surrogate=True)
 
 
+@pytest.mark.parametrize(("seconds", "costly"), [([0.01] * 5 + [3e-4], False), ([1e-3] * 200, True)])
+def test_one_quick_look_is_enough(monkeypatch: pytest.MonkeyPatch, seconds: list[float], costly: bool) -> None:
+    """A clock of our own: a look at three points takes what is said here, whatever else the machine does."""
+    passed, looks = [0.0], iter(seconds)
+
+    class Timed:
+        def call(self, *_: object) -> float:
+            passed[0] += next(looks)
+            return 0.0
+
+    monkeypatch.setattr(ensemble, "COSTLY", 200e-6)
+    monkeypatch.setattr(ensemble.time, "perf_counter", lambda: passed[0])
+    assert ensemble.is_costly(Timed(), np.zeros((3, 2))) == costly
+
+
 def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior, tmp_path: Path) -> None:
     path = tmp_path / "chain.h5"
     sample(result, path=path, **SHORT | {"max_steps": 120})

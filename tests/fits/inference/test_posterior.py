@@ -220,7 +220,8 @@ from fits.inference.sampling import sample
 from tests.helpers.models import line_fit
 result = line_fit()
 print("ready", flush=True)
-posterior = sample(result, walkers=16, seed=1, path=sys.argv[1], progress=lambda *a: time.sleep(0.02))
+options = {"walkers": 16, "seed": 1, "surrogate": False}
+posterior = sample(result, path=sys.argv[1], progress=lambda *a: time.sleep(0.02), **options)
 np.save(sys.argv[2], posterior.chain)
 """
 
