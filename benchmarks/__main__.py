@@ -1,9 +1,10 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
-``calibration`` (are posteriors?), ``error-vs-time`` (every model against the truth, over the suite of stacks),
-``references`` (the solver and the walk beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe
-by lobe, beside the walk), ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy,
-figures, fits), ``endf`` (thin coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each
-other) and ``side-by-side`` (which transport when: a page of docs from the results of error-vs-time)."""
+``calibration`` (are posteriors?), ``samplers`` (do they agree?), ``error-vs-time`` (every model against the truth, over
+the suite of stacks), ``references`` (the solver and the walk beside PythonicDISORT and Mitsuba), ``statistics``
+(directional statistics, lobe by lobe, beside the walk), ``spongecake`` (its multiple scattering beside the truth:
+held-out materials, energy, figures, fits), ``endf`` (thin coats beside a walk of one bounce), ``rough-diffuse`` (rough
+diffuse surfaces beside each other) and ``side-by-side`` (which transport when: a page of docs from the results of
+error-vs-time)."""
 
 import argparse
 import importlib
@@ -13,8 +14,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-NAMES = ("throughput", "recovery", "calibration", "error-vs-time", "references", "statistics", "spongecake", "endf",
-         "rough-diffuse", "side-by-side")  # fmt: skip
+NAMES = ("throughput", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
+         "spongecake", "endf", "rough-diffuse", "side-by-side")  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,7 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     calibrated.add_argument(
         "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), default=(6, 6), help="of AddingDoubling"
     )
-    for command in (compared, calibrated):
+    for command in (compared, calibrated, commands.choices["samplers"]):
         command.add_argument(
             "--resume", action="store_true", help="keep what the directory holds, and add what it lacks"
         )
@@ -74,6 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         nodes, modes = given.resolution
         options |= {"transport": AddingDoubling(nodes=nodes, modes=modes), "repeats": given.repeats}
+        options["resume"] = given.resume
+    if given.benchmark == "samplers":
         options["resume"] = given.resume
     study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
     text, paths = study(**options)

@@ -9,7 +9,6 @@ from typing import Any
 
 import emcee
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from fits.inference.ensemble import log_posteriors
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.mixture import Mixture
+from fits.problem.compiled import cores, in_shares
 from fits.problem.model import Model
 from fits.progress import Progress
 
@@ -46,6 +46,7 @@ class Nuts:
 
     def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
         self.fit, self.problem, self.chain, self.seed = fit, fit.problem, chain, seed
+        self._compiled = False
 
     def decide(self, progress: Progress | None) -> None:
         """Before the first step, and for all: starts, metric and length of steps, by a warm-up that is not kept."""
@@ -84,8 +85,15 @@ class Nuts:
             tell()
 
     def _step(self, positions: Floats, number: int, length: float, metric: Floats) -> tuple[Any, ...]:
-        found = self.problem.call(_step, positions, self.seed, number, length, metric)
-        return tuple(np.asarray(part) for part in found)
+        """What `_step` gives, the chains on all cores: each follows as many gradients as its own trajectory takes."""
+
+        def call(rows: Floats) -> tuple[Array, ...]:
+            return self.problem.call(_step, rows[:, 1:], rows[:, 0].astype(int), self.seed, number, length, metric)
+
+        rows = np.column_stack([np.arange(len(positions)), positions])
+        found = in_shares(call, rows, -(-len(rows) // cores()), self._compiled)
+        self._compiled = True
+        return tuple(found)
 
     def _finite(self, positions: Floats) -> bool:
         return bool(np.all(np.isfinite(self.problem.call(log_posteriors, positions))))
@@ -104,9 +112,10 @@ def _refined(metric: Floats, samples: Floats) -> Floats:
 
 
 def _step(
-    model: Model, positions: Array, seed: Array, number: Array, length: Array, metric: Array
+    model: Model, positions: Array, chains: Array, seed: Array, number: Array, length: Array, metric: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Where a step takes each chain (n, P), the log-posterior there, whether it diverged, and its mean acceptance."""
+    """Where a step takes chains (n, P) of these numbers, the log-posteriors there, whether they diverged, and their
+    mean acceptance."""
     from blackjax.mcmc import nuts
 
     kernel, height = nuts.build_kernel(), model.log_posterior_unconstrained
@@ -119,4 +128,4 @@ def _step(
         state, info = kernel(jax.random.fold_in(key, index), state, height, length, metric)
         return state.position, state.logdensity, info.is_divergent, info.acceptance_rate
 
-    return jax.lax.map(one, (jnp.arange(len(positions)), positions))
+    return jax.lax.map(one, (chains, positions))

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -42,10 +42,18 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
-def in_shares(call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: int) -> list[NDArray[Any]]:
+@cache
+def _threads() -> ThreadPoolExecutor:
+    """One for each core, kept for the next call."""
+    return ThreadPoolExecutor(cores())
+
+
+def in_shares(
+    call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: int, compiled: bool = False
+) -> list[NDArray[Any]]:
     """The arrays that call(rows) gives, by so many rows at a time, on all cores: a program keeps but one busy.
 
-    The last share is padded, so that all have one program; the first runs alone, and compiles it.
+    The last share is padded, so that all have one program; unless it is compiled, the first runs alone and does that.
     """
 
     def of(first: int) -> list[NDArray[Any]]:
@@ -54,6 +62,6 @@ def in_shares(call: Callable[[NDArray[Any]], Any], rows: NDArray[Any], share: in
         return [np.asarray(result)[: len(part)] for result in call(padded)]
 
     firsts = range(0, len(rows), share)
-    with ThreadPoolExecutor(cores()) as pool:
-        parts = [of(firsts[0]), *pool.map(of, firsts[1:])]
+    alone = 0 if compiled else 1
+    parts = [*map(of, firsts[:alone]), *_threads().map(of, firsts[alone:])]
     return [np.concatenate(results) for results in zip(*parts, strict=True)]

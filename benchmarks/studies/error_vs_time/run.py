@@ -7,9 +7,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from benchmarks.measuring import accuracy, environment
+from benchmarks.measuring.memory import keep_within
 from benchmarks.measuring.writing import DIRECTORY, rounded, write
 from benchmarks.studies.error_vs_time import pictures as error_pictures
 from benchmarks.studies.error_vs_time import tables as error_tables
@@ -22,8 +21,6 @@ from fits.reporting.plots.data import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)
-KEPT = 6
-"""Stacks after which compiled programs are dropped: a process may map a limited number of pieces of memory only."""
 QUICK_STEP = 6
 """A quick run takes every so many stacks."""
 
@@ -94,8 +91,7 @@ def study(
     held = _held(directory, setup.settings) if resume else Held()
     programs = Programs()
     for index, case in enumerate(cases, start=1):
-        if index % KEPT == 0:
-            jax.clear_caches()
+        keep_within()
         began = time.perf_counter()
         if not _measure(case, setup, held, programs):
             continue

@@ -76,7 +76,7 @@ def test_one_parameter(name: str) -> None:
     assert deviation == pytest.approx(spread, rel=error)
 
 
-@pytest.mark.parametrize("name", SAMPLERS)
+@pytest.mark.parametrize("name", [pytest.param("delayed acceptance", marks=pytest.mark.slow), "NUTS"])
 def test_a_direction_that_is_open_fills_its_box(name: str) -> None:
     if name == "NUTS":
         pytest.importorskip("blackjax")

@@ -97,6 +97,7 @@ def test_a_shard_is_made_once_and_always_the_same(tmp_path, monkeypatch):
     np.testing.assert_allclose(again.values[3, 2], truth, rtol=1e-3, atol=1e-5 * np.max(truth))
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_as_if_it_had_not_been(tmp_path):
     samples = drawn(1, shards=1)
     lines: list[str] = []

@@ -104,7 +104,14 @@ STACKS = {
 }
 
 
-@pytest.fixture(scope="module", params=STACKS, ids=str)
+SLOW = ("coated metal",)
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in STACKS],
+    ids=str,
+)
 def solved(request):
     stack = STACKS[request.param]
     return stack, lj.prepare(stack, lj.AddingDoubling(nodes=24, modes=24))
@@ -180,14 +187,15 @@ def test_the_error_estimate_covers_the_error():
     assert np.sqrt(np.mean((values - truth) ** 2)) <= np.sqrt(np.mean(errors**2))
 
 
-def test_tolerance_picks_the_resolution():
+@pytest.mark.parametrize("tolerance", [0.02, pytest.param(1e-3, marks=pytest.mark.slow)])
+def test_tolerance_picks_the_resolution(tolerance):
     stack = STACKS["haze"]
     wi, wo = directions(60, seed=8), directions(60, seed=9)
-    values = lj.evaluate(stack, wi, wo, lj.AddingDoubling(tolerance=1e-3))
+    values = lj.evaluate(stack, wi, wo, lj.AddingDoubling(tolerance=tolerance))
     truth = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=20, modes=30))
-    assert np.max(np.abs(values - truth) / (truth + 0.1 * truth.mean())) <= 1e-3
+    assert np.max(np.abs(values - truth) / (truth + 0.1 * truth.mean())) <= tolerance
     with pytest.raises(ValueError, match=r"AddingDoubling.tolerance.*outside jit"):
-        jax.jit(lambda t: lj.evaluate(Stack([Medium(t)]), wi, wo, lj.AddingDoubling(tolerance=0.1)))(1.0)
+        jax.jit(lambda t: lj.evaluate(Stack([Medium(t)]), wi, wo, lj.AddingDoubling(tolerance=tolerance)))(1.0)
 
 
 @pytest.mark.slow

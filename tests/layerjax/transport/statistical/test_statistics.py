@@ -96,7 +96,7 @@ def paths(elements: list[Element]) -> tuple[float, float, float, float]:
     return left[0, 0], left[0, 1] / left[0, 0], left[1, 0], left[1, 1] / left[1, 0]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [*(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)), 3])
 def test_adding_is_the_sum_over_paths(seed: int) -> None:
     elements = random_elements(seed, 4)
     above, lobes = nothing(jnp.ones(1)), []

@@ -1,0 +1,220 @@
+"""Do samplers agree? emcee by itself, delayed acceptance and NUTS on posteriors of all orders of scattering."""
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import fits
+import layerjax as lj
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, rounded, table, write
+from benchmarks.suite import coated_haze
+
+NAME = "samplers"
+TRANSPORT = lj.AddingDoubling(nodes=6, modes=6)
+NOISE, FLOOR = 0.05, 1e-6
+ESS, QUICK, STEPS = 6000.0, 1000.0, 100_000
+LEAST, APART = 5000.0, 0.1
+"""Effective samples of the worst parameter, and deviations that quantiles may differ by."""
+QUANTILES = (0.158655, 0.5, 0.841345)
+
+PLAIN = "emcee by itself"
+SAMPLERS: dict[str, dict[str, Any]] = {
+    PLAIN: {"surrogate": False},
+    "delayed acceptance": {"surrogate": True},
+    "NUTS": {"sampler": "nuts"},
+}
+
+TEXT = """\
+# Do samplers agree?
+
+{environment}
+Posteriors of a rough interface over haze over a diffuse base, all orders of scattering, by `{transport}`: 140
+readings in the plane of incidence, simulated with noise of {noise:.0%}. Each is sampled until its worst parameter has
+{ess:,.0f} effective samples. *taken* is the share of proposals that were, *lost* the number of divergent steps; *apart*
+is the largest difference of a quantile (16, 50 and 84 %) of any parameter from that of emcee by itself, in standard
+deviations of the parameter. Samplers agree where it is below {apart:g} with {least:,.0f} effective samples or more.
+
+{posteriors}
+{rows}"""
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """One posterior by one sampler. quantiles: (3, P), those of `QUANTILES`; deviations: (P,). effective: the least."""
+
+    posterior: str
+    sampler: str
+    parameters: list[str]
+    quantiles: list[list[float]]
+    deviations: list[float]
+    effective: float
+    steps: int
+    walkers: int
+    acceptance: float
+    divergences: int
+    converged: bool
+    moves: str
+    seconds: float
+
+
+def _fitted(free: dict[str, Any], relative: float | fits.Free = NOISE, transport: lj.Transport = TRANSPORT) -> fits.Fit:
+    """The fit of some parameters of the coated haze; the others are known. relative: the level of its noise."""
+    data = fits.simulate(coated_haze.stack_of(), coated_haze.readings(), transport, NOISE, FLOOR, seed=1)
+    stack = coated_haze.stack_of(coated_haze.PARAMETERS | free)
+    noise = fits.Noise(relative=relative, floor=FLOOR, use_sigma=False)
+    return fits.fit(stack, data, transport=transport, noise=noise, starts=4, seed=0)
+
+
+def five_parameters() -> fits.Fit:
+    """Thickness and asymmetry go together, and the albedo alone is known"""
+    return _fitted({name: free for name, free in coated_haze.FREE.items() if name != "albedo"})
+
+
+def on_a_bound() -> fits.Fit:
+    """The base is darker (0.3) than the box has it (0.35 to 1)"""
+    free = {name: coated_haze.FREE[name] for name in ("ior", "alpha", "thickness")}
+    return _fitted(free | {"base": fits.Free(0.5, 0.35, 1.0)})
+
+
+def free_noise_level() -> fits.Fit:
+    """The level of the noise is found with the stack"""
+    free = {name: coated_haze.FREE[name] for name in ("ior", "alpha", "base")}
+    return _fitted(free, fits.Free(0.1, 0.005, 1.0))
+
+
+POSTERIORS: dict[str, Callable[[], fits.Fit]] = {
+    "five parameters": five_parameters,
+    "on a bound": on_a_bound,
+    "free noise level": free_noise_level,
+}
+
+
+def study(
+    quick: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+    directory: Path = DIRECTORY,
+    resume: bool = False,
+    posteriors: Mapping[str, Callable[[], fits.Fit]] = POSTERIORS,
+    ess: float | None = None,
+) -> tuple[str, tuple[Path, Path]]:
+    """Run it, and write ``samplers.json`` and ``.md``; returns the markdown and the two paths.
+
+    Args:
+        quick: 1,000 effective samples: a look, no result to quote.
+        resume: keep what the directory holds, and sample what it lacks. Each chain is written as it ends.
+        posteriors: fits by name, made where they are needed.
+        ess: effective samples that are asked for; 6,000 if None.
+
+    Raises:
+        ValueError: samples to resume that were drawn with other settings.
+    """
+    wanted = ess or (QUICK if quick else ESS)
+    settings = rounded(
+        {"transport": repr(TRANSPORT), "noise": NOISE, "ess": wanted, "parameters": coated_haze.PARAMETERS}
+    )
+    done = _held(directory, settings) if resume else []
+    surroundings = environment.describe()
+    text, paths = "", (Path(), Path())
+    for name, made in posteriors.items():
+        missing = [key for key in SAMPLERS if not any((one.posterior, one.sampler) == (name, key) for one in done)]
+        fit = made() if missing else None
+        for sampler in missing:
+            assert fit is not None
+            done.append(_sampled(name, sampler, fit, wanted))
+            text, paths = _save(done, settings, surroundings, posteriors, directory)
+            report(f"{name}, {sampler}: {done[-1].effective:,.0f} effective samples, {done[-1].seconds:.0f} s")
+    return (text, paths) if text else _save(done, settings, surroundings, posteriors, directory)
+
+
+def _sampled(name: str, sampler: str, fit: fits.Fit, ess: float) -> Sampled:
+    began = time.perf_counter()
+    posterior = fits.sample(fit, seed=1, ess=ess, max_steps=STEPS, allow_short=True, **SAMPLERS[sampler])
+    kept = posterior.chain[posterior.burn_in :].reshape(-1, len(posterior.names))
+    return Sampled(
+        posterior=name,
+        sampler=sampler,
+        parameters=list(posterior.names),
+        quantiles=np.quantile(kept, QUANTILES, axis=0).tolist(),
+        deviations=kept.std(axis=0).tolist(),
+        effective=float(posterior.effective_samples.min()),
+        steps=posterior.chain.shape[0],
+        walkers=posterior.chain.shape[1],
+        acceptance=float(posterior.acceptance),
+        divergences=posterior.divergences,
+        converged=posterior.converged,
+        moves=posterior.status,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def apart(one: Sampled, plain: Sampled) -> float:
+    """The largest difference of a quantile, in standard deviations of `plain`."""
+    return float(np.max(np.abs(np.subtract(one.quantiles, plain.quantiles)) / np.array(plain.deviations)))
+
+
+def _held(directory: Path, settings: Mapping[str, Any]) -> list[Sampled]:
+    """What the directory holds; ValueError if it was sampled with other settings."""
+    path = directory / f"{NAME}.json"
+    if not path.exists():
+        return []
+    content = json.loads(path.read_text())
+    if content["settings"] != settings:
+        raise ValueError(f"{path}: sampled with other settings, it cannot be resumed")
+    return [Sampled(**record) for record in content["chains"]]
+
+
+def _save(
+    done: list[Sampled],
+    settings: Mapping[str, Any],
+    surroundings: Mapping[str, Any],
+    posteriors: Mapping[str, Callable[[], fits.Fit]],
+    directory: Path,
+) -> tuple[str, tuple[Path, Path]]:
+    """Write all chains so far and what they say; returns the markdown and the paths."""
+    plain = {one.posterior: one for one in done if one.sampler == PLAIN}
+    text = TEXT.format(
+        environment=environment_lines(surroundings),
+        transport=settings["transport"],
+        noise=NOISE,
+        ess=settings["ess"],
+        apart=APART,
+        least=LEAST,
+        posteriors="".join(f"- *{name}*: {(made.__doc__ or '').strip()}.\n" for name, made in posteriors.items()),
+        rows=table(
+            ("posterior", "sampler", "effective", "steps", "walkers", "taken", "lost", "seconds", "apart", "verdict"),
+            [_row(one, plain.get(one.posterior)) for one in done],
+        ),
+    )
+    content = {
+        "environment": dict(surroundings),
+        "settings": dict(settings),
+        "chains": [asdict(one) for one in done],
+    }
+    return text, write(NAME, content, text, directory)
+
+
+def _row(one: Sampled, plain: Sampled | None) -> tuple[str, ...]:
+    difference, verdict = "-", "-"
+    if plain is not None and plain is not one:
+        value = apart(one, plain)
+        long_enough = min(one.effective, plain.effective) >= LEAST
+        difference = figure(value, 2)
+        verdict = "too short" if not long_enough else "agree" if value < APART else "**differ**"
+    return (
+        one.posterior,
+        one.sampler,
+        f"{one.effective:,.0f}",
+        f"{one.steps:,}",
+        str(one.walkers),
+        f"{one.acceptance:.2f}",
+        str(one.divergences) if one.sampler == "NUTS" else "-",
+        figure(one.seconds),
+        difference,
+        verdict,
+    )
