@@ -169,7 +169,7 @@ class Stop(Exception):
     pass
 
 
-@pytest.mark.parametrize("after", [1, pytest.param(70, marks=pytest.mark.slow), 160])
+@pytest.mark.parametrize("after", [160, *(pytest.param(after, marks=pytest.mark.slow) for after in (1, 70))])
 def test_interrupted_building_goes_on_to_the_same_chain(
     result: Fit, short: Posterior, tmp_path: Path, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

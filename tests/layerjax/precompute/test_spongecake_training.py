@@ -137,6 +137,7 @@ def test_networks_are_packed_and_unpacked():
         np.testing.assert_allclose(mine.bias, other.bias, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_energies_are_balanced_once_and_always_the_same(tmp_path, monkeypatch):
     monkeypatch.setattr(bending, "SHARD", 2)
     monkeypatch.setattr(bending, "RULE", bending.Rule(nodes=4, cosines=3, azimuths=4, rounds=4))

@@ -37,7 +37,7 @@ def pairs(n=PAIRS, seed=3):
     return lj.direction(theta[0], phi[0]), lj.direction(theta[1], phi[1])
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "flakes")) for name in STACKS])
 def test_reciprocal_positive_and_by_sides(name):
     stack, (wi, wo) = STACKS[name], pairs()
     values = lj.evaluate(stack, wi, wo, CAKE)
@@ -176,7 +176,7 @@ BOXES["fibers over haze"] = lambda p: [
     [
         ("flakes", jnp.float32),
         ("haze", jnp.float64),
-        ("fibers over haze", jnp.float32),
+        pytest.param("fibers over haze", jnp.float32, marks=pytest.mark.slow),
         pytest.param("flakes", jnp.float64, marks=pytest.mark.slow),
         pytest.param("haze", jnp.float32, marks=pytest.mark.slow),
         pytest.param("fibers over haze", jnp.float64, marks=pytest.mark.slow),

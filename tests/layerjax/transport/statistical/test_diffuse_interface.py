@@ -122,7 +122,15 @@ def absorbed(energy, path, tau):
     return left, np.sqrt(left * (1 - left) / PATHS) + 1e-4
 
 
-@pytest.mark.parametrize(("n", "alpha"), [(1 / 1.5, 0.3), (1.5, 0.6), (2.5, 0.2), (0.5, 0.9)])
+@pytest.mark.parametrize(
+    ("n", "alpha"),
+    [
+        (1.5, 0.6),
+        (0.5, 0.9),
+        pytest.param(1 / 1.5, 0.3, marks=pytest.mark.slow),
+        pytest.param(2.5, 0.2, marks=pytest.mark.slow),
+    ],
+)
 def test_rough_coats_against_the_walk(n, alpha):
     cosine = np.asarray([0.2, 0.5, 0.8, 1.0])
     stack = lj.Stack([lj.Interface(n, alpha)])

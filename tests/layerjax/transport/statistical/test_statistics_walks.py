@@ -64,7 +64,9 @@ def count(stack, microfacets="multiple", seed=1):
     ]
 
 
-@pytest.mark.parametrize("name", WALKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * name.startswith("2/.5")) for name in WALKS]
+)
 def test_walk_gives_published_energies(name):
     """4 standard errors of both walks together."""
     stack, (albedo, error), below, _ = WALKS[name]
