@@ -20,6 +20,31 @@ NAMES = ("throughput", "recovery", "calibration", "samplers", "error-vs-time", "
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
+    parser = _parser()
+    given = parser.parse_args(arguments)
+
+    # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    began = time.perf_counter()
+
+    def report(line: str) -> None:
+        print(f"[{time.perf_counter() - began:5.0f} s] {line}", file=sys.stderr, flush=True)
+
+    try:
+        options = _options(given)
+    except ValueError as error:
+        parser.error(str(error))
+    study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
+    text, paths = study(report=report, **options)
+    print(text)
+    report(f"written: {', '.join(map(str, paths))}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     commands = parser.add_subparsers(dest="benchmark", required=True)
     for name in NAMES:
@@ -44,45 +69,30 @@ def main(arguments: list[str] | None = None) -> int:
         command.add_argument(
             "--resume", action="store_true", help="keep what the directory holds, and add what it lacks"
         )
-    given = parser.parse_args(arguments)
+    return parser
 
-    # before numpy is loaded: two threads on a 2,000 x 6 matrix only get into each other's way, and scipy pays for it
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    import jax
 
-    jax.config.update("jax_enable_x64", True)
-    began = time.perf_counter()
-
-    def report(line: str) -> None:
-        print(f"[{time.perf_counter() - began:5.0f} s] {line}", file=sys.stderr, flush=True)
-
-    options: dict[str, Any] = {"quick": given.quick, "report": report}
+def _options(given: argparse.Namespace) -> dict[str, Any]:
+    """What a study is called with, by what was given on the command line; ValueError names a model that is none."""
+    options: dict[str, Any] = {"quick": given.quick}
     if given.out is not None:
         options["directory"] = given.out
     if given.benchmark in ("throughput", "references"):
         options["with_peers"] = not given.no_peers
     if given.benchmark == "spongecake":
         options["work"] = given.work
+    if given.benchmark in ("error-vs-time", "calibration", "samplers"):
+        options["resume"] = given.resume
     if given.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
 
-        try:
-            options |= {"families": given.families, "models": named(given.models), "resume": given.resume}
-        except ValueError as error:
-            parser.error(str(error))
+        options |= {"families": given.families, "models": named(given.models)}
     if given.benchmark == "calibration":
         from layerjax import AddingDoubling
 
         nodes, modes = given.resolution
         options |= {"transport": AddingDoubling(nodes=nodes, modes=modes), "repeats": given.repeats}
-        options["resume"] = given.resume
-    if given.benchmark == "samplers":
-        options["resume"] = given.resume
-    study = importlib.import_module(f"benchmarks.studies.{given.benchmark.replace('-', '_')}").study
-    text, paths = study(**options)
-    print(text)
-    report(f"written: {', '.join(map(str, paths))}")
-    return 0
+    return options
 
 
 if __name__ == "__main__":
