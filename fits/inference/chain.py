@@ -245,7 +245,7 @@ def _refuse_others(path: Path, stored: Mapping[str, Any], identity: Mapping[str,
 
 
 def another(path: str | Path, name: str) -> str:
-    """That a file holds a chain of something else, by what differs."""
+    """The message that a file holds a chain of something else, by the name of what differs."""
     return (
         f"{path} holds a chain of another problem or setting ({name} differs): "
         "give another path, or resume=False to replace it"

@@ -55,12 +55,12 @@ class Resolutions:
 
     @property
     def far(self) -> lj.AddingDoubling:
-        """That of starts."""
+        """The resolution that starts are fitted at: the chosen one, but no finer than a look needs."""
         least = {name: min(getattr(self.chosen, name), most) for name, most in FAR.items()}
         return self._as_given(replace(self.chosen, **least))
 
     def finer(self, transport: lj.AddingDoubling) -> lj.AddingDoubling | None:
-        """The next one; None beyond the finest that is chosen."""
+        """The transport at the next finer resolution; None beyond the finest that is chosen."""
         finer = self._as_given(transport.finer())
         if self.open and not self.tilted:  # what is as fine as it gets stays, the other goes on
             nodes, modes = transport.nodes or 0, transport.modes or 0
@@ -74,14 +74,14 @@ class Resolutions:
         return None if finer == transport else finer
 
     def partly_finer(self, transport: lj.AddingDoubling, finer: lj.AddingDoubling) -> list[lj.AddingDoubling]:
-        """Those between the two: as fine as the second in modes alone, which cost less, and in nodes alone."""
+        """Transports between the two: as fine as `finer` in modes alone, which cost less, and in nodes alone."""
         if self.tilted:
             return []
         parts = [replace(transport, modes=finer.modes), replace(transport, nodes=finer.nodes)]
         return [part for part in parts if part not in (transport, finer)]
 
     def coarser(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
-        """The one before."""
+        """The transport at the next coarser resolution."""
         return self._as_given(transport.coarser())
 
     def in_words(self, transport: lj.AddingDoubling) -> str:
@@ -95,7 +95,7 @@ class Resolutions:
         return size or 0
 
     def _as_given(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
-        """With what was given along with what is chosen; all of it changes where nothing is chosen."""
+        """The transport with what the user gave put back in; unchanged where the user left nothing to choose."""
         if not self.open:
             return transport
         given = {name: value for name in FAR if (value := getattr(self.given, name)) is not None}
@@ -103,7 +103,7 @@ class Resolutions:
 
 
 def resolutions(problem: Problem) -> Resolutions | None:
-    """Those that the problem's transport may take; None if it has none.
+    """Resolutions that the problem's transport may take; None if it has none.
 
     Which transport "auto" is, is decided by what is known while tracing: a fit that passes through an index of 1 or an
     albedo of 0 stays with one.

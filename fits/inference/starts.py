@@ -22,7 +22,7 @@ MOST_ROUNDS = 20
 WORTH = 1e-3
 """A start that ran out of steps goes on while a round of them gains this in the log-posterior."""
 WORTH_OF_COST = 1e-6
-"""The same for a named objective, as a share of the cost."""
+"""With a named objective such a start goes on while a round gains this share of the cost."""
 
 
 def start_points(problem: Problem, starts: int, seed: int) -> Floats:

@@ -43,12 +43,12 @@ class Evaluated(NamedTuple):
     log_posterior: Floats
 
     def finite(self) -> "Evaluated":
-        """Those where the model is."""
+        """The evaluations whose residuals and log-posterior are finite."""
         whole = np.isfinite(self.log_posterior) & np.all(np.isfinite(self.residuals), axis=1)
         return Evaluated(*(part[whole] for part in self))
 
     def joined(self, more: "Evaluated") -> "Evaluated":
-        """These and more of them."""
+        """These evaluations followed by more of them."""
         return Evaluated(*(np.concatenate(parts) for parts in zip(self, more, strict=True)))
 
 

@@ -139,7 +139,7 @@ class Model(eqx.Module):
         return self.log_likelihood_per_datum_at(vector, self.predict(vector))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """The same with these parameters and what they predict, (N, C)."""
+        """Normalised log-density of each datum, (N, C), from the values (N, C) that the parameters predict."""
         sigma = self.sigma_at(vector, predicted)
         return log_density((self.values - predicted) / sigma, sigma, self.tails, self.degrees_of_freedom)
 

@@ -93,7 +93,7 @@ def require_computable(prior: Prior, low: NDArray[np.float64], high: NDArray[np.
 
 
 def _require_within_reach(prior: Prior, low: NDArray[np.float64], high: NDArray[np.float64], bounds: str) -> None:
-    """That of a Gaussian, in its own coordinate: neither out of sight of the bounds, nor a needle, nor a plain."""
+    """Refuse a Gaussian prior (in its own coordinate) that is out of sight of the bounds, a needle or a plain."""
     centre, inverse_sd = prior.gaussian()
     outside = np.maximum(np.maximum(low - centre, centre - high), 0.0)
     if np.any((outside > 0.0) & (outside * inverse_sd > FARTHEST_MEAN)):

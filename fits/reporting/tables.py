@@ -70,7 +70,7 @@ def _least_width(table: Table, columns: list[int], console: "Console") -> int:
 
 
 def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = False) -> "Boxed":
-    """These columns in a box. Texts may be wrapped, numbers only where the box is to be `squeezed`."""
+    """The named columns of a table in a box. Texts may be wrapped, numbers only where the box is to be `squeezed`."""
     from rich import box
     from rich.cells import cell_len
     from rich.table import Table as Boxed

@@ -91,7 +91,7 @@ class PhaseFunction(eqx.Module):
         return True
 
     def mirrored(self) -> "PhaseFunction":
-        """The same upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
+        """The phase function upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
         return self
 
     @property

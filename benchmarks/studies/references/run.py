@@ -46,7 +46,7 @@ FULL_RESOLUTIONS = (
     *((14, 14), (15, 14), (14, 16), (16, 14), (16, 16), (16, 20), (20, 24)),
     *((24, 32), (28, 36), (28, 40), (32, 40), (32, 48), (40, 48)),
 )
-"""The same for the full BRDF."""
+"""Nodes and modes of `AddingDoubling` that are tried for the full BRDF."""
 FINEST, FINE = (64, 96), (32, 64)
 """What counts as exact: for the full BRDF, and where 1 % is asked for."""
 ANISOTROPIC_RESOLUTIONS = ((4, 8), (6, 12), (8, 16), (10, 16), (10, 20), (10, 24), (12, 24), (16, 24), (16, 32))

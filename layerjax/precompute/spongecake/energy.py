@@ -91,7 +91,7 @@ def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule:
 
 
 def _white(medium: Medium) -> Medium:
-    """The same without absorption, and with lobes no narrower than any that the networks know."""
+    """The medium without absorption, and with lobes no narrower than any that the networks know."""
     phase, flakes = medium.phase, medium.phase.flakes
     if flakes is not None:
         phase = SGGX(flakes.kind, at_least(jnp.asarray(flakes.alpha), LEAST_ALPHA), flakes.axis)

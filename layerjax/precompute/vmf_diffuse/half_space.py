@@ -50,7 +50,7 @@ class HalfSpace:
         return self.cosines[:, None] * mean + self.cosines * mean[:, None]
 
     def only(self, mode: int) -> "HalfSpace":
-        """The same with one mode."""
+        """The half space with one Fourier mode in azimuth alone."""
         one = slice(mode, mode + 1)
         return replace(self, up=self.up[one], mixed=self.mixed[one], down=self.down[one])
 

@@ -131,7 +131,8 @@ def _of_asked(parts: Parts, place: int, asked: int) -> Parts:
 
 
 def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes: int, diffuse: bool) -> list[Parts]:
-    """The same where what masking loses is lost, for directions asked for: no sum over directions outside is needed."""
+    """The four operators (see `_operators`) for directions asked for, where what masking loses is lost: no sum over
+    directions outside is needed."""
     ratio = inner.ior / asked.ior
     if diffuse:  # only smooth functions are summed over what is let in
         points = max(LEAST_POINTS[0], grid.nodes), max(LEAST_POINTS[1], modes // 2)

@@ -20,7 +20,7 @@ LADDER = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64
 """Resolutions (nodes, modes) that are chosen from, and that a tolerance climbs."""
 
 ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28))
-"""The same for ordinates, (cosines, azimuths)."""
+"""Ordinates (cosines, azimuths) that are chosen from, and that a tolerance climbs."""
 
 FINEST = (48, 64)
 """What is chosen without a tolerance, at most: more takes minutes and gigabytes."""

@@ -143,7 +143,7 @@ def _interface(
 def _numbered_interface(
     plan: Plan, distribution: Distribution, enters: bool, diffuse: bool, dtype: Any, numbers: Any, region: Array
 ) -> Layer:
-    """That under a region whose number is traced."""
+    """An interface under a region whose number is traced."""
     return _interface(plan, distribution, enters, diffuse, dtype, region, numbers, None)
 
 

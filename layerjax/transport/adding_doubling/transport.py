@@ -154,11 +154,11 @@ class AddingDoubling(DeterministicTransport):
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
     def coarser(self) -> "AddingDoubling":
-        """The same at about two thirds of the resolution, for an estimate of the error."""
+        """This transport at about two thirds of the resolution, for an estimate of the error."""
         return self._at(self._given().coarser())
 
     def finer(self) -> "AddingDoubling":
-        """The same at about four thirds of the resolution."""
+        """This transport at about four thirds of the resolution."""
         return self._at(self._given().finer())
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:

@@ -164,7 +164,8 @@ def chain_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) 
 
 
 def inner_concentration(k: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
-    """The same about the half vector below the surface, by its cosine with the light: variances add there."""
+    """kappa of the extended normals after k reflections at the base about the half vector below the surface, by its
+    cosine with the light: variances add there."""
     spread = crossing(cosine, top.ior)
     inverse = k / base.kappa + 0.5 * spread * spread / top.kappa
     return 1.0 / at_least(inverse + (k - 1) / top.kappa if k > 1 else inverse, LEAST_VARIANCE)

@@ -98,7 +98,8 @@ def slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -
 
 
 def inner_slab_concentration(j: int, cosine: Array, top: UpperSide, base: LowerSide) -> Array:
-    """The same about the half vector inside, by its cosine with the light: variances add there."""
+    """kappa of the extended normals after j reflections at each side about the half vector inside, by its cosine with
+    the light: variances add there."""
     spread = crossing(cosine, top.ior)
     inverse = (j + 0.25 * spread * spread) * (1.0 / top.kappa + 1.0 / base.kappa)
     return 1.0 / at_least(inverse, LEAST_VARIANCE)

@@ -27,7 +27,7 @@ def planar(w: Vector) -> Array:
 
 
 def take(row: Array, columns: tuple[int, int]) -> Channels:
-    """These columns of rows, one array each."""
+    """Columns (first, count) of rows of a table, one array each."""
     return tuple(row[..., columns[0] + c] for c in range(columns[1]))
 
 
