@@ -17,7 +17,7 @@ from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
 from layerjax.normals import facets
 from layerjax.quadrature import gauss_legendre
-from layerjax.transport.adding_doubling.facet_rule import Way, polar_angles, seen_facets
+from layerjax.transport.adding_doubling.facet_rule import Parallels, Way, parallels, polar_angles, seen_facets
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
 ENERGY_POINTS = (12, 8)
@@ -67,17 +67,19 @@ def of_facets(
     alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
 
     def seen(rows: tuple[Array, ...]) -> Any:
-        cosine, sine, *polar = rows
+        cosine, sine, *at = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
         if normals.distribution == "vmf":
             m, weight = facets.seen_normals(wi, alpha, 2 * points[0], 2 * points[1])
             return function(m, dot(wi, m), weight, wi)
-        return function(*seen_facets(cosine, sine, (polar[0], polar[1]), alpha, way, points[1]), wi)
+        return function(*seen_facets(cosine, sine, Parallels(*at), alpha, points[1]), wi)
 
     if normals.distribution == "vmf":
         return by_rows(seen, (region.cosine, region.sine))
     polar = polar_angles(region.cosine, region.sine, alpha, ratio, way, points[0])
-    return by_rows(seen, (region.cosine, region.sine, *polar))
+    # outside of the loop: kept in memory, not computed again for each of the facets' numbers
+    at = parallels(region.cosine, region.sine, polar, alpha, way)
+    return by_rows(seen, (region.cosine, region.sine, *at))
 
 
 def _through(

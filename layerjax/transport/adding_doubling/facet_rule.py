@@ -8,7 +8,7 @@ points serve alpha from 1e-4 to 1: theta_d like a sinh about its peak, psi by th
 nearly even.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -26,20 +26,30 @@ LEAST_COSINE = 1e-9
 Way = Literal["reflected", "refracted"]
 
 
-def seen_facets(
-    cosine: Array, sine: Array, polar: tuple[Array, Array], alpha: Array, way: Way, azimuths: int
-) -> tuple[Vector, Array, Array]:
-    """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
+class Parallels(NamedTuple):
+    """Normals at one angle theta_d from a direction w = (-sine, 0, cosine), (nodes, points) each.
 
-    They have y >= 0, and stand for their mirror images too. Left out are normals of which nothing goes the way asked
-    for: the shares sum to 1 less those.
+    sine, cosine: of theta_d less theta. facing, across: cosine and sine of theta_d. squeeze: of tan(psi/2), for the
+    density of normals; end: of what is squeezed, where the normal, or the light mirrored at it, reaches the horizon.
+    level: the density of normals times the visible area, without what psi changes.
+    """
+
+    sine: Array
+    cosine: Array
+    facing: Array
+    across: Array
+    squeeze: Array
+    end: Array
+    level: Array
+
+
+def parallels(cosine: Array, sine: Array, polar: tuple[Array, Array], alpha: Array, way: Way) -> Parallels:
+    """What facets at the angles `polar` (see `polar_angles`) from directions, (nodes,), have in common.
 
     Args:
         cosine, sine: of w, (nodes,).
-        polar: see `polar_angles`.
         alpha: GGX width.
         way: what becomes of the light: "reflected", to above the horizon, or "refracted".
-        azimuths: points in psi.
     """
     apart, measure = polar
     mu, sin_w = cosine[:, None], sine[:, None]
@@ -56,23 +66,40 @@ def seen_facets(
     level, swing = mu * c - (0.5 * mu / c if way == "reflected" else 0.0), sin_w * s
     up, down = safe_sqrt(swing + level), squeeze * safe_sqrt(swing - level)
     end = safe_div(up, down + safe_sqrt(up * up + down * down))
+    visible = ggx_masking((-sin_w, jnp.zeros_like(mu), mu), alpha) / mu
+    return Parallels(
+        sin_apart, cos_apart, c, s, squeeze, end, (8.0 / jnp.pi) * alpha * alpha * measure * s * c * visible
+    )
+
+
+def seen_facets(cosine: Array, sine: Array, at: Parallels, alpha: Array, azimuths: int) -> tuple[Vector, Array, Array]:
+    """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
+
+    They have y >= 0, and stand for their mirror images too. Left out are normals of which nothing goes the way asked
+    for: the shares sum to 1 less those.
+
+    Args:
+        cosine, sine: of w, (nodes,).
+        at: where they lie.
+        alpha: GGX width.
+        azimuths: points in psi.
+    """
+    mu, sin_w = cosine[:, None], sine[:, None]
     # tan(psi/2) is squeezed; in terms of v, the tangent of half of the angle that has it then
     x, w = (jnp.asarray(array, mu.dtype) for array in gauss_legendre(azimuths))
-    v = end[..., None] * x
-    cos_half, sin_half = (1.0 - v) * (1.0 + v), 2.0 * squeeze[..., None] * v
+    v = at.end[..., None] * x
+    cos_half, sin_half = (1.0 - v) * (1.0 + v), 2.0 * at.squeeze[..., None] * v
     norm = 1.0 / (cos_half * cos_half + sin_half * sin_half)
-    turn = 4.0 * (end * squeeze)[..., None] * w * norm * (1.0 + v * v)
+    turn = (at.level * at.end * at.squeeze)[..., None] * w * norm * (1.0 + v * v)
     back = 2.0 * sin_half * sin_half * norm  # 1 - cos(psi)
     # no differences of large numbers where lobes are narrow
-    mx = sin_apart[..., None] - (mu * s)[..., None] * back
-    my = s[..., None] * 2.0 * sin_half * cos_half * norm
-    mz = cos_apart[..., None] - swing[..., None] * back
+    mx = at.sine[..., None] - (mu * at.across)[..., None] * back
+    my = at.across[..., None] * 2.0 * sin_half * cos_half * norm
+    mz = at.cosine[..., None] - (sin_w * at.across)[..., None] * back
     across = mx * mx + my * my
-    density = alpha * alpha / (jnp.pi * (alpha * alpha * mz * mz + across) ** 2)
-    visible = ggx_masking((-sin_w, jnp.zeros_like(mu), mu), alpha) / mu
-    shares = density * turn * (2.0 * measure * s * c * visible)[..., None]
+    shares = turn / (alpha * alpha * mz * mz + across) ** 2
     flat = (mu.shape[0], -1)
-    facing = c[..., None] * jnp.ones_like(back)
+    facing = at.facing[..., None] * jnp.ones_like(back)
     return (mx.reshape(flat), my.reshape(flat), mz.reshape(flat)), facing.reshape(flat), shares.reshape(flat)
 
 
