@@ -43,7 +43,10 @@ PER_CHANNEL = frozenset(
         "Conductor.k",
     }
 )
-"""Fields that take a value a channel, shape (C,), as well as one for all, shape ()."""
+"""Fields that take a value a channel, shape (C,), as well as one for all, shape (). Maps: see `layerjax._shapes`."""
+
+VECTORS = frozenset({"SGGX.axis"})
+"""Fields that take a vector, shape (3,)."""
 
 
 Parameter = Any
@@ -102,12 +105,8 @@ def floating(name: str, value: Any) -> jax.Array:
 
 def _shaped(name: str, value: Any) -> jax.Array:
     array = floating(name, value)
-    limit = 1 if name in PER_CHANNEL else 0
-    if array.ndim > limit or (array.ndim == 1 and array.shape[0] == 0):
-        wanted = "() or (channels,)" if limit else "()"
-        raise ValueError(
-            f"{name}: shape {array.shape} given, {wanted} allowed (use jax.vmap for many materials at a time)"
-        )
+    if array.ndim and 0 in array.shape:
+        raise ValueError(f"{name}: shape {array.shape} given, which holds no number")
     return array
 
 

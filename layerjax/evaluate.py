@@ -5,6 +5,7 @@ Everything here is a pure function of arrays, compiled once per structure and sh
 that a gradient holds no more than one chunk in memory and accumulates as it goes (`layerjax._batching`).
 """
 
+import math
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
@@ -13,15 +14,17 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from layerjax import maps
 from layerjax._batching import in_chunks
 from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
+from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, read_directions, split
-from layerjax.stack import Stack, channel_count, media_of, optical_depths, require_numbers, simplify, simplify_and_name
+from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify, simplify_and_name
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
-from layerjax.transport.known_directions import Known, KnownDirections, known_directions
+from layerjax.transport.known_directions import MOST_COSINES, Known, KnownDirections, known_directions, own_cosines
 
 
 class Prepared(eqx.Module):
@@ -99,6 +102,9 @@ def evaluate(
             f"known: it is of directions of shapes {known.of_wi.shape} and {known.of_wo.shape}, "
             f"wi and wo have {wi.shape[:-1]} and {wo.shape[:-1]}"
         )
+    shape = _shape_of(stack)
+    if shape:
+        return _evaluate_map(stack, wi, wo, transport, side, key, shape)
     prepared = _prepared(stack, transport, wi.dtype, lambda: known_directions(wi, wo) if known is None else known)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
@@ -122,6 +128,8 @@ def evaluate_with_error(
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
+    if not isinstance(stack, Prepared):
+        require_single(stack, "evaluate_with_error")
     known = cache(partial(known_directions, wi, wo))
     prepared = _prepared(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
@@ -144,6 +152,10 @@ def sample(
         weight 0, and a direction in the tangent plane if they have none.
     """
     (wi,) = read_directions(wi=wi)
+    shape = _shape_of(stack)
+    if shape:
+        mapped, chosen, at = _mapped(stack, transport, shape, wi)
+        return maps.draws(mapped, chosen, at, at.spread(wi), channel_count(stack), key)
     return _sample(_prepared(stack, transport, wi.dtype), wi, key)
 
 
@@ -152,6 +164,10 @@ def pdf(
 ) -> Array:
     """Density in solid angle, 1/sr, with which `sample` draws wo for wi; shape ``broadcast(wi, wo)[:-1]``."""
     wi, wo = read_directions(wi=wi, wo=wo)
+    shape = _shape_of(stack)
+    if shape:
+        mapped, chosen, at = _mapped(stack, transport, shape, wi, wo)
+        return maps.densities(mapped, chosen, at, (at.spread(wi), at.spread(wo)))
     return _pdf(_prepared(stack, transport, wi.dtype), wi, wo)
 
 
@@ -170,6 +186,11 @@ def albedo(
     light grazes lobes of alpha 1e-4. `RandomWalk` follows light instead of that, and needs a `key`.
     """
     (wi,) = read_directions(wi=wi)
+    shape = _shape_of(stack)
+    if shape:
+        mapped, chosen, at = _mapped(stack, transport, shape, wi)
+        given = chosen.needed(key, "albedo")
+        return maps.energies(mapped, chosen, at, at.spread(wi), channel_count(stack), nodes, given)
     prepared = _prepared(stack, transport, wi.dtype)
     return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
@@ -181,7 +202,10 @@ def unscattered(stack: Stack, wi: ArrayLike) -> Array:
     """
     require_numbers(stack)
     (wi,) = read_directions(wi=wi)
-    return _unscattered(in_precision(simplify(stack), wi.dtype), wi, channel_count(stack))
+    slim, channels, shape = in_precision(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
+    if shape:
+        return maps.of_directions(_unscattered, slim, maps.layout(shape, wi), wi, channels)
+    return _unscattered(slim, wi, channels)
 
 
 @eqx.filter_jit
@@ -219,6 +243,37 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
+def _shape_of(stack: Stack | Prepared) -> Shape:
+    return () if isinstance(stack, Prepared) else map_shape(stack)
+
+
+def _mapped(
+    stack: Any, transport: Any, shape: Shape, *directions: Array, known: Known = lambda: None
+) -> tuple[Stack, Transport, maps.Layout]:
+    """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
+    at = maps.layout(shape, *directions)
+    chosen, simplified = _chosen(stack, transport, known)
+    return in_precision(simplified, directions[0].dtype), chosen, at
+
+
+def _evaluate_map(
+    stack: Any, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None, shape: Shape
+) -> Array:
+    at = maps.layout(shape, wi, wo)
+    directions = at.spread(wi), at.spread(wo)
+    pairs = math.prod(at.ahead)
+    own_known = not at.shared and 0 < 2 * pairs <= MOST_COSINES
+    first = [w if at.shared else w[0] for w in directions] if pairs and not at.empty else None
+    known = None
+    if first is not None:
+        known = own_cosines(*first) if own_known else known_directions(*first)
+    mapped, chosen, _ = _mapped(stack, transport, shape, wi, wo, known=lambda: known)
+    given, channels = chosen.needed(key, "evaluate"), channel_count(stack)
+    if not chosen.uses_known:
+        known, own_known = None, False
+    return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own_known)
+
+
 def _check_side(side: Side) -> None:
     if side not in get_args(Side):
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
@@ -244,6 +299,8 @@ def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: 
 
 def _prepare(stack: Stack, transport: Any, known: Known) -> Prepared:
     known = cache(known)
+    require_numbers(stack)
+    require_single(stack, "prepare")
     chosen, simplified = _chosen(stack, transport, known)
     return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
+from layerjax._shapes import channel_count
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
@@ -72,12 +73,16 @@ class Medium(eqx.Module):
 class Stack(eqx.Module):
     """Layers from top to bottom over a base.
 
+    Numbers of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for every texel: see `layerjax._shapes` for how
+    they are told from channels.
+
     Args:
         layers: any number of `Interface` and `Medium`, the topmost first.
         base: an opaque surface (`Lambertian`, `OrenNayar`, `VMFDiffuse`, `Conductor`), or None: light passes.
 
     Raises:
-        ValueError: something else stands in the list, or parameters disagree on the number of channels.
+        ValueError: something else stands in the list, or parameters disagree on the number of channels or the shape of
+            the map.
     """
 
     layers: tuple[Interface | Medium, ...]
@@ -99,22 +104,6 @@ class Stack(eqx.Module):
     def channels(self) -> int:
         """Number of channels C of the stack's values."""
         return channel_count(self)
-
-
-def channel_count(stack: Stack) -> int:
-    """Number of channels, 1 if every parameter is a scalar."""
-    seen: dict[int, str] = {}
-    for name, leaf in leaves_with_names(stack):
-        if isinstance(leaf, float) or is_placeholder(leaf) or ".phase." in name:
-            continue  # phase functions are the same for all channels
-        if leaf.ndim == 1 and leaf.shape[0] > 1:
-            seen.setdefault(leaf.shape[0], name)
-    if len(seen) > 1:
-        raise ValueError(
-            "Stack: parameters disagree on the number of channels: "
-            + ", ".join(f"{name} has {size}" for size, name in seen.items())
-        )
-    return next(iter(seen), 1)
 
 
 def require_numbers(stack: Stack) -> None:

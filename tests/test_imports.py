@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = [
     "layerjax._numerics",
     "layerjax._parameters",
+    "layerjax._shapes",
     "layerjax.channels",
     "layerjax.directions",
     "layerjax._batching",
@@ -42,6 +43,7 @@ PACKAGES = [
     "layerjax.transport.statistical",
     "layerjax.transport.random_walk",
     "layerjax.transport",
+    "layerjax.maps",
     "layerjax.evaluate",
     "layerjax",
     "layerjax.precompute",

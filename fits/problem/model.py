@@ -26,6 +26,7 @@ from fits.problem.likelihood import (
     total_sigma,
 )
 from fits.problem.parameters import Box, Template
+from layerjax._shapes import require_single
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
 """How the values are computed: a layerjax transport, `"auto"`, or any callable in the place of one.
@@ -203,4 +204,6 @@ def forward(
     # a class is callable too, but only a transport that lacks its brackets: layerjax says so
     if callable(transport) and not isinstance(transport, lj.Transport | type):
         return transport(stack, jnp.asarray(wi), jnp.asarray(wo))
+    if isinstance(stack, lj.Stack):
+        require_single(stack, "inference")
     return lj.evaluate(stack, wi, wo, cast(lj.Transport | Literal["auto"], transport), side=side, known=known)

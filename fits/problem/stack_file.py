@@ -50,6 +50,7 @@ from fits.problem.values import (
     whole_numbers,
 )
 from layerjax import gallery
+from layerjax._shapes import require_single
 
 _Kinds = Mapping[str, type]
 _LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
@@ -164,10 +165,12 @@ def stack_from_dict(tables: Mapping[str, Any]) -> lj.Stack:
         raise ValueError("layers is not a list of tables, must be written as [[layers]]")
     if not layers and "base" not in tables:
         raise ValueError("there is neither a layer nor a base, must be at least one: [[layers]] or [base]")
-    return lj.Stack(
+    stack = lj.Stack(
         [_build(f"layers[{index}]", layer, _LAYERS) for index, layer in enumerate(layers)],
         base=_build("base", tables["base"], _BASES) if "base" in tables else None,
     )
+    require_single(stack, "a stack file")
+    return stack
 
 
 def _stack(tables: Mapping[str, Any]) -> lj.Stack:

@@ -65,7 +65,7 @@ class SGGX(PhaseFunction):
     def is_upright(self) -> bool:
         if self.axis is None:
             return True
-        return not isinstance(self.axis, jax.core.Tracer) and not np.any(np.asarray(self.axis)[:2] != 0.0)
+        return not isinstance(self.axis, jax.core.Tracer) and not np.any(np.asarray(self.axis)[..., :2] != 0.0)
 
     def mirrored(self) -> "SGGX":
         if self.axis is None:
@@ -89,13 +89,14 @@ def _axis(axis: Any) -> Any:
     if axis is None or is_placeholder(axis):
         return axis
     array = axis if isinstance(axis, jax.Array) else np.asarray(axis)
-    if array.shape != (3,):
-        raise ValueError(f"SGGX.axis: shape {array.shape} given, (3,) needed")
+    if array.shape[-1:] != (3,):
+        raise ValueError(f"SGGX.axis: shape {array.shape} given, (3,) needed (or (..., 3) in a map of stacks)")
     if array.dtype.kind not in "iuf" or isinstance(array, jax.core.Tracer):
         return floating("SGGX.axis", axis)
     concrete = np.asarray(array, float)
-    longest = np.abs(concrete).max()
-    if not (np.isfinite(longest) and longest > 0):
-        raise ValueError(f"SGGX.axis: {concrete.tolist()} is not a finite vector other than zero")
+    longest = np.abs(concrete).max(axis=-1, keepdims=True)
+    bad = ~(np.isfinite(longest) & (longest > 0))[..., 0]
+    if bad.any():
+        raise ValueError(f"SGGX.axis: {concrete[bad][0].tolist()} is not a finite vector other than zero")
     # whatever its length, it may be asked for in single precision
-    return floating("SGGX.axis", axis if 1e-6 < longest < 1e6 else concrete / longest)
+    return floating("SGGX.axis", axis if np.all((longest > 1e-6) & (longest < 1e6)) else concrete / longest)

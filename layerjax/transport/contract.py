@@ -44,6 +44,9 @@ class Transport(eqx.Module):
     uses_known: ClassVar[bool] = False
     """Whether `prepare_for` makes use of known directions."""
 
+    side_by_side: ClassVar[int] = 1
+    """Texels of a map of stacks that are worked on together: many where a stack costs a few numbers."""
+
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.

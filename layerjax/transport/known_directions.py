@@ -62,3 +62,12 @@ def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
     split = cosines[0].size
     of_wi, of_wo = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
     return KnownDirections(*map(jnp.asarray, (*sides, of_wi, of_wo)))
+
+
+def own_cosines(wi: Array, wo: Array) -> KnownDirections:
+    """Directions (n, 3) each, known or traced, as if each had a cosine of its own: of few pairs that is as good."""
+    z = jnp.concatenate([wi[:, 2], wo[:, 2]])
+    size = jnp.where(jnp.abs(z) > horizon(z.dtype), jnp.minimum(jnp.abs(z), 1.0), STAND_IN)
+    place = jnp.arange(z.size) + jnp.where(z > 0, 0, z.size)
+    above, below = (jnp.where(side, size, STAND_IN) for side in (z > 0, z <= 0))
+    return KnownDirections(above, below, place[: z.size // 2], place[z.size // 2 :])

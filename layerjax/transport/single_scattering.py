@@ -12,7 +12,7 @@ asked for it is evaluated as (exp(-p) - exp(-q)) / (q - p), which is smooth at a
 
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,6 +46,8 @@ class SingleScattering(DeterministicTransport):
 
     Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
     """
+
+    side_by_side: ClassVar[int] = 2048
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         for name, layer in zip(names, stack.layers, strict=True):

@@ -15,6 +15,7 @@ angles over a mirror, returns too much from a diffuse base, and can gain energy 
 """
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import jax.numpy as jnp
 from jax import Array
@@ -48,6 +49,8 @@ class WeidlichWilkie(DeterministicTransport):
     transmission. An albedo must be known to be 0: one that is traced is refused, and so is a Medium that is made inside
     `jit` (make it outside, and put traced numbers in with `equinox.tree_at`). Reciprocal; lit from below it gives 0.
     """
+
+    side_by_side: ClassVar[int] = 2048
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_vmf(stack, names, "WeidlichWilkie")

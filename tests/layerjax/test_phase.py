@@ -13,9 +13,9 @@ import scipy.stats
 
 import layerjax as lj
 from layerjax._parameters import parameter
+from layerjax._shapes import channel_count
 from layerjax.directions import add, combine, dot, frame, half_vector, join, normalize, reflect, scale, split
 from layerjax.phase.contract import deflected
-from layerjax.stack import channel_count
 
 
 class Schlick(lj.PhaseFunction):

@@ -27,7 +27,7 @@ REFUSED = {
     'SGGX.kind: \'flake\' is not one of "surface", "fiber"': lambda: lj.SGGX("flake", 0.1),
     "SGGX.axis: [0.0, 0.0, 0.0] is not a finite vector": lambda: lj.SGGX("fiber", 0.1, (0.0, 0.0, 0.0)),
     "SGGX.axis: shape (2,) given, (3,) needed": lambda: lj.SGGX("fiber", 0.1, (0.0, 1.0)),
-    "SGGX.alpha: shape (3,) given, () allowed": lambda: lj.SGGX("fiber", [0.1, 0.2, 0.3]),
+    "SGGX.alpha: shape (0,) given, which holds no number": lambda: lj.SGGX("fiber", []),
     "Lambertian.albedo: 'red' is not a number": lambda: lj.Lambertian("red"),
     "Lambertian.albedo: None is not a number": lambda: lj.Lambertian(None),
     "OrenNayar.roughness: 2 is outside [0, 1]": lambda: lj.OrenNayar(0.5, 2.0),

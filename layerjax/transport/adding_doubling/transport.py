@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
-from layerjax.stack import Stack, channel_count
+from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
@@ -122,6 +123,11 @@ class AddingDoubling(DeterministicTransport):
         followed = self.orders != "first" and carries_asked(stack)
         directions = known() if followed else None
         if self.tolerance is not None:
+            if map_shape(stack):
+                raise ValueError(
+                    f"AddingDoubling.tolerance: {self.tolerance:g} is for one stack, not for a map of them: "
+                    "give nodes and modes"
+                )
             return self._climbed(stack, directions)
         return self._at(self._resolution(stack, directions is not None))
 

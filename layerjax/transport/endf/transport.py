@@ -6,7 +6,7 @@ normals, which follow from the roughnesses in closed form: see `layerjax.transpo
 """
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
 import equinox as eqx
 import jax
@@ -68,6 +68,8 @@ class ENDF(DeterministicTransport):
     Raises:
         ValueError: an option that is none.
     """
+
+    side_by_side: ClassVar[int] = 2048
 
     bounces: int = eqx.field(static=True, default=1)
     form: Form = eqx.field(static=True, default="reciprocal")

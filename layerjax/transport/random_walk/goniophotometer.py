@@ -15,9 +15,10 @@ from jax.typing import ArrayLike
 
 from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
+from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
 from layerjax.microsurface import Microfacets
-from layerjax.stack import Stack, channel_count, require_numbers, simplify
+from layerjax.stack import Stack, require_numbers, simplify
 from layerjax.transport.random_walk.lanes import Record, follow, quotas, standard_error, upright
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
@@ -85,6 +86,7 @@ def goniophotometer(
         ValueError: a count is too small, or the stack holds a placeholder.
     """
     require_numbers(stack)
+    require_single(stack, "goniophotometer")
     for name, value, least in (
         ("paths", paths, 2),
         ("polar", polar, 1),

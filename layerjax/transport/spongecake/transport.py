@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -62,6 +62,8 @@ class SpongeCake(DeterministicTransport):
     Args:
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
     """
+
+    side_by_side: ClassVar[int] = 2048
 
     proposal: Proposal = eqx.field(static=True, default="first")
 

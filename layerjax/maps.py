@@ -1,0 +1,219 @@
+"""Maps of stacks: every texel a stack of its own, in chunks that stay in the cache.
+
+What a map is, and how its texels are told from channels, stands in `layerjax._shapes`. Directions broadcast against it:
+one of shape ``(3,)`` serves all texels, ``(H, W, 3)`` are one for each, ``(K, 1, 1, 3)`` K for all of them, and
+``(K, H, W, 3)`` K for each. Memory grows with inputs and results alone; a gradient computes each chunk again on the way
+back.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._shapes import Shape, axes_of_map
+from layerjax.directions import join, split
+from layerjax.stack import Stack
+from layerjax.transport.contract import Side, Transport
+from layerjax.transport.known_directions import KnownDirections, own_cosines
+
+TEXELS = 2048
+"""Side by side where a stack costs a few numbers: what they need stays in the cache."""
+
+
+class Layout(NamedTuple):
+    """How directions lie over a map.
+
+    shape: of the map. ahead: axes of the directions in front of it. shared: whether all texels have the same.
+    """
+
+    shape: Shape
+    ahead: Shape
+    shared: bool
+
+    @property
+    def result(self) -> Shape:
+        """Shape of what is found, without channels."""
+        return (*self.ahead, *self.shape)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing to be found."""
+        return 0 in self.result
+
+    def spread(self, w: Array) -> Array:
+        """Directions as every texel has them, (texels, pairs, 3); (pairs, 3) if they are shared."""
+        if self.shared:
+            own = w.shape[:-1][: max(0, w.ndim - 1 - len(self.shape))]
+            return jnp.broadcast_to(w.reshape(*own, 3), (*self.ahead, 3)).reshape(-1, 3)
+        w = jnp.broadcast_to(w, (*self.result, 3)).reshape(math.prod(self.ahead), math.prod(self.shape), 3)
+        return jnp.swapaxes(w, 0, 1)
+
+    def gathered(self, found: Array) -> Array:
+        """What was found, (texels, pairs, ...), in the shape of the result."""
+        return jnp.swapaxes(found, 0, 1).reshape(*self.result, *found.shape[2:])
+
+
+def layout(shape: Shape, *directions: Array) -> Layout:
+    """How directions (..., 3) lie over a map of this shape.
+
+    Raises:
+        ValueError: they do not broadcast.
+    """
+    batches = [w.shape[:-1] for w in directions]
+    try:
+        result = jnp.broadcast_shapes(shape, *batches)
+    except ValueError:
+        given = " and ".join(str(w.shape) for w in directions)
+        raise ValueError(
+            f"stack: a map of shape {shape} does not broadcast against directions of shape {given}"
+        ) from None
+    over = len(shape)
+    if result[len(result) - over :] != shape:
+        raise ValueError(
+            f"stack: directions of shape {' and '.join(str(w.shape) for w in directions)} are longer than the map of "
+            f"shape {shape} that they lie over"
+        )
+    shared = all(math.prod(batch[max(0, len(batch) - over) :]) == 1 for batch in batches)
+    return Layout(shape, result[: len(result) - over], shared)
+
+
+def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequence[Array], together: int) -> Any:
+    """function(stack, *own) of every texel; what it returns along a new first axis.
+
+    Args:
+        stack: a map; function gets single ones.
+        own: arrays (texels, ...), an entry for each.
+        together: texels side by side.
+    """
+    texels = math.prod(at.shape)
+    leaves, structure = jax.tree.flatten(stack)
+    mapped = jax.tree.leaves(axes_of_map(stack, at.shape))
+    over = len(at.shape)
+    numbers = [
+        jnp.broadcast_to(leaf, (*at.shape, *leaf.shape[over:])).reshape(texels, *leaf.shape[over:])
+        for leaf, is_mapped in zip(leaves, mapped, strict=True)
+        if is_mapped
+    ]
+
+    def one(numbers: list[Array], own: Sequence[Array]) -> Any:
+        rest = iter(numbers)
+        filled = [next(rest) if is_mapped else leaf for leaf, is_mapped in zip(leaves, mapped, strict=True)]
+        return function(jax.tree.unflatten(structure, filled), *own)
+
+    rows = (numbers, tuple(own))
+    if together == 1:
+        return jax.lax.map(jax.checkpoint(lambda row: one(*row)), rows)
+    chunks = -(-texels // together)
+    size = -(-texels // chunks)
+    missing = chunks * size - texels
+
+    def in_chunks(array: Array) -> Array:
+        if missing:
+            array = jnp.concatenate([array, jnp.broadcast_to(array[-1:], (missing, *array.shape[1:]))])
+        return array.reshape(chunks, size, *array.shape[1:])
+
+    found = jax.lax.map(jax.checkpoint(lambda row: jax.vmap(one)(*row)), jax.tree.map(in_chunks, rows))
+    return jax.tree.map(lambda array: array.reshape(chunks * size, *array.shape[2:])[:texels], found)
+
+
+@eqx.filter_jit
+def values(
+    stack: Stack,
+    transport: Transport,
+    at: Layout,
+    directions: tuple[Array, Array],
+    side: Side,
+    channels: int,
+    key: Array | None,
+    known: KnownDirections | None,
+    own_known: bool,
+) -> Array:
+    """BSDF of every texel of a simplified map, ``at.result + (channels,)``.
+
+    directions: wi and wo as `Layout.spread` gives them. known: of directions that are shared; own_known: whether those
+    of each texel are few enough to be known.
+    """
+
+    def one(stack: Stack, wi: Array, wo: Array, key: Array | None) -> tuple[Array, ...]:
+        state = transport.prepare_for(stack, lambda: own_cosines(wi, wo) if own_known else known)
+        found, _ = transport.measured(state, wi, wo, side, channels, key)
+        return tuple(found[..., c] for c in range(channels))
+
+    return jnp.stack([at.gathered(value) for value in _along(one, stack, transport, at, directions, key)], axis=-1)
+
+
+@eqx.filter_jit
+def draws(
+    stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, key: Array
+) -> tuple[Array, Array, Array]:
+    """Directions drawn, densities and weights for every texel, as `layerjax.sample` gives them."""
+
+    def one(stack: Stack, wi: Array, key: Array) -> tuple[Array, ...]:
+        wo, density, weight = transport.drawn(transport.prepare(stack), wi, channels, key)
+        return (*split(wo), density, *(weight[..., c] for c in range(channels)))
+
+    found = [at.gathered(value) for value in _along(one, stack, transport, at, (wi,), key)]
+    return jnp.stack(found[:3], axis=-1), found[3], jnp.stack(found[4:], axis=-1)
+
+
+@eqx.filter_jit
+def densities(stack: Stack, transport: Transport, at: Layout, directions: tuple[Array, Array]) -> Array:
+    """Density of draws of every texel, ``at.result``."""
+
+    def one(stack: Stack, wi: Array, wo: Array, key: None) -> Array:
+        return transport.pdf(transport.prepare(stack), split(wi), split(wo))
+
+    return at.gathered(_along(one, stack, transport, at, directions, None))
+
+
+@eqx.filter_jit
+def energies(
+    stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, nodes: int, key: Array | None
+) -> tuple[Array, Array]:
+    """Scattered energy of every texel on wi's side and on the other, ``at.result + (channels,)`` each."""
+
+    def one(stack: Stack, wi: Array, key: Array | None) -> tuple[Array, Array]:
+        return transport.energies(transport.prepare(stack), wi, channels, nodes, key)
+
+    near, far = _along(one, stack, transport, at, (wi,), key, together=1)
+    return at.gathered(near), at.gathered(far)
+
+
+def _along(
+    function: Callable[..., Any],
+    stack: Stack,
+    transport: Transport,
+    at: Layout,
+    directions: Sequence[Array],
+    key: Array | None,
+    together: int | None = None,
+) -> Any:
+    """function(stack, *directions, key) of every texel, each with a key of its own; see `each_texel`."""
+    pairs = max(1, math.prod(at.ahead))
+    together = max(1, transport.side_by_side // pairs) if together is None else together
+    keys = [] if key is None else [jax.random.split(key, math.prod(at.shape))]
+    if at.shared:
+        parts: Sequence[Array] = []
+    else:  # as components: to read every third number takes as long as the arithmetic
+        parts = [part for w in directions for part in split(w)]
+
+    def of_components(stack: Stack, *rest: Array) -> Any:
+        w = directions if at.shared else [join((rest[k], rest[k + 1], rest[k + 2])) for k in range(0, len(parts), 3)]
+        return function(stack, *w, rest[-1] if keys else None)
+
+    return each_texel(of_components, stack, at, [*parts, *keys], together)
+
+
+def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: Array, *options: Any) -> Array:
+    """function(stack, w, *options) of every texel, ``at.result + ...``."""
+    own = [] if at.shared else [at.spread(w)]
+
+    def one(stack: Stack, *own: Array) -> Array:
+        return function(stack, own[0] if own else at.spread(w), *options)
+
+    return at.gathered(each_texel(one, stack, at, own, together=TEXELS))
