@@ -179,6 +179,9 @@ REFUSED = {
     ),
     "prepare takes one stack; layers[0].ior of shape (5,)": lambda: lj.prepare(coated(slice(None))),
     "goniophotometer takes one stack": lambda: lj.goniophotometer(coated(slice(None)), WI[0], key=jax.random.key(0)),
+    "layers: SpongeCake puts 3 media together": lambda: lj.evaluate(
+        lj.Stack(haze(slice(None)).layers * 3), WI, WO, lj.SpongeCake()
+    ),
     "AddingDoubling.tolerance: 0.01 is for one stack": lambda: lj.evaluate(
         coated(slice(None)), WI, WO, lj.AddingDoubling(tolerance=0.01)
     ),

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._shapes import map_shape
 from layerjax.channels import Channels, total
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
@@ -85,10 +86,11 @@ class SpongeCake(DeterministicTransport):
                     "only); SingleScattering, AddingDoubling and RandomWalk carry it"
                 )
         media = tuple(media_of(stack))
-        if len(media) > MOST and is_traced(media):
+        if len(media) > MOST and (is_traced(media) or map_shape(stack)):
             raise ValueError(
                 f"layers: SpongeCake puts {len(media)} media together to {MOST} by their numbers, which are traced "
-                "here; prepare the stack outside jit, grad and vmap, or take SingleScattering or AddingDoubling"
+                "here, or differ from texel to texel; prepare the stack outside jit, grad and vmap, or take "
+                "SingleScattering or AddingDoubling"
             )
 
     def prepare(self, stack: Stack) -> Mapped:
