@@ -79,7 +79,8 @@ def evaluate(
     """BSDF in 1/sr, without the cosine.
 
     Args:
-        stack: the layered material, or what `prepare` made of it (`transport` is then the one it was prepared for).
+        stack: the layered material, or what `prepare` made of it (`transport` is then the one it was prepared for); or
+            a map of stacks of shape S (see `Stack`), against whose axes the last ones of the directions broadcast.
         wi: unit directions towards the light, shape ``(..., 3)``, pointing away from the surface. Concrete ones that
             are not of unit length are refused; traced ones (under `jit`, `grad`, `vmap`) cannot be, and give wrong
             numbers.
@@ -92,8 +93,10 @@ def evaluate(
             along few distinct cosines `AddingDoubling` follows light exactly, and costs less.
 
     Returns:
-        Values of shape ``broadcast(wi, wo)[:-1] + (C,)`` in the floating type of the directions, the channel axis
-        last. A direction in the tangent plane gives 0.
+        Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
+        the floating type of the directions, the channel axis last. A direction in the tangent plane gives 0. Of a map
+        every texel is what its stack alone gives, in chunks that stay in the cache; what `"auto"` and `AddingDoubling`
+        leave open is chosen once, for the texel that asks for most.
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
@@ -144,7 +147,7 @@ def evaluate_with_error(
 def sample(
     stack: Stack | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
 ) -> tuple[Array, Array, Array]:
-    """Draw one outgoing direction for each wi.
+    """Draw one outgoing direction for each wi (and each texel of a map of stacks, as in `evaluate`).
 
     Returns:
         ``wo`` of shape ``(..., 3)``; its density ``pdf`` in 1/sr, shape ``(...)``; and ``weight = f |cos_o| / pdf``
@@ -162,7 +165,10 @@ def sample(
 def pdf(
     stack: Stack | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
 ) -> Array:
-    """Density in solid angle, 1/sr, with which `sample` draws wo for wi; shape ``broadcast(wi, wo)[:-1]``."""
+    """Density in solid angle, 1/sr, with which `sample` draws wo for wi; shape ``broadcast(wi, wo)[:-1]``.
+
+    Maps of stacks as in `evaluate`.
+    """
     wi, wo = read_directions(wi=wi, wo=wo)
     shape = _shape_of(stack)
     if shape:
@@ -184,6 +190,8 @@ def albedo(
     The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe, with
     `nodes` Gauss points a dimension and panel: 32 give 1e-6 as a rule, and 4e-3 at worst over the documented box, where
     light grazes lobes of alpha 1e-4. `RandomWalk` follows light instead of that, and needs a `key`.
+
+    Maps of stacks as in `evaluate`.
     """
     (wi,) = read_directions(wi=wi)
     shape = _shape_of(stack)
@@ -198,7 +206,7 @@ def albedo(
 def unscattered(stack: Stack, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes straight through the stack without a collision, shape ``(..., C)``.
 
-    The delta part of the BSDF: 0 over an opaque base and through rough interfaces.
+    The delta part of the BSDF: 0 over an opaque base and through rough interfaces. Maps of stacks as in `evaluate`.
     """
     require_numbers(stack)
     (wi,) = read_directions(wi=wi)
