@@ -274,6 +274,10 @@ LAYER = "[[layers]]\nkind = 'Medium'\n"
             "[base]\nkind = 'Lambertian'\nalbedo = [0.1, 0.2]\n" + LAYER + "thickness = [1, 2, 3]\n",
             "disagree on the number of channels",
         ),
+        (
+            BASE + "[[layers]]\nkind = 'Interface'\nior = 1.5\nalpha = [0.1, 0.2]\n",
+            r"a stack file takes one stack; layers\[0\].alpha of shape \(2,\) makes it a map",
+        ),
     ],
 )
 def test_bad_files_are_one_line_that_names_the_place(tmp_path, text, message):
