@@ -1,9 +1,11 @@
 """Values and gradients of every transport stay what they were: a change of their code that should change none is seen.
 
-``python -m tests.layerjax.test_values_stay`` writes the file anew, where a change is meant.
+``python -m tests.layerjax.test_values_stay "NAME" ...`` writes these cases anew (all of them without a name), where a
+change is meant.
 """
 
 import json
+import sys
 from functools import partial
 
 import jax
@@ -18,6 +20,8 @@ from tests.helpers.places import STORED
 FILE = STORED / "values.json"
 ROUNDING = {"float64": 1e-9, "float32": 1e-3}
 """Of the largest value or slope: what another order of the same operations may change."""
+CONDITIONED = ("Statistical: hazy varnish", "AddingDoubling, multiple: coated metal")
+"""Slopes by index and roughness, through energies that nearly cancel: of another processor they differ by 4e-8."""
 
 MEDIA = ("haze over paint", "flakes over rough paint", "haze over metal", "flakes' transport")
 CASES = {
@@ -98,20 +102,24 @@ def parts(name, dtype):
 def test_values_stay(name, dtype):
     key = f"{name}, {dtype}"
     stored = json.loads(FILE.read_text())[key]
+    rounding = max(ROUNDING[dtype], 1e-7 if name in CONDITIONED else 0.0)
     for found, before in zip(parts(name, dtype), stored, strict=True):
-        np.testing.assert_allclose(found, before, rtol=0, atol=ROUNDING[dtype] * np.abs(before).max())
+        np.testing.assert_allclose(found, before, rtol=0, atol=rounding * np.abs(before).max())
 
 
-def _write() -> None:
+def _write(names: list[str]) -> None:
     jax.config.update("jax_enable_x64", True)
+    before = json.loads(FILE.read_text()) if names else {}
     lines = []
     for name in ALL:
         for dtype in ROUNDING:
-            stored = [part.tolist() for part in parts(name, dtype)]
-            lines.append(f"{json.dumps(f'{name}, {dtype}')}: {json.dumps(stored)}")
-            print(name, dtype, flush=True)
+            key = f"{name}, {dtype}"
+            if not names or name in names:
+                before[key] = [part.tolist() for part in parts(name, dtype)]
+                print(key, flush=True)
+            lines.append(f"{json.dumps(key)}: {json.dumps(before[key])}")
     FILE.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
 if __name__ == "__main__":
-    _write()
+    _write(sys.argv[1:])

@@ -158,6 +158,7 @@ def meet_opposite(
     assert path.relay is not None
     assert path.inverse_density is not None
     tiny = jnp.finfo(scene.dtype).tiny * 1e4
+    most = jnp.sqrt(jnp.finfo(scene.dtype).max)  # of a quotient of densities: times a density of 0 it stays 0
 
     def turns(travel: Vector, onward: Vector) -> Array:
         return surfaces.density(scene, surface, from_above, travel, onward, diffuse=False)
@@ -167,7 +168,7 @@ def meet_opposite(
     walked = jnp.ones_like(drawn)
     share: Array | float = 1.0
     if path.aim is not None:
-        walked = 1.0 + turns(travel, onward) / jnp.maximum(path.aim.density, tiny)
+        walked = jnp.minimum(1.0 + turns(travel, onward) / jnp.maximum(path.aim.density, tiny), most)
         share = path.aim.weight
     turned = jnp.abs(path.direction[2]) / jnp.maximum(jnp.abs(hit.direction[2]), tiny)
     found = hit.survives & ~hit.crosses & at_opposite  # a ray still at the exit has none yet
@@ -176,10 +177,11 @@ def meet_opposite(
     passed = scene.transmittance(crossed, rates) if scene.media else (jnp.ones_like(drawn),)
     weight = tuple(pick(hit.kept, c) * pick(passed, c) * turned * share for c in range(scene.channels))
     weight = tuple(jnp.where(found, w, 0.0) for w in weight)
-    aiming, relay = path.aiming, Relay(travel, scene.rates(travel), weight, jnp.where(found, walked / drawn, 0.0))
+    of_relay = jnp.minimum(walked / drawn, most)
+    aiming, relay = path.aiming, Relay(travel, scene.rates(travel), weight, jnp.where(found, of_relay, 0.0))
     relay = jax.tree.map(lambda new, old: jnp.where(aiming, new, old), relay, path.relay)
     rivals = (
-        1.0 + jnp.where(at_opposite, path.inverse_density * turns(scale(-1.0, w), onward), 0.0)
+        1.0 + jnp.where(at_opposite, jnp.minimum(path.inverse_density * turns(scale(-1.0, w), onward), most), 0.0)
         for w in (target, hit.direction)
     )
     return relay, next(rivals), next(rivals)

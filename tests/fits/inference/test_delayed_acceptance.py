@@ -242,7 +242,7 @@ def test_all_orders_of_a_coated_medium() -> None:
         Free(1.5, 1.2, 2.2), Free(0.2, 0.05, 0.8), Free(1.0, 0.02, 10.0), Free(0.5, -0.5, 0.95), Free(0.3, 0.0, 1.0)
     )
     fitted = fit(free, data, transport=transport, starts=1)
-    posterior = sample(fitted, seed=1, ess=1000, max_steps=1000)
+    posterior = sample(fitted, seed=1, ess=1000, max_steps=1000, surrogate=True)
     assert "surrogate of degree" in posterior.status
     assert effective(posterior) >= 1000
     assert effective(posterior) > 0.2 * posterior.chain[..., 0].size
