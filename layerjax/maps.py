@@ -100,12 +100,13 @@ def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequ
         if is_mapped
     ]
 
-    def one(numbers: list[Array], own: Sequence[Array]) -> Any:
+    def one(numbers: list[Array], own: Sequence[Array], _: Array) -> Any:
         rest = iter(numbers)
         filled = [next(rest) if is_mapped else leaf for leaf, is_mapped in zip(leaves, mapped, strict=True)]
         return function(jax.tree.unflatten(structure, filled), *own)
 
-    rows = (numbers, tuple(own))
+    # numbered: a map may be left without a number that differs, where all its layers are known not to be there
+    rows = (numbers, tuple(own), jnp.arange(texels))
     if together == 1:
         return jax.lax.map(jax.checkpoint(lambda row: one(*row)), rows)
     chunks = -(-texels // together)

@@ -158,6 +158,13 @@ def test_chunks_that_do_not_fill():
     np.testing.assert_allclose(values[-1], lj.evaluate(alone, wi, wo, lj.WeidlichWilkie()), rtol=1e-9)
 
 
+def test_a_map_of_layers_that_are_nowhere():
+    """What differs from texel to texel is known not to be there: every texel is the bare base."""
+    stack = lj.Stack([lj.Medium(jnp.zeros((N, 1)), 0.5)], lj.Lambertian(0.5))
+    values = lj.evaluate(stack, WI[0], WO[0], lj.SingleScattering())
+    np.testing.assert_allclose(values, jnp.full((N, 1), 0.5 / jnp.pi), rtol=1e-12)
+
+
 REFUSED = {
     "layers[0].albedo: shape (3,) given in a map of shape (3,): texels or channels?": lambda: lj.Stack(
         [lj.Medium(1.0, [0.1, 0.2, 0.3], lj.HenyeyGreenstein(jnp.zeros(3)))]
