@@ -63,6 +63,8 @@ def _numbers_in(prefix: str, owner: Any) -> Iterator[Number]:
                 yield Number(name, value.shape, 1, False)
             elif keys & RANGES.keys():
                 yield Number(name, value.shape, 0, False)
+            elif axes == 1 and ".phase" not in prefix:  # a plain array of a surface of one's own counts channels
+                yield Number(name, value.shape, 1, True)
 
 
 def channel_count(stack: Any) -> int:

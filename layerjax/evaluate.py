@@ -21,7 +21,16 @@ from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, read_directions, split
-from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify, simplify_and_name
+from layerjax.stack import (
+    Interface,
+    Medium,
+    Stack,
+    media_of,
+    optical_depths,
+    require_numbers,
+    simplify,
+    simplify_and_name,
+)
 from layerjax.transport import Side, Transport
 from layerjax.transport.automatic import automatic
 from layerjax.transport.known_directions import MOST_COSINES, Known, KnownDirections, known_directions, own_cosines
@@ -90,7 +99,7 @@ def evaluate(
             one below. Other pairs give 0, and what only they need is left out of the program.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
         known: what `known_directions` says of wi and wo, where these are traced. Concrete ones are looked at here:
-            along few distinct cosines `AddingDoubling` follows light exactly, and costs less.
+            along few distinct cosines `AddingDoubling` follows light exactly, and costs less. Maps look for themselves.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
@@ -261,7 +270,14 @@ def _mapped(
     """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
     at = maps.layout(shape, *directions)
     chosen, simplified = _chosen(stack, transport, known)
+    layers = (_without_upright_axis(layer) for layer in simplified.layers)
+    simplified = eqx.tree_at(lambda s: s.layers, simplified, tuple(layers))
     return in_precision(simplified, directions[0].dtype), chosen, at
+
+
+def _without_upright_axis(layer: Interface | Medium) -> Interface | Medium:
+    """Texels are traced: an axis that is known to be the normal must be so by structure, or it counts as tilted."""
+    return eqx.tree_at(lambda m: m.phase, layer, layer.phase.simplified()) if isinstance(layer, Medium) else layer
 
 
 def _evaluate_map(

@@ -18,11 +18,8 @@ from jax import Array
 from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
 from layerjax.stack import Stack
-from layerjax.transport.contract import Side, Transport
+from layerjax.transport.contract import TEXELS, Side, Transport
 from layerjax.transport.known_directions import KnownDirections, own_cosines
-
-TEXELS = 2048
-"""Side by side where a stack costs a few numbers: what they need stays in the cache."""
 
 
 class Layout(NamedTuple):
@@ -217,4 +214,4 @@ def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: A
     def one(stack: Stack, *own: Array) -> Array:
         return function(stack, own[0] if own else at.spread(w), *options)
 
-    return at.gathered(each_texel(one, stack, at, own, together=TEXELS))
+    return at.gathered(each_texel(one, stack, at, own, together=max(1, TEXELS // max(1, math.prod(at.ahead)))))

@@ -90,6 +90,10 @@ class PhaseFunction(eqx.Module):
         """Whether p and sigma are known (while tracing) not to change if all directions turn about the normal."""
         return True
 
+    def simplified(self) -> "PhaseFunction":
+        """This phase function without an axis that is known to be the normal, so that it stays known under tracing."""
+        return self
+
     def mirrored(self) -> "PhaseFunction":
         """The phase function upside down: its p(wi, wo) is this one's with the z of both directions turned round."""
         return self

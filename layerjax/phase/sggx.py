@@ -67,6 +67,11 @@ class SGGX(PhaseFunction):
             return True
         return not isinstance(self.axis, jax.core.Tracer) and not np.any(np.asarray(self.axis)[..., :2] != 0.0)
 
+    def simplified(self) -> "SGGX":
+        if self.axis is None or not self.is_upright:
+            return self
+        return eqx.tree_at(lambda phase: phase.axis, self, None)
+
     def mirrored(self) -> "SGGX":
         if self.axis is None:
             return self

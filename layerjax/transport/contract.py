@@ -27,6 +27,9 @@ Side = Literal["all", "reflection", "transmission"]
 
 Uniforms = tuple[Array, Array, Array]
 
+TEXELS = 2048
+"""Of a map of stacks, worked on together where a stack costs a few numbers: what they need stays in the cache."""
+
 
 class Transport(eqx.Module):
     """One way of solving a stack; its options are static fields.
@@ -45,7 +48,7 @@ class Transport(eqx.Module):
     """Whether `prepare_for` makes use of known directions."""
 
     side_by_side: ClassVar[int] = 1
-    """Texels of a map of stacks that are worked on together: many where a stack costs a few numbers."""
+    """Texels of a map of stacks that are worked on together: `TEXELS` where a stack costs a few numbers."""
 
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:

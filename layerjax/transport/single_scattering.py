@@ -25,7 +25,7 @@ from layerjax.directions import Vector, half_vector, is_above, sanitised, select
 from layerjax.quadrature import Nodes
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of, optical_depths
 from layerjax.surfaces import Surface
-from layerjax.transport.contract import DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
 
 BASE = -1
 """Stands for the base among the indices of layers."""
@@ -47,7 +47,7 @@ class SingleScattering(DeterministicTransport):
     Supports `Medium` layers over any surface or none; a base is seen through the media, without inter-reflection.
     """
 
-    side_by_side: ClassVar[int] = 2048
+    side_by_side: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         for name, layer in zip(names, stack.layers, strict=True):

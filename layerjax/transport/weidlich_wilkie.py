@@ -35,7 +35,7 @@ from layerjax.directions import (
 from layerjax.normals.ggx import ggx_area, ggx_density
 from layerjax.stack import Medium, Stack, is_known, optical_depths
 from layerjax.surfaces import Conductor, Surface
-from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import ReflectingInterface
 
 LEAST_SHARE = 0.02
@@ -50,7 +50,7 @@ class WeidlichWilkie(DeterministicTransport):
     `jit` (make it outside, and put traced numbers in with `equinox.tree_at`). Reciprocal; lit from below it gives 0.
     """
 
-    side_by_side: ClassVar[int] = 2048
+    side_by_side: ClassVar[int] = TEXELS
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_vmf(stack, names, "WeidlichWilkie")

@@ -158,6 +158,17 @@ def test_chunks_that_do_not_fill():
     np.testing.assert_allclose(values[-1], lj.evaluate(alone, wi, wo, lj.WeidlichWilkie()), rtol=1e-9)
 
 
+def test_an_axis_that_is_the_normal_stays_so():
+    """Media that are symmetric about it are solved in modes, in a map as well."""
+
+    def stack_of(k):
+        flakes = lj.SGGX("fiber", ALPHA[k], (0.0, 0.0, 2.0))
+        return lj.Stack([lj.Interface(1.5, 0.3), lj.Medium(1.0, 0.8, flakes)], lj.Lambertian(0.5))
+
+    values = lj.evaluate(stack_of(slice(None)), WI, WO, SOLVER)
+    np.testing.assert_allclose(values[2], lj.evaluate(stack_of(2), WI[2], WO[2], SOLVER), rtol=1e-9)
+
+
 def test_a_map_of_layers_that_are_nowhere():
     """What differs from texel to texel is known not to be there: every texel is the bare base."""
     stack = lj.Stack([lj.Medium(jnp.zeros((N, 1)), 0.5)], lj.Lambertian(0.5))

@@ -20,7 +20,7 @@ from layerjax.directions import Vector, flip, is_above, sanitised, select
 from layerjax.normals.vmf import Masking, concentration
 from layerjax.stack import Interface, Medium, Stack, is_known, media_of
 from layerjax.surfaces import Conductor
-from layerjax.transport.contract import DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
 from layerjax.transport.endf import drawing
 from layerjax.transport.endf.chains import Coat, Form, LowerSide, Options, UpperSide, reflections
 from layerjax.transport.endf.slab import transmissions
@@ -69,7 +69,7 @@ class ENDF(DeterministicTransport):
         ValueError: an option that is none.
     """
 
-    side_by_side: ClassVar[int] = 2048
+    side_by_side: ClassVar[int] = TEXELS
 
     bounces: int = eqx.field(static=True, default=1)
     form: Form = eqx.field(static=True, default="reciprocal")

@@ -13,7 +13,7 @@ from layerjax.channels import Channels, total
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
-from layerjax.transport.contract import DeterministicTransport, Side
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.bending import bend_network
 from layerjax.transport.spongecake.layers import MOST, is_traced, pair_of
@@ -64,7 +64,7 @@ class SpongeCake(DeterministicTransport):
         proposal: what `lj.sample` draws from: the first order alone, as in the paper, or both lobes and the constant.
     """
 
-    side_by_side: ClassVar[int] = 2048
+    side_by_side: ClassVar[int] = TEXELS
 
     proposal: Proposal = eqx.field(static=True, default="first")
 
