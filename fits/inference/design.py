@@ -1,8 +1,10 @@
 """Where a surrogate is fitted: at draws of the fit's approximation, then at draws of the surrogate's own posterior.
 
-Without points farther out its tails are cut off, and nothing says so: a third of the draws are tempered, which follows
-a ridge however it bends, and a third moved away from their mean, which does not rely on the surrogate's own tails.
-Every round is a check of the surrogate at points that it has not seen, and the last one is used as it was checked.
+Without points farther out its tails are cut off, and nothing says so: a quarter of the draws is tempered, which
+follows a ridge however it bends, a quarter moved away from their mean, which does not rely on the surrogate's own
+tails, and a quarter comes from the approximation, which knows a ridge from end to end. A tail that is missed costs more
+than its share of the posterior: a chain stays there. Every round is a check of the surrogate at points that it has not
+seen, and the last one is used as it was checked.
 """
 
 import io
@@ -18,19 +20,31 @@ from fits._files import write_bytes
 from fits.inference.delayed_acceptance import DelayedAcceptance
 from fits.inference.laplace import Approximation
 from fits.inference.mixture import Mixture
-from fits.inference.surrogate import Evaluated, Surrogate, affordable_degrees, evaluate_many, fitted, term_count
+from fits.inference.surrogate import (
+    Evaluated,
+    Surrogate,
+    affordable_degrees,
+    evaluate_many,
+    fitted,
+    term_count,
+    with_polynomials,
+)
+from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
 FIRST_POINTS, MORE_POINTS = 1.6, 1.3  # a term
-FEWEST_POINTS = 32
+FEWEST_POINTS = 128
 AT_HIGHEST = 6  # rounds at most, of the highest degree
 POINTS = FIRST_POINTS + MORE_POINTS * (AT_HIGHEST + 1)  # a term, at most
 HOTTEST, COOLER_FROM = 2.5, 6  # temperature, with up to so many parameters: draws of more would miss the posterior
 A_FEW = 5.0  # effective points
 LOW = 7.0  # in the log-posterior below its height: points count no less that lie lower
 NARROWEST = 1e-9
-GOOD, LEAST = 0.85, 0.3  # share of proposals taken: from which no more points are needed, and below which it is no use
+STRATA = 4  # of draws
+SAMPLES = 1024  # of the surrogate's posterior, that a mixture is fitted to
+SELDOM = 0.02  # chance to leave a point: less counts as this, for other moves see to it
+GOOD, LONGEST = 1.2, 4.0  # steps that a chain would stay: no more points are needed, and it is of no use
 
 Floats = NDArray[np.float64]
 
@@ -43,11 +57,33 @@ class Draws(NamedTuple):
     log_density: Floats
 
 
-class Built(NamedTuple):
-    """What came of it: a surrogate, None where none holds; the root of a covariance to walk with; and words on it."""
+class Walked(NamedTuple):
+    """A surrogate, and the root of a covariance and a mixture to walk with in its posterior."""
 
-    surrogate: Surrogate | None
+    surrogate: Surrogate
     root: Floats
+    mixture: Mixture
+
+    def moves(self) -> DelayedAcceptance:
+        """The proposals of it."""
+        return DelayedAcceptance(*self)
+
+    def arrays(self) -> dict[str, Any]:
+        """What `from_arrays` makes it of."""
+        return {"root": self.root, **self.surrogate.arrays(), **self.mixture.arrays()}
+
+    @classmethod
+    def from_arrays(cls, model: Model, arrays: dict[str, Any]) -> "Walked | None":
+        """That of a model, of these `arrays`; None where there are none."""
+        if "root" not in arrays:
+            return None
+        return cls(with_polynomials(model, arrays), arrays["root"], Mixture.from_arrays(arrays))
+
+
+class Built(NamedTuple):
+    """What came of it: None where no surrogate holds; and words on it."""
+
+    walked: Walked | None
     words: str
 
 
@@ -98,30 +134,35 @@ class Design:
         residuals = self.problem.count * (2 if self.problem.model.varying else 1)
         degrees = affordable_degrees(dimension, residuals, POINTS)
         if not degrees:
-            return Built(None, np.eye(dimension), f"no surrogate of {dimension} parameters: exact evaluations alone")
+            return Built(None, f"no surrogate of {dimension} parameters: exact evaluations alone")
         first = self._batches(FIRST_POINTS * term_count(dimension, degrees[0]) / 2.0)
         points = self._evaluated(self._first_draws(initial, first), 0).finite()
         if len(points.positions) < term_count(dimension, degrees[0]):
-            return Built(None, np.eye(dimension), "no surrogate, for want of finite values about the best fit")
-        root, share = _root(points), 0.0
+            return Built(None, "no surrogate, for want of finite values about the best fit")
+        generator = self._generator(0)
+        mixture = Mixture.through(initial.draw(generator, SAMPLES), generator)
+        root, stay = _root(points), np.inf
         for number, degree in enumerate([*degrees, *degrees[-1:] * (AT_HIGHEST - 1)], 1):
             terms = term_count(dimension, degree)
             if len(points.positions) < terms:
                 break
             surrogate = fitted(self.problem.model, degree, points)
-            draws = self._draws(surrogate, root, points, self._batches(MORE_POINTS * terms / 3.0), number)
+            move = DelayedAcceptance(surrogate, root, mixture)
+            settled = self._settled(move, points, number)
+            draws = self._draws(move, settled, initial, self._batches(MORE_POINTS * terms / STRATA), number)
             new = self._evaluated(np.concatenate([part.positions for part in draws]), number)
             exact = np.split(new.log_posterior, len(draws))
-            share = share_taken(draws, exact)
+            stay = mean_stay(draws, exact)
             root = _root(Evaluated(*(part[: len(exact[0])] for part in new)).finite(), root)
-            self.note = f"{share:.0%} of its proposals would be taken"
-            if share >= GOOD:
+            mixture = Mixture.through(settled, self._generator(number))
+            self.note = f"a chain would stay {stay:.1f} steps where it is"
+            if stay <= GOOD:
                 break
             points = points.joined(new.finite())
-        if share < LEAST:
-            return Built(None, root, f"the surrogate does not hold ({self.note}) and is left out")
+        if stay > LONGEST:
+            return Built(None, f"the surrogate does not hold ({self.note}) and is left out")
         words = f"proposals from a surrogate of degree {surrogate.degree}, built with {self.evaluations} evaluations"
-        return Built(surrogate, root, words)
+        return Built(Walked(surrogate, root, mixture), words)
 
     def _first_draws(self, initial: Approximation | Mixture, count: int) -> Floats:
         """Draws of the approximation, and as many whose parameters are shuffled: where it takes the posterior for
@@ -142,23 +183,39 @@ class Design:
     def _generator(self, number: int) -> np.random.RandomState:
         return np.random.RandomState([self.seed, number])
 
-    def _draws(
-        self, surrogate: Surrogate, root: Floats, points: Evaluated, count: int, number: int
-    ) -> tuple[Draws, Draws, Draws]:
-        """Of the surrogate's posterior: `count` draws, as many tempered ones, and as many as far from their mean."""
-        generator, move = self._generator(number), DelayedAcceptance(surrogate, root)
+    def _settled(self, move: DelayedAcceptance, points: Evaluated, number: int) -> Floats:
+        """Samples of the surrogate's posterior: ends of walks one after another, from the best points on."""
+        generator = self._generator(number)
         highest = np.argsort(-points.log_posterior)[: max(len(points.positions) // 2, 1)]
+        visited = [points.positions[generator.choice(highest, self.walkers)]]
+        while len(visited) * self.walkers < 2 * SAMPLES:
+            visited.append(move.walk(visited[-1], generator)[0])
+        return np.concatenate(visited[len(visited) // 2 :])
 
-        def drawn(temperature: float) -> Draws:
-            starts = points.positions[generator.choice(highest, count)]
-            walks = [move.walk(part, generator, temperature) for part in np.split(starts, count // self.walkers)]
-            ends, _, heights = (np.concatenate(parts) for parts in zip(*walks, strict=True))
-            return Draws(ends, heights, heights / temperature)
-
-        plain, tempered, again = drawn(1.0), drawn(self._temperature), drawn(1.0)
+    def _draws(
+        self, move: DelayedAcceptance, settled: Floats, initial: Approximation | Mixture, count: int, number: int
+    ) -> list[Draws]:
+        """Of the surrogate's posterior: `count` draws, as many tempered ones, and as many as far from their mean; and
+        as many of the approximation."""
+        generator = self._generator(number)
+        positions = settled[generator.permutation(len(settled))[: 2 * count]]
+        heights = move.heights(positions)
+        plain, again = (
+            Draws(positions[part], heights[part], heights[part]) for part in (slice(count), slice(count, None))
+        )
+        walks = [
+            move.walk(part, generator, self._temperature) for part in np.split(plain.positions, count // self.walkers)
+        ]
+        ends, _, warm = (np.concatenate(parts) for parts in zip(*walks, strict=True))
         centre = again.positions.mean(axis=0)
         away = centre + np.sqrt(self._temperature) * (again.positions - centre)
-        return plain, tempered, Draws(away, move.heights(away), again.heights)
+        wide = initial.draw(generator, count)
+        return [
+            plain,
+            Draws(ends, warm, warm / self._temperature),
+            Draws(away, move.heights(away), again.heights),
+            Draws(wide, move.heights(wide), initial.log_density(wide)),
+        ]
 
     def _evaluated(self, positions: Floats, number: int) -> Evaluated:
         """Exact evaluations at the points of a round, those that were kept of it."""
@@ -177,16 +234,16 @@ class Design:
         return points
 
 
-def share_taken(draws: Sequence[Draws], exact: Sequence[Floats]) -> float:
-    """Share of independent proposals from the surrogate that Metropolis' rule would take, by unseen points.
+def mean_stay(draws: Sequence[Draws], exact: Sequence[Floats]) -> float:
+    """Steps that a chain of independent proposals from the surrogate stays where it is, on average, by unseen points.
 
     draws: of the surrogate's posterior, the proposals; then others that, weighted, stand for the exact posterior, where
-    they come from: the least of the shares, of those that stand for it with more than a few points. exact: its log at
+    they come from: the longest of the stays, of those that stand for it with more than a few points. exact: its log at
     the points of each.
     """
     with np.errstate(invalid="ignore"):  # of points where nothing is finite
         to = _or_nowhere(exact[0] - draws[0].heights)
-        shares = []
+        stays = []
         for drawn, log_posterior in zip(draws[1:], exact[1:], strict=True):
             log_weight = _or_nowhere(log_posterior - drawn.log_density)
             seen = np.isfinite(log_weight)
@@ -194,11 +251,12 @@ def share_taken(draws: Sequence[Draws], exact: Sequence[Floats]) -> float:
                 continue
             weight = np.exp(log_weight[seen] - np.max(log_weight[seen]))
             off = to[None, :] - (log_posterior - drawn.heights)[seen, None]
-            share = np.average(np.exp(np.minimum(off, 0.0)).mean(axis=1), weights=weight)
-            shares.append((float(np.sum(weight) ** 2 / np.sum(weight**2)), float(share)))
-    if not shares:
-        return 0.0
-    return min([share for effective, share in shares if effective >= A_FEW] or [max(shares)[1]])
+            chance = np.exp(np.minimum(off, 0.0)).mean(axis=1)
+            stay = np.average(1.0 / np.maximum(chance, SELDOM), weights=weight)
+            stays.append((float(np.sum(weight) ** 2 / np.sum(weight**2)), float(stay)))
+    if not stays:
+        return np.inf
+    return max([stay for effective, stay in stays if effective >= A_FEW] or [max(stays)[1]])
 
 
 def _or_nowhere(log_density: Floats) -> Floats:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from fits.inference.chain import MemoryChain
 from fits.inference.delayed_acceptance import DelayedAcceptance
-from fits.inference.design import Design, Kept
+from fits.inference.design import Design, Kept, Walked
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.length import last_checks
 from fits.inference.mixture import Mixture
-from fits.inference.surrogate import evaluate_many, with_polynomials
+from fits.inference.surrogate import evaluate_many
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -50,16 +50,15 @@ class Ensemble:
         if surrogate:
             built = Design(self.problem, self.chain.shape[0], self.seed, kept, progress).build(self.initial)
             moves["words"] = built.words
-            if built.surrogate is not None:
-                moves |= {"root": built.root, **built.surrogate.arrays()}
+            if built.walked is not None:
+                moves |= built.walked.arrays()
         self.chain.decide(moves)
         self._read_moves()
         kept.remove()
 
     def _read_moves(self) -> None:
-        moves = self.chain.moves
-        if "root" in moves:
-            self._delayed = DelayedAcceptance(with_polynomials(self.problem.model, moves), moves["root"])
+        walked = Walked.from_arrays(self.problem.model, self.chain.moves)
+        self._delayed = walked and walked.moves()
 
     def advance(self, step: int, tell: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""

@@ -135,8 +135,16 @@ def student(centre: Floats, root: Floats, positions: Floats) -> Floats:
         return np.zeros(len(positions))
     whitened = np.linalg.solve(root, (positions - centre).T)
     freedom = 0.5 * (DEGREES_OF_FREEDOM + dimension)
-    peak = gammaln(freedom) - gammaln(0.5 * DEGREES_OF_FREEDOM) - 0.5 * dimension * np.log(DEGREES_OF_FREEDOM * np.pi)
-    return peak - np.linalg.slogdet(root)[1] - freedom * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
+    tails = freedom * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
+    return peak(dimension) - np.linalg.slogdet(root)[1] - tails
+
+
+def peak(dimension: int) -> float:
+    """Log-density of a Student-t of unit width at its centre."""
+    freedom = 0.5 * (DEGREES_OF_FREEDOM + dimension)
+    return float(
+        gammaln(freedom) - gammaln(0.5 * DEGREES_OF_FREEDOM) - 0.5 * dimension * np.log(DEGREES_OF_FREEDOM * np.pi)
+    )
 
 
 def student_draws(generator: np.random.RandomState, count: int, dimension: int) -> Floats:

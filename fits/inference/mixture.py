@@ -3,16 +3,20 @@
 In the box, not in log-odds: there a posterior has no long tails towards its bounds. What is drawn outside is refused.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
+from scipy.cluster.vq import kmeans2
 from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
-from fits.inference.laplace import slope_at_bounds, student, student_draws
+from fits.inference.laplace import DEGREES_OF_FREEDOM, peak, slope_at_bounds, student, student_draws
 from fits.inference.ridge import height, open_directions, ridge
 from fits.inference.uncertainty import local_information
 
@@ -23,6 +27,8 @@ REFINEMENTS = 10
 MOST_SAMPLES = 4000
 OWN_SAMPLES = 2.0  # that a component counts as
 KEPT = 0.1  # of a mixture that is refined
+MIXTURE = "mixture_"
+COMPONENTS = 12  # of one that is fitted to samples
 
 Floats = NDArray[np.float64]
 
@@ -65,6 +71,36 @@ class Mixture:
             root[index] = directions.T / values
         log_weight = np.array([height(problem, point) for point in points]) + np.linalg.slogdet(root)[1]
         return cls(points, root, log_weight - logsumexp(log_weight), held)
+
+    @classmethod
+    def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
+        """The mixture fitted to samples (count, P) of a posterior, of which more are needed than of `COMPONENTS`."""
+        samples = expit(positions)
+        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
+        root = directions * np.sqrt(np.maximum(values, SMALLEST_REACH**2))
+        white = np.linalg.solve(root, samples.T).T
+        centres, nearest = kmeans2(white, COMPONENTS, minit="++", rng=generator)
+        within = np.atleast_2d(np.cov((white - centres[nearest]).T)) + SMALLEST_REACH * np.eye(white.shape[1])
+        roots = np.tile(root @ np.linalg.cholesky(within), (COMPONENTS, 1, 1))
+        log_weight = np.full(COMPONENTS, -np.log(COMPONENTS))
+        return cls(centres @ root.T, roots, log_weight, np.zeros(white.shape[1], bool)).refined(positions)
+
+    def arrays(self) -> dict[str, Any]:
+        """What `from_arrays` makes it of, named apart from what else a chain keeps of its moves."""
+        return {f"{MIXTURE}{field.name}": getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, Any]) -> "Mixture":
+        """The mixture of these `arrays`."""
+        return cls(*(np.asarray(arrays[f"{MIXTURE}{field.name}"]) for field in fields(cls)))
+
+    def leaps(self) -> "Leaps":
+        """The mixture in JAX; none of its parameters is held at a bound."""
+        assert not self.held.any()
+        dimension = self.centre.shape[1]
+        level = self.log_weight - np.linalg.slogdet(self.root)[1] + peak(dimension)
+        parts = self.centre, self.root, np.linalg.inv(self.root), self.log_weight, level
+        return Leaps(*(jnp.asarray(part) for part in parts))
 
     def refined(self, positions: Floats) -> "Mixture":
         """The mixture fitted to samples (count, P) of the posterior, with a share of what it was.
@@ -130,6 +166,34 @@ class Mixture:
         """What every component adds to the log-density in the box, unfolded, (M, count)."""
         parts = zip(self.log_weight, self.centre, self.root, strict=True)
         return np.stack([weight + student(centre, root, units) for weight, centre, root in parts])
+
+
+class Leaps(NamedTuple):
+    """A `Mixture` for programs: inverse of its roots, and level: what a component adds to the log-density's peak."""
+
+    centre: Array
+    root: Array
+    inverse: Array
+    log_weight: Array
+    level: Array
+
+    def log_density(self, position: Array) -> Array:
+        """Log-density at an unconstrained position (P,)."""
+        white = jnp.einsum("mij,mj->mi", self.inverse, jax.nn.sigmoid(position) - self.centre)
+        freedom = 0.5 * (DEGREES_OF_FREEDOM + position.shape[0])
+        parts = self.level - freedom * jnp.log1p(jnp.sum(white**2, axis=1) / DEGREES_OF_FREEDOM)
+        return jax.nn.logsumexp(parts) + jnp.sum(jax.nn.log_sigmoid(position) + jax.nn.log_sigmoid(-position))
+
+    def draw(self, key: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
+        """Independent draws (*shape, P), unconstrained, and whether they are inside the box (*shape)."""
+        of_components, of_normals, of_widths = jax.random.split(key, 3)
+        which = jax.random.categorical(of_components, self.log_weight, shape=shape)
+        normal = jax.random.normal(of_normals, (*shape, self.centre.shape[1]), self.centre.dtype)
+        squares = jax.random.normal(of_widths, (*shape, int(DEGREES_OF_FREEDOM)), normal.dtype) ** 2
+        normal /= jnp.sqrt(jnp.mean(squares, axis=-1, keepdims=True))
+        unit = self.centre[which] + jnp.einsum("...ij,...j->...i", self.root[which], normal)
+        inside = jnp.all((unit > 0.0) & (unit < 1.0), axis=-1)
+        return jax.scipy.special.logit(jnp.where(inside[..., None], unit, 0.5)), inside
 
 
 def _inside(units: Floats) -> NDArray[np.bool_]:

@@ -6,6 +6,7 @@ from scipy import special, stats
 
 from fits.inference.delayed_acceptance import DelayedAcceptance
 from fits.inference.fit_result import Fit
+from fits.inference.mixture import Mixture
 from fits.inference.optimise import fit
 from fits.inference.posterior import Posterior
 from fits.inference.sampling import sample
@@ -108,7 +109,8 @@ def test_walks_of_a_surrogate_follow_a_thin_curved_ridge() -> None:
     exact = fitted.problem.call(evaluate, positions)
     model = with_polynomial(fitted.problem.model, 2, Evaluated(positions, *(np.asarray(part) for part in exact)))
     root = np.linalg.cholesky(np.cov(positions.T))
-    ends, _, _ = DelayedAcceptance(model, root).walk(positions, generator)
+    mixture = Mixture.through(positions, generator)
+    ends, _, _ = DelayedAcceptance(model, root, mixture).walk(positions, generator)
     after = 0.3 + 1.2 * special.expit(ends[:, 0])
     assert abs(np.corrcoef(along, after)[0, 1]) < 0.9
     assert stats.kstest(np.interp(after, a, cumulated), "uniform").pvalue > 1e-3
