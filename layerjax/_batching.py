@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._devices import over_devices
 from layerjax.directions import split
 
 CHUNK_BYTES = 20_000
@@ -52,7 +53,12 @@ def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Arr
     if pairs <= 2 * chunk:
         return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
     flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]
-    size = BLOCK_CHUNKS * chunk
+    return over_devices(partial(_in_blocks, function, chunk), flat, least=chunk).reshape(*batch, -1)
+
+
+def _in_blocks(function: Callable[..., tuple[Array, ...]], chunk: int, flat: list[Array]) -> Array:
+    """function over arrays (n, 3), block by block."""
+    pairs, size = flat[0].shape[0], BLOCK_CHUNKS * chunk
     whole = pairs // size * size
     run = partial(_block, function, chunk)
     parts = []
@@ -68,7 +74,7 @@ def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Arr
         # a vector of zeros is no direction: it gives 0
         rest = [jnp.pad(array[whole:], ((0, number * even - left), (0, 0))) for array in flat]
         parts.append(_block(function, even, *rest)[:left])
-    return jnp.concatenate(parts).reshape(*batch, -1)
+    return jnp.concatenate(parts)
 
 
 def _block(function: Callable[..., tuple[Array, ...]], chunk: int, *rows: Array) -> Array:

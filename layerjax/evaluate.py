@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 
 from layerjax import maps
 from layerjax._batching import in_chunks
+from layerjax._devices import compiled
 from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
@@ -225,17 +226,17 @@ def unscattered(stack: Stack, wi: ArrayLike) -> Array:
     return _unscattered(slim, wi, channels)
 
 
-@eqx.filter_jit
+@compiled
 def _evaluate(prepared: Prepared, wi: Array, wo: Array, side: Side, key: Array | None) -> tuple[Array, Array | None]:
     return prepared.transport.measured(prepared.state, wi, wo, side, prepared.channels, key)
 
 
-@eqx.filter_jit
+@compiled
 def _sample(prepared: Prepared, wi: Array, key: Array) -> tuple[Array, Array, Array]:
     return prepared.transport.drawn(prepared.state, wi, prepared.channels, key)
 
 
-@eqx.filter_jit
+@compiled
 def _pdf(prepared: Prepared, wi: Array, wo: Array) -> Array:
     def density(wi: Vector, wo: Vector) -> tuple[Array, ...]:
         return (prepared.transport.pdf(prepared.state, wi, wo),)
@@ -243,12 +244,12 @@ def _pdf(prepared: Prepared, wi: Array, wo: Array) -> Array:
     return in_chunks(density, wi, wo)[..., 0]
 
 
-@eqx.filter_jit
+@compiled
 def _albedo(prepared: Prepared, wi: Array, nodes: int, key: Array | None) -> tuple[Array, Array]:
     return prepared.transport.energies(prepared.state, wi, prepared.channels, nodes, key)
 
 
-@eqx.filter_jit
+@compiled
 def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     x, y, z = split(wi)
     media = media_of(stack)

@@ -8,13 +8,14 @@ back.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._devices import compiled, over_devices
 from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
 from layerjax.stack import Stack
@@ -104,8 +105,14 @@ def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequ
 
     # numbered: a map may be left without a number that differs, where all its layers are known not to be there
     rows = (numbers, tuple(own), jnp.arange(texels))
+    return over_devices(partial(_side_by_side, one, together), rows, least=together)
+
+
+def _side_by_side(one: Callable[..., Any], together: int, rows: Any) -> Any:
+    """one(*row) of every row, so many together."""
     if together == 1:
         return jax.lax.map(jax.checkpoint(lambda row: one(*row)), rows)
+    texels = jax.tree.leaves(rows)[0].shape[0]
     chunks = -(-texels // together)
     size = -(-texels // chunks)
     missing = chunks * size - texels
@@ -119,7 +126,7 @@ def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequ
     return jax.tree.map(lambda array: array.reshape(chunks * size, *array.shape[2:])[:texels], found)
 
 
-@eqx.filter_jit
+@compiled
 def values(
     stack: Stack,
     transport: Transport,
@@ -145,7 +152,7 @@ def values(
     return jnp.stack([at.gathered(value) for value in _along(one, stack, transport, at, directions, key)], axis=-1)
 
 
-@eqx.filter_jit
+@compiled
 def draws(
     stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, key: Array
 ) -> tuple[Array, Array, Array]:
@@ -159,7 +166,7 @@ def draws(
     return jnp.stack(found[:3], axis=-1), found[3], jnp.stack(found[4:], axis=-1)
 
 
-@eqx.filter_jit
+@compiled
 def densities(stack: Stack, transport: Transport, at: Layout, directions: tuple[Array, Array]) -> Array:
     """Density of draws of every texel, ``at.result``."""
 
@@ -169,7 +176,7 @@ def densities(stack: Stack, transport: Transport, at: Layout, directions: tuple[
     return at.gathered(_along(one, stack, transport, at, directions, None))
 
 
-@eqx.filter_jit
+@compiled
 def energies(
     stack: Stack, transport: Transport, at: Layout, wi: Array, channels: int, nodes: int, key: Array | None
 ) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ PACKAGES = [
     "layerjax._shapes",
     "layerjax.channels",
     "layerjax.directions",
+    "layerjax._devices",
     "layerjax._batching",
     "layerjax.quadrature",
     "layerjax.fresnel",

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache, partial
 from typing import Any
 
@@ -40,6 +41,18 @@ def _run(function: Callable[..., Any], static: Static, arrays: Any, *arguments: 
 def cores() -> int:
     """Of this machine."""
     return os.cpu_count() or 1
+
+
+def devices_of_cores() -> None:
+    """Make each core a device of JAX, over which layerjax splits large batches; before the first computation.
+
+    Left as it is where that is too late, or the user has asked for devices.
+    """
+    if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    if jax.config.values["jax_num_cpu_devices"] < 1:
+        with suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", cores())
 
 
 @cache

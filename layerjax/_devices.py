@@ -1,0 +1,70 @@
+"""Large batches over all devices: cores that `jax_num_cpu_devices` makes devices of, or several GPUs.
+
+XLA keeps the body of a loop on one core, and large batches run in loops over chunks that stay in the cache. Where the
+process has several devices, each of them loops over its own share; gradients are summed over the shares.
+"""
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+from jax import Array
+from jax.core import Tracer
+from jax.sharding import AxisType, Mesh, PartitionSpec
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+ROWS = "rows"
+_in_use: list[int] = []  # by the programs that are being traced, the innermost last
+
+
+def compiled(function: Callable[P, T]) -> Callable[P, T]:
+    """The function compiled, as by `eqx.filter_jit`, with what it hands to `over_devices` split over all of them."""
+
+    @eqx.filter_jit
+    def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
+        _in_use.append(devices)
+        try:
+            return function(*arguments, **options)
+        finally:
+            _in_use.pop()
+
+    @wraps(function)
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        return program(_usable(arguments, options), *arguments, **options)
+
+    return call
+
+
+def _usable(*inputs: Any) -> int:
+    """Devices to split over: one where inputs are kept on some, the user has chosen one, or has a mesh of their own."""
+    everywhere = jax.local_device_count()
+    if everywhere == 1 or jax.default_device.value is not None or jax.sharding.get_abstract_mesh().axis_names:
+        return 1
+    kept = [leaf for leaf in jax.tree.leaves(inputs) if isinstance(leaf, Array) and not isinstance(leaf, Tracer)]
+    if any(leaf.committed and len(leaf.sharding.device_set) < everywhere for leaf in kept):
+        return 1
+    return everywhere
+
+
+def over_devices(function: Callable[[Any], Any], rows: Any, least: int) -> Any:
+    """function over arrays that share their first axis, and whose results do: as many of its rows on every device.
+
+    function: closes over what all rows need. least: rows of a share below which it does not pay. Nor does it where a
+    device would have more rows than another: to gather what they found takes longer than to find it.
+    """
+    count = jax.tree.leaves(rows)[0].shape[0]
+    devices = _in_use[-1] if _in_use else 1
+    if devices == 1 or count % devices or count < devices * least:
+        return function(rows)
+    split = PartitionSpec(ROWS)
+    shared = jax.shard_map(function, mesh=_mesh(devices), in_specs=split, out_specs=split, check_vma=False)
+    return shared(rows)
+
+
+@cache
+def _mesh(devices: int) -> Mesh:
+    return jax.make_mesh((devices,), (ROWS,), axis_types=(AxisType.Auto,), devices=jax.local_devices()[:devices])
