@@ -1,10 +1,10 @@
-"""Benchmarks: ``throughput`` (times, beside numpy and peers), ``recovery`` (are errors and intervals honest?),
-``calibration`` (are posteriors?), ``samplers`` (do they agree?), ``error-vs-time`` (every model against the truth, over
-the suite of stacks), ``references`` (the solver and the walk beside PythonicDISORT and Mitsuba), ``statistics``
-(directional statistics, lobe by lobe, beside the walk), ``spongecake`` (its multiple scattering beside the truth:
-held-out materials, energy, figures, fits), ``endf`` (thin coats beside a walk of one bounce), ``rough-diffuse`` (rough
-diffuse surfaces beside each other) and ``side-by-side`` (which transport when: a page of docs from the results of
-error-vs-time)."""
+"""Benchmarks: ``throughput`` (times, beside numpy and peers), ``textured`` (maps of stacks, beside Mitsuba's textures),
+``recovery`` (are errors and intervals honest?), ``calibration`` (are posteriors?), ``samplers`` (do they agree?),
+``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
+beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
+``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
+coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other) and ``side-by-side``
+(which transport when: a page of docs from the results of error-vs-time)."""
 
 import argparse
 import importlib
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-NAMES = ("throughput", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
+NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
          "spongecake", "endf", "rough-diffuse", "side-by-side")  # fmt: skip
 
 
@@ -54,7 +54,11 @@ def _parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name)
         command.add_argument("--quick", action="store_true", help="fewer repeats: a look, no result to quote")
         command.add_argument("--out", type=Path, help="directory to write into (default: benchmarks/results)")
-    for name, named_peers in (("throughput", "Mitsuba and Dr.Jit"), ("references", "Mitsuba and PythonicDISORT")):
+    for name, named_peers in (
+        ("throughput", "Mitsuba and Dr.Jit"),
+        ("textured", "Mitsuba"),
+        ("references", "Mitsuba and PythonicDISORT"),
+    ):
         commands.choices[name].add_argument("--no-peers", action="store_true", help=f"without {named_peers}")
     commands.choices["spongecake"].add_argument(
         "--work", type=Path, default=Path("spongecake-data"), help="folder for the truth of its materials"
@@ -80,7 +84,7 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
     options: dict[str, Any] = {"quick": given.quick}
     if given.out is not None:
         options["directory"] = given.out
-    if given.benchmark in ("throughput", "references"):
+    if given.benchmark in ("throughput", "textured", "references"):
         options["with_peers"] = not given.no_peers
     if given.benchmark == "spongecake":
         options["work"] = given.work

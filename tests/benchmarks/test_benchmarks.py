@@ -1,5 +1,6 @@
 """The benchmarks' own models agree with layerjax, and their runs leave whole files behind."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from benchmarks.measuring import writing as results
 from benchmarks.peers import functions as peers
 from benchmarks.peers import plain_numpy
 from benchmarks.studies import recovery
+from benchmarks.studies.textured import run as textured
+from benchmarks.studies.textured.materials import MATERIALS
 from benchmarks.studies.throughput import fitting, forward_models
 from benchmarks.studies.throughput import run as throughput
 from benchmarks.suite.scenes import CONDUCTOR, SCENES, Scene, pairs
@@ -91,6 +94,21 @@ def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
     assert all(row["layerjax"] > 0 and row["numpy"] > 0 and row["peer"] is None for row in content["forward_models"])
     assert {row["verdict"] for row in content["forward_models"]} == {"no peer"}
     assert all(row["ours"] > 0 and row["theirs"] > 0 for row in content["inference"])
+
+
+def test_a_tiny_run_of_maps_writes_whole_files(tmp_path: Path) -> None:
+    """A cheap transport keeps its texels, one that takes longer than it may has fewer of them; memory does not grow."""
+    few = [material for material in MATERIALS if isinstance(material.transport, lj.SingleScattering)]
+    size = textured.Size(texels=(20_000,), precisions=("float32",), rounds=1, longest=100.0)
+    _, paths = textured.study(with_peers=False, directory=tmp_path, size=size, materials=few)
+    (row,) = json.loads(paths[0].read_text())["rows"]
+    assert row["texels"] == 20_000
+    assert 0.0 < row["value"] < 1e3
+    assert row["gradient"] > 1.0
+    assert row["memory"] < 64.0
+    assert row["principled"] is None
+    hurried = dataclasses.replace(size, longest=1e-9)
+    assert textured.measure(few[0], "float32", 20_000, hurried, with_peers=False).texels == textured.PROBED
 
 
 def test_a_tiny_recovery_run_writes_whole_files(tmp_path: Path) -> None:

@@ -1,0 +1,248 @@
+"""Time a texel of maps of stacks: value, and value with the gradient in every parameter map."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import layerjax as lj
+from benchmarks.measuring import environment
+from benchmarks.measuring.memory import keep_within
+from benchmarks.measuring.timing import interleaved, once
+from benchmarks.measuring.writing import DIRECTORY, Bar, environment_lines, figure, table, write
+from benchmarks.peers import functions as peers
+from benchmarks.peers.mitsuba_textures import Textured
+from benchmarks.studies.textured.materials import MATERIALS, Maps, Material, principled_maps
+from benchmarks.suite.scenes import pairs
+
+NAME = "textured"
+BRIGHTER = 1.1
+"""The loss is the mean squared difference from the values times this."""
+PROBED = 64
+"""Texels by which the time of a map is estimated."""
+GRADIENT, COMPILE, COMPILE_GRADIENT, PRINCIPLED = Bar(5.0, 3.0), Bar(3.0, 1.5), Bar(8.0, 4.0), Bar(5.0, 2.0)
+"""In times of a value; in seconds; in times of Mitsuba's principled BSDF."""
+
+TEXT = """\
+# Maps of stacks
+
+{environment}
+Every texel is a stack of its own, of which each parameter is a map, under a pair of directions of its own. Medians of
+{rounds} rounds, everything compiled; *gradient* is a value with the derivatives of a mean squared difference in all
+parameter maps, in values; *memory* is what the program of a value holds beside inputs and results, and grows by with
+each texel. Where a map would take longer than {longest:g} s, fewer *texels* stand for it. *principled* and *conductor*
+are times of our value over those of Mitsuba's `principled` and `roughconductor` (`llvm_ad_rgb`, float32) with a texture
+for every parameter, in the same rounds. {peers}
+
+{rows}
+## Verdicts
+
+At least, and in brackets the aim: a value as in the first column, a gradient {gradient} values, compiling a value
+{compile} s and a gradient {compile_gradient} s, {principled} times Mitsuba's `principled`. The slowest of all sizes and
+types counts.
+
+{verdicts}"""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured. longest: seconds that an evaluation of a map may take."""
+
+    texels: tuple[int, ...] = (100_000, 1_000_000)
+    precisions: tuple[str, ...] = ("float32", "float64")
+    rounds: int = 7
+    longest: float = 10.0
+
+
+QUICK = Size((10_000,), ("float32",), 3, 1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One material at one size. value: microseconds a texel; gradient: in values; memory: bytes a texel.
+
+    principled, conductor: the median over rounds of our time over Mitsuba's.
+    """
+
+    material: str
+    transport: str
+    precision: str
+    texels: int
+    value: float
+    gradient: float
+    compile_value: float
+    compile_gradient: float
+    memory: float
+    principled: float | None
+    conductor: float | None
+
+
+def study(
+    quick: bool = False,
+    with_peers: bool = True,
+    report: Callable[[str], None] = lambda line: None,
+    directory: Path = DIRECTORY,
+    size: Size | None = None,
+    materials: Sequence[Material] = MATERIALS,
+) -> tuple[str, tuple[Path, Path]]:
+    """Measure, and write ``textured.json`` and ``textured.md``; returns the markdown and the two paths."""
+    size = size or (QUICK if quick else Size())
+    surroundings = environment.describe()
+    missing = peers.why_not() if with_peers else "left out by request"
+    rows: list[Row] = []
+    for material in materials:
+        for precision in size.precisions:
+            for texels in size.texels:
+                keep_within()
+                began = time.perf_counter()
+                rows.append(measure(material, precision, texels, size, missing is None))
+                report(f"{material.name}, {precision}: {rows[-1].texels:,} texels, {time.perf_counter() - began:.0f} s")
+                if rows[-1].texels < texels:
+                    break  # nor would there be more of them in a larger map
+    text = TEXT.format(
+        environment=environment_lines(surroundings),
+        rounds=size.rounds,
+        longest=size.longest,
+        peers="" if missing is None else f"Mitsuba did not run: {missing}.",
+        rows=table(HEADER, [_cells(row) for row in rows]),
+        gradient=GRADIENT.words(),
+        compile=COMPILE.words(),
+        compile_gradient=COMPILE_GRADIENT.words(),
+        principled=PRINCIPLED.words(),
+        verdicts=_verdicts(materials, rows),
+    )
+    content = {"environment": surroundings, "peers": missing or "ran", "rows": [asdict(row) for row in rows]}
+    return text, write(NAME, content, text, directory)
+
+
+def measure(material: Material, precision: str, texels: int, size: Size, with_peers: bool) -> Row:
+    """One row; of fewer texels than are asked for where these would take too long."""
+    few = _Problem(material, precision, PROBED)
+    seconds = min(once(few.compiled_value()[0]) for _ in range(2))
+    count = int(min(texels, max(PROBED, PROBED * size.longest / seconds)))
+    problem, half = _Problem(material, precision, count), _Problem(material, precision, count // 2)
+    value, compile_value, memory = problem.compiled_value()
+    gradient, compile_gradient = problem.compiled_gradient()
+    ways: dict[str, Callable[[], Any]] = {"value": value, "gradient": gradient}
+    if with_peers and precision == "float32":
+        ways |= {"principled": problem.principled().value, "conductor": problem.conductor().value}
+    times = interleaved(ways, size.rounds)
+    ratios = {name: float(np.median(times["value"] / times[name])) for name in times}
+    return Row(
+        material=material.name,
+        transport=type(material.transport).__name__,
+        precision=precision,
+        texels=count,
+        value=1e6 * float(np.median(times["value"])) / count,
+        gradient=1.0 / ratios["gradient"],
+        compile_value=compile_value,
+        compile_gradient=compile_gradient,
+        memory=(memory - half.compiled_value()[2]) / (count - count // 2),
+        principled=ratios.get("principled"),
+        conductor=ratios.get("conductor"),
+    )
+
+
+class _Problem:
+    """A material of so many texels, with a pair of directions for each."""
+
+    def __init__(self, material: Material, precision: str, texels: int) -> None:
+        self.material, self.texels = material, texels
+        self.plain = material.maps(texels, precision)
+        self.directions = [w.astype(precision) for w in pairs(texels, "reflection")]
+        self._arguments: tuple[Any, ...] = ({name: jnp.asarray(value) for name, value in self.plain.items()},)
+        self._arguments += tuple(map(jnp.asarray, self.directions))
+
+    def values(self, maps: dict[str, Array], wi: Array, wo: Array) -> Array:
+        """The BSDF of every texel."""
+        return lj.evaluate(self.material.build(maps), wi, wo, self.material.transport, side="reflection")
+
+    def compiled_value(self) -> tuple[Callable[[], Any], float, float]:
+        """A value, the seconds that it took to compile, and the bytes that it holds beside inputs and results."""
+        program, seconds = _compiled(self.values, self._arguments)
+        return _waiting(program, self._arguments), seconds, float(program.memory_analysis().temp_size_in_bytes)
+
+    def compiled_gradient(self) -> tuple[Callable[[], Any], float]:
+        """A value with its gradient, and the seconds that it took to compile."""
+
+        def loss(maps: dict[str, Array], wi: Array, wo: Array, target: Array) -> Array:
+            return jnp.mean((self.values(maps, wi, wo) - target) ** 2)
+
+        target = BRIGHTER * jax.jit(self.values)(*self._arguments)
+        arguments = (*self._arguments, target)
+        program, seconds = _compiled(jax.value_and_grad(loss), arguments)
+        return _waiting(program, arguments), seconds
+
+    def principled(self) -> Textured:
+        """Mitsuba's, of as many texels."""
+        return Textured("principled", principled_maps(self.texels), *self.directions)
+
+    def conductor(self) -> Textured:
+        """Mitsuba's rough metal, of as many texels."""
+        generator = np.random.default_rng(0)
+        maps: Maps = {
+            "eta": generator.uniform(0.2, 1.5, (self.texels, 3)),
+            "k": generator.uniform(2, 5, (self.texels, 3)),
+        }
+        return Textured("roughconductor", maps | {"alpha": generator.uniform(0.05, 0.6, self.texels)}, *self.directions)
+
+
+def _compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, float]:
+    found: list[Any] = []
+    seconds = once(lambda: found.append(jax.jit(function).lower(*arguments).compile()))
+    return found[0], seconds
+
+
+def _waiting(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[[], Any]:
+    return lambda: jax.block_until_ready(program(*arguments))
+
+
+HEADER = ("material", "transport", "type", "texels", "us a texel", "gradient", "compile s", "its gradient s",
+          "memory, B", "principled", "conductor")  # fmt: skip
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    return (
+        row.material,
+        row.transport,
+        row.precision,
+        f"{row.texels:,}",
+        figure(row.value),
+        figure(row.gradient, 2),
+        figure(row.compile_value, 2),
+        figure(row.compile_gradient, 2),
+        figure(row.memory, 2),
+        figure(row.principled, 2),
+        figure(row.conductor, 2),
+    )
+
+
+def _verdicts(materials: Sequence[Material], rows: Sequence[Row]) -> str:
+    lines = []
+    for material in materials:
+        if material.least is None:
+            continue
+        bar = Bar(material.least, material.least if material.aim is None else material.aim)
+        found = [row for row in rows if row.material == material.name]
+
+        def slowest(bar: Bar, name: str, found: Sequence[Row] = found) -> str:
+            values = [getattr(row, name) for row in found if getattr(row, name) is not None]
+            return bar.verdict(max(values)) if values else "no peer"
+
+        lines.append(
+            (
+                f"{material.name}: {bar.words()} us",
+                slowest(bar, "value"),
+                slowest(GRADIENT, "gradient"),
+                slowest(COMPILE, "compile_value"),
+                slowest(COMPILE_GRADIENT, "compile_gradient"),
+                slowest(PRINCIPLED, "principled"),
+            )
+        )
+    return table(("material", "value", "gradient", "compile", "its gradient", "principled"), lines)
