@@ -52,7 +52,7 @@ def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Pr
         stack: the layered material.
         transport: how light is carried. ``"auto"``: all orders of scattering. `SingleScattering` where nothing
             scatters light twice (a base under media that are known only to absorb), else `AddingDoubling`, which by
-            measurement is both nearer to the truth and faster than the closed forms of `Statistical`.
+            measurement is nearer to the truth than the closed forms of `Statistical`.
 
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).

@@ -200,7 +200,7 @@ def _along(
 ) -> Any:
     """function(stack, *directions, key) of every texel, each with a key of its own; see `each_texel`."""
     pairs = max(1, math.prod(at.ahead))
-    together = max(1, transport.side_by_side // pairs) if together is None else together
+    together = max(1, transport.together(stack) // pairs) if together is None else together
     keys = [] if key is None else [jax.random.split(key, math.prod(at.shape))]
     if at.shared:
         parts: Sequence[Array] = []

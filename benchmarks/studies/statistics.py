@@ -256,7 +256,7 @@ def _lobe_energies(stack: lj.Stack, angles: Sequence[float], own_side: bool = Fa
     """Energies of the model's lobes, (lobes, angles)."""
     options = Options(FORWARD.microfacets, FORWARD.scattering, FORWARD.angles, own_side)
     found = statistics(stack, jnp.cos(jnp.radians(jnp.asarray(angles))), options)
-    return np.stack([entry.lobe.energy[0, 0] for entry in found.reflected])
+    return np.stack([entry.lobe.energy[0][0] for entry in found.reflected])
 
 
 def _off(value: float, truth: float) -> float:

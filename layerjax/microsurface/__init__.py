@@ -2,7 +2,8 @@
 
 In go a cosine of incidence, the width of GGX normals and the index; out come the shares of light reflected and
 transmitted. `directional_albedo` finds them by quadrature over `visible_facets`, with `multiple_bounces` for what meets
-more than one facet; `heitz_walk` is the random walk that is behind them, a facet at a time.
+more than one facet; `energy_tables` reads them off `splines`; `heitz_walk` is the random walk that is behind them, a
+facet at a time.
 """
 
 from layerjax.microsurface.directional_albedo import Microfacets as Microfacets

@@ -101,9 +101,9 @@ def conductor_energy(
     """
     cosine, alpha, ior, k = _arrays(cosine, alpha, ior, k)
     if microfacets == "single":
-        upper = _upper(make_cap(cosine, alpha), points)
+        upper = reflecting(make_cap(cosine, alpha), points)
         reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
-        return upper.mean(reflectance * _masking(upper.reflected(), upper.alpha))
+        return upper.mean(reflectance * masking(upper.reflected(), upper.alpha))
     first, reflected_on = first_mirror(cosine, alpha, ior, k, points=points)
     return _share(first + reflected_on * conductor_multiple_reflectance(cosine, alpha, ior, k))
 
@@ -119,7 +119,7 @@ def single_energy(cosine: ArrayLike, alpha: ArrayLike, ior: ArrayLike, *, points
 def lobe_energy(cosine: ArrayLike, alpha: ArrayLike, *, points: int = POINTS) -> Array:
     """Reflectance of a rough surface of perfect mirrors, single scattering."""
     cosine, alpha = _arrays(cosine, alpha)
-    return _lobe(_upper(make_cap(cosine, alpha), points))
+    return _lobe(reflecting(make_cap(cosine, alpha), points))
 
 
 @partial(jax.jit, static_argnames="points")
@@ -134,7 +134,7 @@ def retained(cosine: ArrayLike, alpha: ArrayLike, ratio: ArrayLike, *, points: i
     """
     cosine, alpha, ratio = _arrays(cosine, alpha, ratio)
     cap = make_cap(cosine, alpha)
-    share = _lobe(facets_in(cap, cone(cap, ratio), points)) / _lobe(_upper(cap, points))
+    share = _lobe(facets_in(cap, cone(cap, ratio), points)) / _lobe(reflecting(cap, points))
     return jnp.where(ratio < 1.0, _share(share), 1.0)
 
 
@@ -148,7 +148,7 @@ def first_event(
     cosine, alpha, ior = _arrays(cosine, alpha, ior)
     cap = make_cap(cosine, alpha)
     upper = facets_split(cap, cone(cap, jnp.ones_like(cosine)), refracting(cap, ior), points)
-    first = upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * _escape(upper))
+    first = upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * escape(upper))
     crossing, transmitted = _passing(cap, ior, points)
     return first, at_least(1.0 - crossing - first, 0.0), at_least(crossing - transmitted, 0.0)
 
@@ -159,9 +159,9 @@ def first_mirror(
     """First event of the walk on a conductor: shares reflected away, and to other facets."""
     cosine, alpha, ior, k = _arrays(cosine, alpha, ior, k)
     cap = make_cap(cosine, alpha)
-    upper, seen = _upper(cap, points), facets_in(cap, everything(cap), points)
+    upper, seen = reflecting(cap, points), facets_in(cap, everything(cap), points)
     levels = [fresnel.conductor(part.facing, ior[..., None, None], k[..., None, None]) for part in (upper, seen)]
-    first = upper.mean(levels[0] * _escape(upper))
+    first = upper.mean(levels[0] * escape(upper))
     return first, at_least(seen.mean(levels[1]) - first, 0.0)
 
 
@@ -171,26 +171,26 @@ def _arrays(*values: ArrayLike) -> list[Array]:
     return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
 
 
-def _upper(cap: Cap, points: int) -> Facets:
+def reflecting(cap: Cap, points: int) -> Facets:
     """Facets that reflect above the horizon."""
     return facets_in(cap, cone(cap, jnp.ones_like(cap.cosine)), points)
 
 
 def _lobe(facets: Facets) -> Array:
-    return facets.mean(_masking(facets.reflected(), facets.alpha))
+    return facets.mean(masking(facets.reflected(), facets.alpha))
 
 
 def _reflected(cap: Cap, ior: Array, points: int) -> Array:
     """Reflected by dielectric facets and not masked."""
     upper = facets_split(cap, cone(cap, jnp.ones_like(cap.cosine)), refracting(cap, ior), points)
-    return upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * _masking(upper.reflected(), upper.alpha))
+    return upper.mean(fresnel.dielectric(upper.facing, ior[..., None, None]) * masking(upper.reflected(), upper.alpha))
 
 
 def _passing(cap: Cap, ior: Array, points: int) -> tuple[Array, Array]:
     """Refracted by dielectric facets: all, and what is not masked."""
     passing, index = facets_in(cap, refracting(cap, ior), points), ior[..., None, None]
     crossing = 1.0 - fresnel.dielectric(passing.facing, index)
-    return passing.mean(crossing), passing.mean(crossing * _masking(passing.refracted(index), passing.alpha))
+    return passing.mean(crossing), passing.mean(crossing * masking(passing.refracted(index), passing.alpha))
 
 
 def _sigma(cosine: Array, alpha: Array) -> Array:
@@ -198,14 +198,14 @@ def _sigma(cosine: Array, alpha: Array) -> Array:
     return jnp.sqrt(alpha * alpha * (1.0 - cosine) * (1.0 + cosine) + cosine * cosine)
 
 
-def _masking(cosine: Array, alpha: Array) -> Array:
+def masking(cosine: Array, alpha: Array) -> Array:
     """Smith masking G1, 0 below the horizon."""
     above = cosine > 0
     cosine = jnp.where(above, cosine, 0.5)
     return jnp.where(above, 2.0 * cosine / (cosine + _sigma(cosine, alpha)), 0.0)
 
 
-def _escape(facets: Facets) -> Array:
+def escape(facets: Facets) -> Array:
     """Share that leaves the surface of what facets reflect, given the heights at which wi meets them: G2 / G1(wi)."""
     reflected = facets.reflected()
     above = reflected > 0

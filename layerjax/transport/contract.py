@@ -50,6 +50,10 @@ class Transport(eqx.Module):
     side_by_side: ClassVar[int] = 1
     """Texels of a map of stacks that are worked on together: `TEXELS` where a stack costs a few numbers."""
 
+    def together(self, stack: Stack) -> int:
+        """Texels of a map of simplified stacks that are worked on together."""
+        return self.side_by_side
+
     @abc.abstractmethod
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         """Raise a ValueError that names the first layer or base of a simplified stack which it cannot carry.

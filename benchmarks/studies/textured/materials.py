@@ -82,7 +82,7 @@ MATERIALS = (
     Material(
         "three layers over metal",
         COAT | DYE | SECOND | METAL,
-        lambda p: lj.Stack([_coat(p), lj.Medium(p["dye"]), _second(p)], _metal(p)),
+        lambda p: lj.Stack([_coat(p), lj.Medium(p["dye"], 0.0), _second(p)], _metal(p)),
         lj.Statistical(),
         2.0,
         1.0,

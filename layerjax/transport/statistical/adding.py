@@ -1,18 +1,24 @@
 """Adding of energies and variances, element by element from the top (Belcour 2018, Sec. 5).
 
-Energies carry a leading axis of scattering orders: entry k is the energy of the paths with k collisions in media, the
-last entry that of all with as many or more. Without scattering media its length is 1.
+Energies are tuples by scattering order: entry k is the energy of the paths with k collisions in media, the last entry
+that of all with as many or more; without scattering media there is one. Each entry has an array for every channel, or
+one for all, as variances have: at one texel or cosine these are a few numbers, and side by side they stay in registers.
 
 The printed equations are corrected: the factor J of Eq. 36 also multiplies the variance of the way down, and the series
 is in sigma_23^R + sigma_21^R; J counts from the medium that a variance is in to the outside.
 """
 
+from functools import reduce
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax import channels
 from layerjax._numerics import at_least
+from layerjax.channels import Channels, each
+
+Orders = tuple[Channels, ...]
 
 LEAST_ESCAPE = 1e-6
 """Of light between two elements, the share that stands for all smaller ones to leave at a turn."""
@@ -22,21 +28,21 @@ LEAST_ENERGY = 1e-12
 
 
 class Element(NamedTuple):
-    """An interface, a medium or a base. Energies (orders, C or 1, n), variances (C or 1, n), for n directions.
+    """An interface, a medium or a base.
 
     r12, t12: reflected and transmitted of what comes from above; r21, t21: of what comes from below. widening: variance
     that reflection adds (either side), down and up: transmission. jacobian: J_up, the variance on its upper side of a
     unit of it below.
     """
 
-    r12: Array
-    t12: Array
-    r21: Array
-    t21: Array
-    widening: Array
-    down: Array
-    up: Array
-    jacobian: Array
+    r12: Orders
+    t12: Orders
+    r21: Orders
+    t21: Orders
+    widening: Channels
+    down: Channels
+    up: Channels
+    jacobian: Channels
 
 
 class Above(NamedTuple):
@@ -46,97 +52,114 @@ class Above(NamedTuple):
     in the medium below, that of ti outside; jacobian: variance outside of a unit of it in the medium below.
     """
 
-    t0: Array
-    ri: Array
-    ti: Array
-    s_t0: Array
-    s_ri: Array
-    s_ti: Array
-    jacobian: Array
+    t0: Orders
+    ri: Orders
+    ti: Orders
+    s_t0: Channels
+    s_ri: Channels
+    s_ti: Channels
+    jacobian: Channels
 
 
 class Lobe(NamedTuple):
-    """Energy by scattering orders (orders, C or 1, n) and variance (C or 1, n), at the side where it leaves."""
+    """Energy and variance at the side where it leaves."""
 
-    energy: Array
-    variance: Array
+    energy: Orders
+    variance: Channels
 
 
 def nothing(cosine: Array) -> Above:
-    """No element at all, for directions of shape (n,)."""
-    zero = jnp.zeros_like(cosine)[None]
-    one = jnp.ones_like(cosine)[None]
-    return Above(one[None], zero[None], one[None], zero, zero, zero, one)
+    """No element at all."""
+    zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
+    return Above((one,), (zero,), (one,), zero, zero, zero, one)
 
 
 def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
     """The lobe that the element sends out of the top, and what is above its lower side."""
     between = times(above.ri, element.r12)
     inverse = escapes(between)
-    m = times(times(times(above.t0, element.r12), above.ti), inverse)
+    m = times(above.t0, element.r12, above.ti, inverse)
     # mean number of further turns between the two, and the variance of them
-    turned = jnp.sum(between, axis=0)
-    rr = turned / at_least(1.0 - turned, LEAST_ESCAPE)
-    turns = rr * (element.widening + above.s_ri)
-    lobe = Lobe(m, above.s_ti + above.jacobian * (above.s_t0 + element.widening + turns))  # Eq. (36)
-
-    down = 1.0 / element.jacobian
-    s_t0 = down * (above.s_t0 + turns) + element.down  # Eqs. (47-49)
-    s_ti = above.jacobian * (element.up + turns) + above.s_ti  # Eq. (50)
-    back = times(times(times(element.t21, above.ri), element.t12), inverse)
-    r21, crossed = jnp.sum(element.r21, axis=0), jnp.sum(back, axis=0)
-    through = element.down + down * (element.up + above.s_ri + turns)
-    total = r21 + crossed
-    returns = total > LEAST_ENERGY  # where hardly any light does, its width is that of the element alone
-    share = jnp.where(returns, crossed / jnp.where(returns, total, 1.0), 0.0)
-    mean = element.widening + share * (through - element.widening)  # Eq. (51)
-    return lobe, Above(
-        t0=times(times(above.t0, element.t12), inverse),  # Eq. (31)
+    rr = each(lambda turned: turned / at_least(1.0 - turned, LEAST_ESCAPE), whole(between))
+    turns = each(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
+    variance = each(  # Eq. (36)
+        lambda s_ti, j, s_t0, w, turns: s_ti + j * (s_t0 + w + turns),
+        above.s_ti, above.jacobian, above.s_t0, element.widening, turns,
+    )  # fmt: skip
+    s_t0 = each(  # Eqs. (47-49)
+        lambda j, s, turns, d: (s + turns) / j + d, element.jacobian, above.s_t0, turns, element.down
+    )
+    s_ti = each(  # Eq. (50)
+        lambda j, up, turns, s: j * (up + turns) + s, above.jacobian, element.up, turns, above.s_ti
+    )
+    back = times(element.t21, above.ri, element.t12, inverse)
+    through = each(
+        lambda d, j, up, s, turns: d + (up + s + turns) / j,
+        element.down, element.jacobian, element.up, above.s_ri, turns,
+    )  # fmt: skip
+    s_ri = each(_mean_variance, whole(element.r21), whole(back), element.widening, through)
+    return Lobe(m, variance), Above(
+        t0=times(above.t0, element.t12, inverse),  # Eq. (31)
         ri=plus(element.r21, back),  # Eq. (30)
-        ti=times(times(element.t21, above.ti), inverse),  # Eq. (29)
+        ti=times(element.t21, above.ti, inverse),  # Eq. (29)
         s_t0=s_t0,
-        s_ri=mean,
+        s_ri=s_ri,
         s_ti=s_ti,
-        jacobian=above.jacobian * element.jacobian,
+        jacobian=channels.times(above.jacobian, element.jacobian),
     )
 
 
-def retain(above: Above, share: Array) -> Above:
+def _mean_variance(reflected: Array, crossed: Array, widening: Array, through: Array) -> Array:
+    """Eq. (51): of what the element itself reflects and of what comes back from above it."""
+    total = reflected + crossed
+    returns = total > LEAST_ENERGY  # where hardly any light does, its width is that of the element alone
+    share = jnp.where(returns, crossed / jnp.where(returns, total, 1.0), 0.0)
+    return widening + share * (through - widening)
+
+
+def retain(above: Above, share: Channels) -> Above:
     """Only this share (kappa, Eqs. 34-35) of the light from below gets out; the rest is totally reflected."""
-    return above._replace(ri=plus(above.ri, (1.0 - share) * above.ti), ti=share * above.ti)
+    kept = tuple(each(lambda energy, share: (1.0 - share) * energy, energy, share) for energy in above.ti)
+    return above._replace(ri=plus(above.ri, kept), ti=tuple(channels.times(share, energy) for energy in above.ti))
 
 
-def plus(a: Array, b: Array) -> Array:
+def whole(energy: Orders) -> Channels:
+    """Of all orders together."""
+    return channels.total(energy)
+
+
+def plus(a: Orders, b: Orders) -> Orders:
     """Sum of energies by scattering orders; what has no more than one entry has not been scattered."""
-    if a.shape[0] < b.shape[0]:
-        a, b = b, a
-    if b.shape[0] < a.shape[0]:
-        b = jnp.concatenate([b, jnp.zeros((a.shape[0] - b.shape[0], *b.shape[1:]), b.dtype)])
-    return a + b
+    longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
+    return (*(channels.total(pair) for pair in zip(longer, shorter, strict=False)), *longer[len(shorter) :])
 
 
-def times(a: Array, b: Array) -> Array:
+def times(*factors: Orders) -> Orders:
     """Product of energies by scattering orders; the last entry takes all orders beyond it, so that sums multiply."""
-    if a.shape[0] == 1 or b.shape[0] == 1:
-        return a * b
-    count = a.shape[0]
-    found = []
-    for k in range(count - 1):
-        found.append(sum((a[j] * b[k - j] for j in range(k + 1)), jnp.zeros_like(a[0] * b[0])))
-    rest = jnp.zeros_like(found[0])
-    for i in range(count):
-        for j in range(max(0, count - 1 - i), count):
-            rest = rest + a[i] * b[j]
-    return jnp.stack([*found, rest])
+    return reduce(_product, factors)
 
 
-def escapes(x: Array) -> Array:
+def _product(a: Orders, b: Orders) -> Orders:
+    if len(a) == 1 or len(b) == 1:
+        return tuple(channels.times(x, y) for x in a for y in b)
+    last = len(a) - 1
+    sums: list[list[Channels]] = [[] for _ in a]
+    for i, x in enumerate(a):
+        for j, y in enumerate(b):
+            sums[min(i + j, last)].append(channels.times(x, y))
+    return tuple(channels.total(parts) for parts in sums)
+
+
+def escapes(x: Orders) -> Orders:
     """1 + x + x^2 + ... by scattering orders."""
-    first = 1.0 / at_least(1.0 - x[0], LEAST_ESCAPE)
-    if x.shape[0] == 1:
-        return first[None]
+    first = each(lambda x: 1.0 / at_least(1.0 - x, LEAST_ESCAPE), x[0])
+    if len(x) == 1:
+        return (first,)
     found = [first]
-    for k in range(1, x.shape[0] - 1):
-        found.append(first * sum((x[j] * found[k - j] for j in range(1, k + 1)), jnp.zeros_like(first)))
-    total = 1.0 / at_least(1.0 - jnp.sum(x, axis=0), LEAST_ESCAPE)
-    return jnp.stack([*found, at_least(total - sum(found[1:], first), 0.0)])
+    for k in range(1, len(x) - 1):
+        again = channels.total([channels.times(x[j], found[k - j]) for j in range(1, k + 1)])
+        found.append(channels.times(first, again))
+    rest = each(
+        lambda x, known: at_least(1.0 / at_least(1.0 - x, LEAST_ESCAPE) - known, 0.0), whole(x), channels.total(found)
+    )
+    return (*found, rest)

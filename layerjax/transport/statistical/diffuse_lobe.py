@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax._numerics import at_least, horizon, safe_sqrt
@@ -15,9 +16,13 @@ from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, sanitised
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
+from layerjax.transport.adding_doubling.grid import cubic
 from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
 from layerjax.transport.statistical.lobes import precision
-from layerjax.transport.statistical.tables import GRAZING, look_up, points
+from layerjax.transport.statistical.shaped import GRAZING
+
+POINTS = 97
+"""Cosines of a table, uniform in the angle above the horizon."""
 
 
 class DiffuseLobe(eqx.Module):
@@ -44,7 +49,8 @@ def make_diffuse_lobe(stack: Stack) -> DiffuseLobe:
     """The lobe of a simplified stack for which `why_no_lobe` finds nothing."""
     assert isinstance(stack.base, Lambertian)
     dtype = precision(stack)
-    cosine = at_least(points(dtype), GRAZING)
+    points = np.sin(0.5 * np.pi * np.linspace(0.0, 1.0, POINTS))
+    cosine = jnp.asarray(np.maximum(points, GRAZING), dtype)
     albedos = per_channel(jnp.asarray(stack.base.albedo))
     depths: list[list[Array]] = []
     faces: list[Interface] = []
@@ -80,5 +86,8 @@ def lobe_value(part: DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
 
 def lobe_albedo(part: DiffuseLobe, wi: Vector) -> Channels:
     """Energy of `lobe_value` for light along wi, above."""
-    rows = look_up(part.energy, wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1]))
+    place = jnp.arctan2(wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])) * (2.0 * (POINTS - 1) / np.pi)
+    first = jnp.clip(jnp.floor(place) - 1.0, 0.0, POINTS - 4.0).astype(jnp.int32)
+    taps = [weight[..., None] * part.energy[first + j] for j, weight in enumerate(cubic(place - first))]
+    rows = sum(taps[1:], taps[0])
     return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points

@@ -1,10 +1,10 @@
-"""Directions drawn from the lobes of a table: one lobe by its energy, then a facet that is seen from the light."""
+"""Directions drawn from the lobes of a stack: one lobe by its energy, then a facet that is seen from the light."""
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
+from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import reflection_pdf
@@ -12,60 +12,32 @@ from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.single_scattering import Media, SingleScattering
+from layerjax.transport.statistical.coated_base import CoatedBase, coated_albedo, coated_value
 from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
-from layerjax.transport.statistical.lobes import bounded
-from layerjax.transport.statistical.tables import Columns, Table, folded, look_up, unfolded
+from layerjax.transport.statistical.shaped import Shaped, folded, unfolded
 
-DiffusePart = DiffuseBase | DiffuseLobe | Surface
+DiffusePart = DiffuseBase | CoatedBase | DiffuseLobe | Surface
 """Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""
 
 
-def planar(w: Vector) -> Array:
-    """Sine of the polar angle."""
-    return safe_sqrt(w[0] * w[0] + w[1] * w[1])
-
-
-def take(row: Array, columns: tuple[int, int]) -> Channels:
-    """Columns (first, count) of rows of a table, one array each."""
-    return tuple(row[..., columns[0] + c] for c in range(columns[1]))
-
-
-def read_energies(table: Table, wi: Vector) -> tuple[Channels, Channels]:
-    """Energy of all lobes on the side of the light and on the other."""
-    # a cubic may fall below its points
-    near, far = (at_least(look_up(rows, wi[2], planar(wi)), 0.0) for rows in (table.near, table.far))
-    return take(near, (0, near.shape[-1])), take(far, (0, far.shape[-1]))
-
-
-def widths(table: Table, wi: Vector) -> tuple[list[Array], list[Array]]:
-    """GGX width of every lobe for light along wi, mean of the channels: those reflected, those transmitted."""
-    row = look_up(table.rows, wi[2], planar(wi))
-
-    def width(columns: Columns) -> Array:
-        if columns.alpha is None:
-            assert table.facet is not None
-            return jnp.asarray(table.facet[0].alpha) * jnp.ones_like(wi[2])
-        alphas = take(row, columns.alpha)
-        return bounded(sum(alphas[1:], alphas[0]) / len(alphas))
-
-    return [width(columns) for columns in table.reflected], [width(columns) for columns in table.transmitted]
-
-
 def draw(
-    table: Table,
+    lobes: Shaped,
     diffuse: DiffusePart | None,
     wi: Vector,
     uniforms: tuple[Array, Array, Array],
     entry: Array,
     exit: Array,
 ) -> Vector:
-    """Outgoing directions for light above. entry, exit: indices before and behind over that of the folded medium."""
+    """Outgoing directions for light above, of these lobes.
+
+    entry, exit: indices before and behind over that of the folded medium.
+    """
     u, u1, u2 = uniforms
     valid = wi[2] > horizon(wi[2].dtype)
     wi = sanitised(wi, valid)
-    shares = _probabilities(table, diffuse, wi)
-    reflected, transmitted = widths(table, wi)
+    shares = _probabilities(lobes, diffuse, wi)
+    reflected, transmitted = lobes.widths()
     alpha, passes, scatters = jnp.ones_like(u), jnp.zeros(u.shape, bool), jnp.ones(u.shape, bool)
     reached = jnp.zeros_like(u)
     for index, width in enumerate(reflected + transmitted):
@@ -85,13 +57,13 @@ def draw(
     return (wo[0], wo[1], jnp.where(lost, 0.0, wo[2]))
 
 
-def density(table: Table, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array) -> Array:
+def density(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector, wo: Vector, entry: Array, exit: Array) -> Array:
     """Density of `draw` in solid angle, 1/sr."""
     edge = horizon(wi[2].dtype)
     lit = wi[2] > edge
     wi = sanitised(wi, lit)
-    shares = _probabilities(table, diffuse, wi)
-    reflected, transmitted = widths(table, wi)
+    shares = _probabilities(lobes, diffuse, wi)
+    reflected, transmitted = lobes.widths()
     above = wo[2] > edge
     up = sanitised(wo, above)
     h, _ = half_vector(wi, up, same_side=True)
@@ -119,6 +91,8 @@ def diffuse_energy(diffuse: DiffusePart, wi: Vector, nodes: int) -> Channels:
     """Energy of the light that has met a diffuse base, of any form; `nodes`: see `layerjax.albedo`."""
     if isinstance(diffuse, Surface):
         return SingleScattering().albedo(Media((), diffuse), wi, nodes)[0]
+    if isinstance(diffuse, CoatedBase):
+        return coated_albedo(diffuse, wi)
     return diffuse_albedo(diffuse, wi) if isinstance(diffuse, DiffuseBase) else lobe_albedo(diffuse, wi)
 
 
@@ -126,15 +100,16 @@ def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
     """BRDF of the light that has met a diffuse base, of any form; 0 unless both directions are above."""
     if isinstance(diffuse, Surface):
         return SingleScattering().evaluate(Media((), diffuse), wi, wo, "reflection")
+    if isinstance(diffuse, CoatedBase):
+        return coated_value(diffuse, wi, wo)
     return diffuse_value(diffuse, wi, wo) if isinstance(diffuse, DiffuseBase) else lobe_value(diffuse, wi, wo)
 
 
-def _probabilities(table: Table, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
-    """Of the lobes, in the order of the table; what is missing from 1 is that of the diffuse part."""
-    if table.shares.shape[-1] == 0:
+def _probabilities(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
+    """Of the lobes, in their order; what is missing from 1 is that of the diffuse part."""
+    energies = [jnp.where(share > 1e-6, share, 1e-6) for share in lobes.shares()]
+    if not energies:
         return []
-    row = look_up(table.shares, wi[2], planar(wi))
-    energies = [jnp.where(row[..., k] > 1e-6, row[..., k], 1e-6) for k in range(row.shape[-1])]
     total = sum(energies, jnp.zeros_like(wi[2]))
     if diffuse is not None:
         assert not isinstance(diffuse, Surface)  # which has no lobes beside it

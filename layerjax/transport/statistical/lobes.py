@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax import fresnel
+from layerjax import channels, fresnel
 from layerjax._numerics import at_least, at_most
-from layerjax.channels import per_channel
-from layerjax.microsurface.directional_albedo import conductor_energy, interface_energies, is_smooth, retained
+from layerjax.channels import Channels, each, per_channel
+from layerjax.microsurface.directional_albedo import Microfacets, is_smooth
+from layerjax.microsurface.energy_tables import conductor_energies, interface_energies, retained_share
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
 from layerjax.transport.statistical.adding import Element, Lobe, add_element, nothing, retain
@@ -33,9 +34,6 @@ Scattering = Literal["orders", "single"]
 STEEPEST = 0.999
 """Sine of refraction that stands in where no refracted direction exists (rough interfaces pass some light there)."""
 
-POINTS = 8
-"""Of the quadrature of interfaces: energies to 1e-3, which is far below what the model can tell."""
-
 LEAST_DEPTH = 1e-9
 """Optical depth that a mean over media is divided by at least."""
 
@@ -43,39 +41,45 @@ LEAST_DEPTH = 1e-9
 class Options(NamedTuple):
     """How the statistics are taken: see `Statistical`."""
 
-    microfacets: Literal["single", "multiple"]
+    microfacets: Microfacets
     scattering: Scattering
     angles: bool
     own_side: bool
+    smooth: tuple[bool, ...] | None = None
+    """Of the layers and the base, which are known to be as narrow as can be; None: those that are not traced."""
 
 
 class Reflection(NamedTuple):
     """A lobe that leaves on the side of the light.
 
     spread: variance that each order of scattering adds, None where nothing scatters. facet: the interface or base that
-    reflects, if it is the first one, and the ratio of the indices behind and before it (of a conductor: the index of
-    what it is in); else None.
+    reflects, if it is the first one, the ratio of the indices behind and before it (of a conductor: the index of what
+    it is in), and whether it is smooth; else None.
     """
 
     lobe: Lobe
-    spread: Array | None
-    facet: tuple[Interface | Conductor, Array] | None
+    spread: Channels | None
+    facet: tuple[Interface | Conductor, Array, bool] | None
 
 
 class Statistics(NamedTuple):
-    """Lobes of light along n cosines: those reflected, and the one transmitted (None over a base)."""
+    """Lobes of light along some cosines: those reflected, and the one transmitted (None over a base)."""
 
     reflected: tuple[Reflection, ...]
     transmitted: Lobe | None
-    transmitted_spread: Array | None
+    transmitted_spread: Channels | None
 
 
 class Part(NamedTuple):
-    """A layer or base, with the refractive indices above and below it, as the light meets them."""
+    """A layer or base, with the refractive indices above and below it, as the light meets them.
+
+    smooth: whether its energies are Fresnel's.
+    """
 
     what: Any
     above: Array
     below: Array
+    smooth: bool
 
 
 def precision(stack: Stack) -> Any:
@@ -83,64 +87,76 @@ def precision(stack: Stack) -> Any:
     return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
-def parts(stack: Stack, upward: bool) -> list[Part]:
+def smooth_parts(stack: Stack) -> tuple[bool, ...]:
+    """Of the layers and a base, which are known while tracing to be as narrow as can be: `Options.smooth`."""
+    return tuple(
+        isinstance(part, Interface | Conductor) and is_smooth(part.alpha) for part in (*stack.layers, stack.base)
+    )
+
+
+def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) -> list[Part]:
     """The layers and a conductor below, in the order in which light from above (or from below: `upward`) meets them."""
     found = []
     index = jnp.ones((), precision(stack))
-    for layer in stack.layers:
+    smooth = smooth_parts(stack) if smooth is None else smooth
+    for layer, narrow in zip(stack.layers, smooth, strict=False):
         below = jnp.asarray(layer.ior) if isinstance(layer, Interface) else index
-        found.append(Part(layer, index, below))
+        found.append(Part(layer, index, below, narrow))
         index = below
     if upward:
-        return [Part(part.what, part.below, part.above) for part in reversed(found)]
+        return [Part(part.what, part.below, part.above, part.smooth) for part in reversed(found)]
     if isinstance(stack.base, Conductor):
-        found.append(Part(stack.base, index, index))
+        found.append(Part(stack.base, index, index, smooth[-1]))
     return found
 
 
 def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = False) -> Statistics:
-    """Lobes of a simplified stack, lit along cosines (n,) > 0, from below if `upward`. Diffuse bases are left out."""
-    met = parts(stack, upward)
+    """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are left out."""
+    met = parts(stack, upward, options.smooth)
     above = nothing(cosine)
     reflected: list[Reflection] = []
-    spread: Array | None = None
-    depth = jnp.zeros_like(cosine)[None]
+    spread: Channels | None = None
+    depth: Channels = (jnp.zeros_like(cosine),)
     over: Array | None = None  # index above the nearest interface so far
     cosines = [bounded_refracted_cosine(cosine, part.above / met[0].above, STEEPEST)[0] for part in met]
     interfaces = iter(_interfaces(met, cosines, options))
-    for (what, index, below), here in zip(met, cosines, strict=True):
+    for (what, index, below, smooth), here in zip(met, cosines, strict=True):
         if isinstance(what, Medium):
             element, scattered = _medium(what, here, options)
             if scattered is not None and options.scattering == "orders":
                 optical, width = scattered
-                mean = above.jacobian * width * jnp.ones_like(optical)
-                total = depth + optical
-                spread = mean if spread is None else (depth * spread + optical * mean) / at_least(total, LEAST_DEPTH)
-                depth = total
+                mean = channels.times(above.jacobian, (width,))
+                spread = mean if spread is None else each(_mean_spread, depth, spread, optical, mean)
+                depth = channels.total([depth, optical])
             _, above = add_element(above, element)
             continue
         alpha = jnp.asarray(what.alpha)
         if over is not None:  # some of the light on its way up is totally reflected: Eqs. (32-35)
-            above = retain(above, retained(here, roughness(above.s_t0 + variance(alpha)), over / index))
-        element = _conductor(what, here, index, options) if isinstance(what, Conductor) else next(interfaces)
+            width = jnp.stack([roughness(sigma + variance(alpha)) for sigma in above.s_t0])
+            above = retain(above, tuple(retained_share(here, width, over / index)))
+        element = _conductor(what, here, index, options, smooth) if isinstance(what, Conductor) else next(interfaces)
         lobe, above = add_element(above, element)
         relative = index if isinstance(what, Conductor) else below / index
-        reflected.append(Reflection(lobe, spread, None if reflected else (what, relative)))
+        reflected.append(Reflection(lobe, spread, None if reflected else (what, relative, smooth)))
         over = index
     if stack.base is not None:
         return Statistics(tuple(reflected), None, None)
     return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), spread)
 
 
+def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Array:
+    return (depth * spread + optical * mean) / at_least(depth + optical, LEAST_DEPTH)
+
+
 def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options) -> list[Element]:
-    """Elements of all interfaces: the energies of the rough ones together, as one quadrature."""
+    """Elements of all interfaces: the energies of the rough ones together, at one look."""
     chosen = [k for k, part in enumerate(met) if isinstance(part.what, Interface)]
     if not chosen:
         return []
     cosine = jnp.stack([cosines[k] for k in chosen])
-    alpha = jnp.stack([jnp.asarray(met[k].what.alpha) for k in chosen])[:, None]
-    ior = jnp.stack([jnp.asarray(met[k].below / met[k].above) for k in chosen])[:, None]
-    smooth = [is_smooth(met[k].what.alpha) for k in chosen]
+    alpha = _rows([jnp.asarray(met[k].what.alpha) for k in chosen], cosine)
+    ior = _rows([jnp.asarray(met[k].below / met[k].above) for k in chosen], cosine)
+    smooth = [met[k].smooth for k in chosen]
     refracted, exists = bounded_refracted_cosine(cosine, ior, STEEPEST)
     r12, t12 = _dielectric(cosine, alpha, ior, smooth, options)
     r21, t21 = r12, t12  # Helmholtz: exact where the interface is smooth
@@ -155,11 +171,22 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     up = variance(transmission_scale(steep_t, 1.0 / ior, steep_i) * alpha)
     return [
         Element(
-            *(energy[k][None, None] for energy in (r12, t12, r21, t21)),
-            *(width[k][None] for width in (widening, down, up, jacobian)),
+            r12=((r12[k],),),
+            t12=((t12[k],),),
+            r21=((r21[k],),),
+            t21=((t21[k],),),
+            widening=(widening[k],),
+            down=(down[k],),
+            up=(up[k],),
+            jacobian=(jacobian[k],),
         )
         for k in range(len(chosen))
     ]
+
+
+def _rows(values: Sequence[Array], like: Array) -> Array:
+    """Numbers, one for each row of an array."""
+    return jnp.stack(values).reshape(-1, *(1,) * (like.ndim - 1))
 
 
 def _dielectric(
@@ -167,48 +194,50 @@ def _dielectric(
 ) -> tuple[Array, Array]:
     """Reflected and transmitted energy of interfaces, one a row."""
     if not any(smooth):
-        return interface_energies(cosine, alpha, ior, options.microfacets, points=POINTS)
+        return interface_energies(cosine, alpha, ior, options.microfacets)
     exact = fresnel.dielectric(cosine, ior)
     rough = np.flatnonzero(~np.asarray(smooth))
     if not rough.size:
         return exact, 1.0 - exact
-    r, t = interface_energies(cosine[rough], alpha[rough], ior[rough], options.microfacets, points=POINTS)
+    r, t = interface_energies(cosine[rough], alpha[rough], ior[rough], options.microfacets)
     return exact.at[rough].set(r), (1.0 - exact).at[rough].set(t)
 
 
-def _conductor(base: Conductor, cosine: Array, index: Array, options: Options) -> Element:
+def _conductor(base: Conductor, cosine: Array, index: Array, options: Options, smooth: bool) -> Element:
     alpha = jnp.asarray(base.alpha)
-    ior, k = (jnp.reshape(value, (-1, 1)) / index for value in (base.ior, base.k))
-    if is_smooth(base.alpha):
-        levels = fresnel.conductor(cosine, ior, k)[None]
-    else:
-        levels = conductor_energy(cosine, alpha, ior, k, options.microfacets)[None]
-    zero = jnp.zeros_like(cosine)[None]
-    nothing_passes = zero[None]
-    width = variance(alpha) * jnp.ones_like(zero)
-    return Element(levels, nothing_passes, nothing_passes, nothing_passes, width, zero, zero, jnp.ones_like(zero))
+    levels = metal_levels(base, cosine, index, options.microfacets, smooth)
+    zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
+    dark = (zero,)  # nothing passes
+    return Element((levels,), dark, dark, dark, (variance(alpha) * one[0],), zero, zero, one)
 
 
-def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, tuple[Array, Array] | None]:
+def metal_levels(base: Conductor, cosine: Array, index: Array, microfacets: Microfacets, smooth: bool) -> Channels:
+    """Reflectance of a metal in a medium of this index."""
+    ior, k = (tuple(x / index for x in per_channel(jnp.asarray(value))) for value in (base.ior, base.k))
+    if smooth:
+        return each(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
+    return conductor_energies(cosine, jnp.asarray(base.alpha), ior, k, microfacets)
+
+
+def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, tuple[Channels, Array] | None]:
     """Element of a medium; and the optical depth that scatters with the variance of a collision, None if none does."""
-    depth = jnp.stack(per_channel(medium.thickness))[:, None] / cosine
-    zero = jnp.zeros_like(cosine)[None]
+    depth = tuple(thickness / cosine for thickness in per_channel(jnp.asarray(medium.thickness)))
+    zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
+    dark = (zero,)
+    straight = tuple(jnp.exp(-t) for t in depth)
     g = medium.phase.forward_lobe
     if g is None or is_known(medium.albedo, 0.0):
-        t = jnp.exp(-depth)[None]
-        return Element(zero[None], t, zero[None], t, zero, zero, zero, jnp.ones_like(zero)), None
-    albedo = jnp.asarray(medium.albedo)
-    scattered = (albedo[:, None] if albedo.ndim else albedo) * depth
+        return Element(dark, (straight,), dark, (straight,), zero, zero, zero, one), None
+    scattered = channels.times(per_channel(jnp.asarray(medium.albedo)), depth)
     width = phase_variance(jnp.asarray(g))
     if options.scattering == "single":
-        t = jnp.exp(jnp.log1p(scattered) - depth)[None]  # (1 + t) exp(-t)
-        added = scattered / (1.0 + scattered) * width
-        return Element(zero[None], t, zero[None], t, zero, added, added, jnp.ones_like(zero)), None
-    straight = jnp.exp(-depth)
-    once = straight * scattered
-    more = at_least(jnp.exp(-depth + scattered) - straight - once, 0.0)
-    t = jnp.stack(jnp.broadcast_arrays(straight, once, more))
-    return Element(zero[None], t, zero[None], t, zero, zero, zero, jnp.ones_like(zero)), (scattered, width)
+        passed = each(lambda s, t: jnp.exp(jnp.log1p(s) - t), scattered, depth)  # (1 + t) exp(-t)
+        added = tuple(s / (1.0 + s) * width for s in scattered)
+        return Element(dark, (passed,), dark, (passed,), zero, added, added, one), None
+    once = channels.times(straight, scattered)
+    more = each(lambda s, t, e, o: at_least(jnp.exp(s - t) - e - o, 0.0), scattered, depth, straight, once)
+    orders = (straight, once, more)
+    return Element(dark, orders, dark, orders, zero, zero, zero, one), (scattered, width)
 
 
 def lobe_roughness(sigma: Array) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels
-from layerjax._numerics import at_least, horizon, safe_div, safe_sqrt
+from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitised, select
 from layerjax.microsurface import Microfacets
@@ -22,7 +22,8 @@ from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Surface
 from layerjax.surfaces.interface import interface_reflection
-from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.contract import TEXELS, DeterministicTransport, Side, refuse_vmf
+from layerjax.transport.statistical.coated_base import is_coated, make_coated
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.diffuse_lobe import make_diffuse_lobe, why_no_lobe
 from layerjax.transport.statistical.drawing import (
@@ -31,19 +32,15 @@ from layerjax.transport.statistical.drawing import (
     diffuse_energy,
     diffuse_part,
     draw,
-    planar,
-    read_energies,
-    take,
-    widths,
 )
-from layerjax.transport.statistical.lobes import Options, Scattering, bounded
-from layerjax.transport.statistical.tables import (
-    Table,
+from layerjax.transport.statistical.lobes import Options, Scattering, bounded, smooth_parts
+from layerjax.transport.statistical.shaped import (
+    Facet,
+    Shaped,
     folded,
     index_below,
-    look_up,
-    make_table,
     reference_index,
+    shaped,
     unfolded,
 )
 
@@ -51,14 +48,19 @@ Diffuse = Literal["exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
 
-class LobeTables(eqx.Module):
-    """A stack made ready: tables for light from above and from below (None over a base), and the diffuse part."""
+class Lit(eqx.Module):
+    """A stack, the diffuse part of its light, and the indices below it and of where transmitted lobes are described."""
 
-    top: Table
-    bottom: Table | None
+    stack: Stack
     diffuse: DiffusePart | None
     below: Array
     reference: Array
+    smooth: tuple[bool, ...] = eqx.field(static=True)
+
+    @property
+    def passes(self) -> bool:
+        """Whether there is no base."""
+        return self.stack.base is None
 
 
 class Statistical(DeterministicTransport):
@@ -76,7 +78,8 @@ class Statistical(DeterministicTransport):
         scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
             collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
             that lobe cannot be told from the light that nothing met, and both are left out.
-        diffuse: light that has met a diffuse base: ``"exact"``, closed form with transmittances by adding-doubling; or
+        diffuse: light that has met a diffuse base: ``"exact"``, closed form with transmittances from tables (of one
+            coat that absorbs at most, over a `Lambertian`, ``microfacets="multiple"``) or by adding-doubling; or
             ``"lobe"``, one GGX lobe from tables (2022), for interfaces and absorbing media over a `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
         own_side: whether light from inside meets the reflectance of its own side, or by reciprocity that from outside.
@@ -116,141 +119,149 @@ class Statistical(DeterministicTransport):
             if reason is not None:
                 raise ValueError(f'{reason}; Statistical(diffuse="exact") takes any')
 
-    def prepare(self, stack: Stack) -> LobeTables:
-        options = Options(self.microfacets, self.scattering, self.angles, self.own_side)
+    def prepare(self, stack: Stack) -> Lit:
         diffuse: DiffusePart | None = None
         if stack.base is not None and _is_diffuse(stack.base):
             if not stack.layers:
                 diffuse = stack.base
-            elif self.diffuse == "exact":
+            elif self.diffuse == "lobe":
+                diffuse = make_diffuse_lobe(stack)
+            elif self._solves(stack):
                 diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
-                diffuse = make_diffuse_lobe(stack)
-        return LobeTables(
-            top=make_table(stack, options, upward=False),
-            bottom=None if stack.base is not None else make_table(stack, options, upward=True),
-            diffuse=diffuse,
-            below=index_below(stack),
-            reference=reference_index(stack),
-        )
+                diffuse = make_coated(stack)
+        return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
-    def evaluate(self, state: LobeTables, wi: Vector, wo: Vector, side: Side) -> Channels:
+    def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = [(jnp.zeros_like(wi[2] * wo[2]),)]
         if side != "transmission":
-            parts += self._reflections(state.top, wi, wo)
+            parts += self._reflections(state, wi, wo, upward=False)
             if state.diffuse is not None:
                 parts.append(diffuse_part(state.diffuse, wi, wo))
-            if side == "all" and state.bottom is not None:
-                parts += self._reflections(state.bottom, flip(wi), flip(wo))
-        if side != "reflection" and state.bottom is not None:
+            if side == "all" and state.passes:
+                parts += self._reflections(state, flip(wi), flip(wo), upward=True)
+        if side != "reflection" and state.passes:
             parts += self._transmissions(state, wi, wo)
         return channels.total(parts)
 
-    def sample(self, state: LobeTables, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
-        down = draw(state.top, state.diffuse, wi, uniforms, 1.0 / state.reference, state.below / state.reference)
-        if state.bottom is None:
+    def sample(self, state: Lit, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
+        down = draw(self._lobes(state, wi, False), state.diffuse, wi, uniforms, *_ratios(state))
+        if not state.passes:
             return down
-        up = draw(state.bottom, None, flip(wi), uniforms, state.below / state.reference, 1.0 / state.reference)
+        wi_below = flip(wi)
+        up = draw(self._lobes(state, wi_below, True), None, wi_below, uniforms, *_ratios(state)[::-1])
         return select(wi[2] > 0, down, flip(up))
 
-    def pdf(self, state: LobeTables, wi: Vector, wo: Vector) -> Array:
-        down = density(state.top, state.diffuse, wi, wo, 1.0 / state.reference, state.below / state.reference)
-        if state.bottom is None:
+    def pdf(self, state: Lit, wi: Vector, wo: Vector) -> Array:
+        down = density(self._lobes(state, wi, False), state.diffuse, wi, wo, *_ratios(state))
+        if not state.passes:
             return down
-        ratios = state.below / state.reference, 1.0 / state.reference
-        return jnp.where(wi[2] > 0, down, density(state.bottom, None, flip(wi), flip(wo), *ratios))
+        wi_below = flip(wi)
+        up = density(self._lobes(state, wi_below, True), None, wi_below, flip(wo), *_ratios(state)[::-1])
+        return jnp.where(wi[2] > 0, down, up)
 
-    def albedo(self, state: LobeTables, wi: Vector, nodes: int) -> Energies:
+    def albedo(self, state: Lit, wi: Vector, nodes: int) -> Energies:
         """Forward: the energies of the lobes. Symmetric: by quadrature, 2 nodes^2 points a lobe."""
         above = wi[2] > horizon(wi[2].dtype)
-        near, far = self._energies(state, state.top, sanitised(wi, above), nodes, upward=False)
+        near, far = self._energies(state, sanitised(wi, above), nodes, upward=False)
         if state.diffuse is not None:
             near = channels.total([near, diffuse_energy(state.diffuse, sanitised(wi, above), nodes)])
-        if state.bottom is None:
+        if not state.passes:
             return channels.select(above, near), (jnp.zeros_like(wi[2]),)
         below = wi[2] < -horizon(wi[2].dtype)
-        other = self._energies(state, state.bottom, sanitised(flip(wi), below), nodes, upward=True)
+        other = self._energies(state, sanitised(flip(wi), below), nodes, upward=True)
         sides = []
         for down, up in zip((near, far), other, strict=True):
             sides.append(channels.select(above, down, channels.select(below, up)))
         return sides[0], sides[1]
 
-    def _energies(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
-        if self.symmetric:
-            return self._integrated(state, table, wi, nodes, upward)
-        return read_energies(table, wi)
+    def together(self, stack: Stack) -> int:
+        return 1 if self._solves(stack) else TEXELS
 
-    def _reflections(self, table: Table, wi: Vector, wo: Vector) -> list[Channels]:
-        """Every lobe, for light and viewer above."""
-        if not table.reflected:
-            return []
+    def _solves(self, stack: Stack) -> bool:
+        """Whether the diffuse part of a simplified stack needs a solve of its own."""
+        if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
+            return False
+        return self.diffuse == "lobe" or self.microfacets == "single" or not is_coated(stack)
+
+    def _shaped(self, state: Lit, cosine: Array, upward: bool) -> Shaped:
+        options = Options(self.microfacets, self.scattering, self.angles, self.own_side, state.smooth)
+        return shaped(state.stack, options, cosine, upward)
+
+    def _lobes(self, state: Lit, wi: Vector, upward: bool) -> Shaped:
+        """For light along wi, above (`upward`: turned up); of light that comes from elsewhere, whatever is finite."""
+        lit = wi[2] > horizon(wi[2].dtype)
+        return self._shaped(state, jnp.where(lit, wi[2], 1.0), upward)
+
+    def _energies(self, state: Lit, wi: Vector, nodes: int, upward: bool) -> Energies:
+        if self.symmetric:
+            return self._integrated(state, wi, nodes, upward)
+        return self._lobes(state, wi, upward).energies(jnp.zeros_like(wi[2]))
+
+    def _reflections(self, state: Lit, wi: Vector, wo: Vector, upward: bool) -> list[Channels]:
+        """Every lobe, for light and viewer above (`upward`: turned up)."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
         wi, wo = sanitised(wi, valid), sanitised(wo, valid)
         h, cosine = half_vector(wi, wo, same_side=True)
-        row = look_up(table.rows, *(_halves(wi, wo, cosine) if self.symmetric else (wi[2], planar(wi))))
+        found = self._shaped(state, cosine if self.symmetric else wi[2], upward)
         lobes = []
-        for columns in table.reflected:
-            scale = take(row, columns.scale)
-            if columns.alpha is None:
-                shape = _facet(table, wi, wo)
+        for lobe in found.reflected:
+            if lobe.alpha is None:
+                assert found.facet is not None
+                shape = _facet(found.facet, wi, wo)
             else:
-                shape = tuple(_lobe(h, wi, wo, alpha) for alpha in take(row, columns.alpha))
-            lobes.append(_product(scale, shape, valid))
+                shape = tuple(_lobe(h, wi, wo, alpha) for alpha in lobe.alpha)
+            lobes.append(channels.select(valid, channels.times(lobe.scale, shape)))
         return lobes
 
-    def _transmissions(self, state: LobeTables, wi: Vector, wo: Vector) -> list[Channels]:
+    def _transmissions(self, state: Lit, wi: Vector, wo: Vector) -> list[Channels]:
         """Every lobe that passes, for light and viewer on different sides: lobes of a reflection, folded over."""
-        assert state.bottom is not None
         edge = horizon(wi[2].dtype)
         downward = wi[2] > 0
         over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
         valid = (over[2] > edge) & (under[2] > edge)
         over, under = sanitised(over, valid), sanitised(under, valid)
-        ratio_over, ratio_under = 1.0 / state.reference, state.below / state.reference
+        ratio_over, ratio_under = _ratios(state)
         a, b = folded(over, ratio_over), folded(under, ratio_under)
         valid = valid & (a[2] > edge) & (b[2] > edge)
         a, b = sanitised(a, valid), sanitised(b, valid)
-        h, cosine = half_vector(a, b, same_side=True)
+        h, _ = half_vector(a, b, same_side=True)
         if self.symmetric:
-            _, sine = _halves(a, b, cosine)
-            sine = sine * state.reference
-            rows = [look_up(state.top.rows, safe_sqrt(1.0 - sine * sine), sine)] * 2
-            tables = [state.top] * 2
+            sine = _half_sine(a, b) * state.reference
+            found = [self._shaped(state, safe_sqrt(1.0 - sine * sine), False)] * 2
         else:
-            rows = [look_up(state.top.rows, over[2], planar(over)), look_up(state.bottom.rows, under[2], planar(under))]
-            tables = [state.top, state.bottom]
+            found = [self._shaped(state, w[2], upward) for w, upward in ((over, False), (under, True))]
         leaving = jnp.where(downward, ratio_under, ratio_over)
         lobes = []
-        for above, below in zip(tables[0].transmitted, tables[1].transmitted, strict=True):
+        for above, below in zip(found[0].transmitted, found[1].transmitted, strict=True):
             assert above.alpha is not None
             assert below.alpha is not None
-            scales = channels.select(downward, take(rows[0], above.scale), take(rows[1], below.scale))
-            alphas = channels.select(downward, take(rows[0], above.alpha), take(rows[1], below.alpha))
+            scale = channels.select(downward, above.scale, below.scale)
+            alphas = channels.select(downward, above.alpha, below.alpha)
             shape = tuple(leaving * leaving * _lobe(h, a, b, alpha) for alpha in alphas)  # per solid angle outside
-            lobes.append(_product(scales, shape, valid))
+            lobes.append(channels.select(valid, channels.times(scale, shape)))
         return lobes
 
-    def _integrated(self, state: LobeTables, table: Table, wi: Vector, nodes: int, upward: bool) -> Energies:
+    def _integrated(self, state: Lit, wi: Vector, nodes: int, upward: bool) -> Energies:
         """Energy of every lobe by a quadrature over the facets seen from wi, above (`upward`: turned up)."""
         s, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(nodes))
         turn = (jnp.arange(2 * nodes, dtype=s.dtype) + 0.5) / (2 * nodes)
         u1, u2 = (u.ravel() for u in jnp.meshgrid(turn, s, indexing="ij"))
         weight = jnp.tile(w, 2 * nodes) / (2 * nodes)
         edge = horizon(wi[2].dtype)
-        reflected, transmitted = widths(table, wi)
+        reflected, transmitted = self._lobes(state, wi, upward).widths()
         wi = (wi[0][..., None], wi[1][..., None], wi[2][..., None])
         near: list[Channels] = [(jnp.zeros_like(wi[2][..., 0]),)]
         far = list(near)
         for j, width in enumerate(reflected):
-            alpha = width[..., None]
+            alpha = jnp.asarray(width)[..., None]
             m = ggx_sample(wi, alpha, u1, u2)
             wo = reflect(wi, m)
             share = weight * safe_div(jnp.where(wo[2] > edge, wo[2], 0.0), reflection_pdf(m, wi, alpha))
-            lobe = self._reflections(table, wi, wo)[j]
+            lobe = self._reflections(state, wi, wo, upward)[j]
             near.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
-        ratios = 1.0 / state.reference, state.below / state.reference
-        entry, exit = ratios[::-1] if upward else ratios
+        entry, exit = _ratios(state)[::-1] if upward else _ratios(state)
         turned = flip if upward else _same
         for j, width in enumerate(transmitted):
             alpha = width[..., None]
@@ -271,29 +282,27 @@ def _same(w: Vector) -> Vector:
     return w
 
 
-def _halves(wi: Vector, wo: Vector, cosine: Array) -> tuple[Array, Array]:
-    """Cosine and sine of the angle between the directions and their half vector."""
+def _ratios(state: Lit) -> tuple[Array, Array]:
+    """Indices above and below over that of the medium in which transmitted lobes are described."""
+    return 1.0 / state.reference, state.below / state.reference
+
+
+def _half_sine(wi: Vector, wo: Vector) -> Array:
+    """Sine of the angle between the directions and their half vector."""
     apart = add(wi, (-wo[0], -wo[1], -wo[2]))
-    return cosine, 0.5 * safe_sqrt(dot(apart, apart))
+    return 0.5 * safe_sqrt(dot(apart, apart))
 
 
 def _lobe(h: Vector, wi: Vector, wo: Vector, alpha: Array) -> Array:
     """GGX lobe of facets that reflect all, D G / (4 cos cos), 1/sr."""
-    alpha = bounded(alpha)  # a cubic may leave the range of its points
+    alpha = bounded(alpha)
     area_i, area_o = ggx_area(wi, alpha), ggx_area(wo, alpha)
     return ggx_density(h, alpha) / ((wi[2] + area_i) * (wo[2] + area_o))
 
 
-def _facet(table: Table, wi: Vector, wo: Vector) -> Channels:
+def _facet(facet: Facet, wi: Vector, wo: Vector) -> Channels:
     """The first interface or base itself, with Fresnel reflectance at its own facets."""
-    assert table.facet is not None
-    what, relative = table.facet
+    what, relative, _ = facet
     if isinstance(what, Interface):
         return (interface_reflection(wi, wo, relative, jnp.asarray(what.alpha)),)
     return eqx.tree_at(lambda c: (c.ior, c.k), what, (what.ior / relative, what.k / relative)).evaluate(wi, wo)
-
-
-def _product(scale: Channels, shape: Channels, valid: Array) -> Channels:
-    # a cubic may fall below its points
-    scale = tuple(at_least(value, 0.0) for value in scale)
-    return channels.select(valid, channels.times(scale, shape))

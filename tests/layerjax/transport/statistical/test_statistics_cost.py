@@ -44,9 +44,16 @@ def test_smooth_interfaces(microfacets):
 
 
 def test_bases():
-    """A diffuse base asks for a solver, and nothing else does; without layers it is itself alone."""
-    clear, diffuse = program([COAT], None, symmetric=False), program([COAT], DIFFUSE, symmetric=False)
-    assert clear["while"] == program([COAT])["while"] == 0 < diffuse["while"]
+    """A diffuse base under several interfaces or haze asks for a solver, and nothing else does; bare it is itself."""
+    solved = program([COAT, lj.Interface(1.8, 0.1)], DIFFUSE), program([COAT, HAZE], DIFFUSE)
+    read = (
+        program([COAT], None),
+        program([COAT]),
+        program([COAT], DIFFUSE),
+        program([COAT, lj.Medium(0.7, 0.0)], DIFFUSE),
+    )
+    assert all(found["dot_general"] > 20 for found in solved)
+    assert all(found["dot_general"] < 10 for found in read)
     assert operations([], DIFFUSE) < 12 < operations([], METAL) < operations([COAT])
 
 
