@@ -5,6 +5,7 @@ process has several devices, each of them loops over its own share; gradients ar
 """
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -18,7 +19,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 ROWS = "rows"
-_in_use: list[int] = []  # by the programs that are being traced, the innermost last
+_in_use: ContextVar[int] = ContextVar("devices", default=1)  # by the program that this thread is tracing
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
@@ -26,11 +27,11 @@ def compiled(function: Callable[P, T]) -> Callable[P, T]:
 
     @eqx.filter_jit
     def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
-        _in_use.append(devices)
+        before = _in_use.set(devices)
         try:
             return function(*arguments, **options)
         finally:
-            _in_use.pop()
+            _in_use.reset(before)
 
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:
@@ -57,7 +58,7 @@ def over_devices(function: Callable[[Any], Any], rows: Any, least: int) -> Any:
     device would have more rows than another: to gather what they found takes longer than to find it.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
-    devices = _in_use[-1] if _in_use else 1
+    devices = _in_use.get()
     if devices == 1 or count % devices or count < devices * least:
         return function(rows)
     split = PartitionSpec(ROWS)

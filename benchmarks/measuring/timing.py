@@ -2,7 +2,9 @@
 
 import time
 from collections.abc import Callable, Mapping
+from typing import Any
 
+import jax
 import numpy as np
 
 Work = Callable[[], object]
@@ -28,3 +30,15 @@ def once(work: Work) -> float:
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
+
+
+def compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, float]:
+    """The program of a function for arguments like these, and the seconds that it takes to trace and compile."""
+    found: list[Any] = []
+    seconds = once(lambda: found.append(jax.jit(function).lower(*arguments).compile()))
+    return found[0], seconds
+
+
+def waiting(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[[], Any]:
+    """A way to run a program that returns when its work is done."""
+    return lambda: jax.block_until_ready(program(*arguments))

@@ -136,10 +136,10 @@ def student(centre: Floats, root: Floats, positions: Floats) -> Floats:
     whitened = np.linalg.solve(root, (positions - centre).T)
     freedom = 0.5 * (DEGREES_OF_FREEDOM + dimension)
     tails = freedom * np.log1p(np.sum(whitened**2, axis=0) / DEGREES_OF_FREEDOM)
-    return peak(dimension) - np.linalg.slogdet(root)[1] - tails
+    return student_peak(dimension) - np.linalg.slogdet(root)[1] - tails
 
 
-def peak(dimension: int) -> float:
+def student_peak(dimension: int) -> float:
     """Log-density of a Student-t of unit width at its centre."""
     freedom = 0.5 * (DEGREES_OF_FREEDOM + dimension)
     return float(

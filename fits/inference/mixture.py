@@ -16,7 +16,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
-from fits.inference.laplace import DEGREES_OF_FREEDOM, peak, slope_at_bounds, student, student_draws
+from fits.inference.laplace import DEGREES_OF_FREEDOM, slope_at_bounds, student, student_draws, student_peak
 from fits.inference.ridge import height, open_directions, ridge
 from fits.inference.uncertainty import local_information
 
@@ -98,7 +98,7 @@ class Mixture:
         """The mixture in JAX; none of its parameters is held at a bound."""
         assert not self.held.any()
         dimension = self.centre.shape[1]
-        level = self.log_weight - np.linalg.slogdet(self.root)[1] + peak(dimension)
+        level = self.log_weight - np.linalg.slogdet(self.root)[1] + student_peak(dimension)
         parts = self.centre, self.root, np.linalg.inv(self.root), self.log_weight, level
         return Leaps(*(jnp.asarray(part) for part in parts))
 

@@ -109,13 +109,6 @@ def conductor_energy(
 
 
 @partial(jax.jit, static_argnames="points")
-def single_energy(cosine: ArrayLike, alpha: ArrayLike, ior: ArrayLike, *, points: int = POINTS) -> Array:
-    """Reflectance of a rough dielectric interface, single scattering; see `interface_energies`."""
-    cosine, alpha, ior = _arrays(cosine, alpha, ior)
-    return _reflected(make_cap(cosine, alpha), ior, points)
-
-
-@partial(jax.jit, static_argnames="points")
 def lobe_energy(cosine: ArrayLike, alpha: ArrayLike, *, points: int = POINTS) -> Array:
     """Reflectance of a rough surface of perfect mirrors, single scattering."""
     cosine, alpha = _arrays(cosine, alpha)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from layerjax.microsurface.energy_tables import LARGEST_INDEX, index_variable
 from layerjax.precompute.interface_walks import multiply_scattered
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.statistical import diffuse
@@ -173,8 +174,8 @@ def _alphas(place: np.ndarray) -> np.ndarray:
 
 
 def _indices(place: np.ndarray, side: int) -> np.ndarray:
-    """Inverse of `diffuse.index_variable`."""
-    return diffuse.LARGEST_INDEX ** (place**3 * (1 - 2 * side))
+    """Inverse of `energy_tables.index_variable`."""
+    return LARGEST_INDEX ** (place**3 * (1 - 2 * side))
 
 
 def _cosines(place: np.ndarray, n: float) -> np.ndarray:
@@ -288,7 +289,7 @@ def _shared(shares: np.ndarray, way: int, cosine: np.ndarray, alpha: np.ndarray,
     """Shares of the walks at points (points, tau) on one side of index 1, cubic between the nodes."""
     side = int(np.min(n) < 1.0)
     c, a, i = (jnp.asarray(x) for x in (cosine, alpha, n))
-    places = diffuse.cosine_variable(c, i), diffuse.roughness_variable(a), diffuse.index_variable(i)
+    places = diffuse.cosine_variable(c, i), diffuse.roughness_variable(a), index_variable(i)
     weights = [_between(np.asarray(place), nodes) for place, nodes in zip(places, shares.shape[1:4], strict=True)]
     found = np.einsum("pc,pa,pn,cant->pt", *weights, shares[side, :, :, :, way], optimize=True)
     return np.clip(found, 0.0, 1.0)

@@ -20,6 +20,7 @@ from layerjax.microsurface import energy_tables as tables
 from layerjax.microsurface.energy_tables import (
     DENSER,
     FADED,
+    LEAST_ALPHA,
     MIRROR,
     REST,
     RETAINED,
@@ -43,7 +44,7 @@ METALS, LEAST_K, TOLERATED = 150, 0.3, 1e-3
 """That shares are fitted to, their least k, and the error of energy that counts as one of the usual numbers."""
 NEXT = 0.03
 """Step of differences of cosines, in widths of a lobe."""
-LEAST_COSINE, LEAST_ALPHA = 1e-6, 1e-4
+LEAST_COSINE = 1e-6
 NARROWEST_WALKED = 0.01
 """Alpha below which what is given back is that at this one, at a cosine that is as much larger."""
 
@@ -86,7 +87,8 @@ def _grid(side: str, dense: float) -> tuple[Values, Values, Values]:
     width = warp.cosine[0] + warp.cosine[1] * alpha * (ior if side == "thinner" else 1.0)
     cosine = tables.unstretched(x[:, None, None], critical, width)
     cosine = np.clip(cosine, LEAST_COSINE, 1.0)
-    return tuple(np.broadcast_arrays(cosine, alpha, ior))  # type: ignore[return-value]
+    cosine, alpha, ior = np.broadcast_arrays(cosine, alpha, ior)
+    return cosine, alpha, ior
 
 
 def _all_facets(cosine: Array, alpha: Array, ior: Array) -> tuple[Array]:

@@ -35,12 +35,17 @@ class Material:
 
     def maps(self, texels: int, precision: str) -> Maps:
         """A map of each parameter, (texels,) or (texels, channels)."""
-        generator = np.random.default_rng(SEED)
-        found = {}
-        for name, kind in self.ranges.items():
-            shape = (texels, kind.channels) if kind.channels else (texels,)
-            found[name] = generator.uniform(kind.low, kind.high, shape).astype(precision)
-        return found
+        return maps_of(self.ranges, texels, precision)
+
+
+def maps_of(ranges: Mapping[str, Range], texels: int, precision: str) -> Maps:
+    """Maps of parameters that vary in these ranges."""
+    generator = np.random.default_rng(SEED)
+    found = {}
+    for name, kind in ranges.items():
+        shape = (texels, kind.channels) if kind.channels else (texels,)
+        found[name] = generator.uniform(kind.low, kind.high, shape).astype(precision)
+    return found
 
 
 COAT = {"ior": Range(1.3, 1.8), "alpha": Range(0.05, 0.6)}
@@ -130,7 +135,5 @@ PRINCIPLED = {
 }
 """Of Mitsuba's BSDF of that name: a metal or a diffuse base, and a coat over either."""
 
-
-def principled_maps(texels: int) -> Maps:
-    """A map of each parameter of Mitsuba's principled BSDF."""
-    return Material("", PRINCIPLED, lambda p: lj.Stack([]), lj.SingleScattering()).maps(texels, "float32")
+CONDUCTOR = {"eta": METAL["metal"], "k": METAL["k"], "alpha": METAL["metal alpha"]}
+"""Of its rough metal."""

@@ -12,13 +12,13 @@ import numpy as np
 from jax import Array
 
 import layerjax as lj
-from benchmarks.measuring import environment
+from benchmarks.measuring import environment, timing
 from benchmarks.measuring.memory import keep_within
 from benchmarks.measuring.timing import interleaved, once
 from benchmarks.measuring.writing import DIRECTORY, Bar, environment_lines, figure, table, write
 from benchmarks.peers import functions as peers
 from benchmarks.peers.mitsuba_textures import Textured
-from benchmarks.studies.textured.materials import MATERIALS, Maps, Material, principled_maps
+from benchmarks.studies.textured.materials import CONDUCTOR, MATERIALS, PRINCIPLED, Material, maps_of
 from benchmarks.suite.scenes import pairs
 
 NAME = "textured"
@@ -26,7 +26,7 @@ BRIGHTER = 1.1
 """The loss is the mean squared difference from the values times this."""
 PROBED = 64
 """Texels by which the time of a map is estimated."""
-GRADIENT, COMPILE, COMPILE_GRADIENT, PRINCIPLED = Bar(5.0, 3.0), Bar(3.0, 1.5), Bar(8.0, 4.0), Bar(5.0, 2.0)
+GRADIENT, COMPILE, COMPILE_GRADIENT, TO_PRINCIPLED = Bar(5.0, 3.0), Bar(3.0, 1.5), Bar(8.0, 4.0), Bar(5.0, 2.0)
 """In times of a value; in seconds; in times of Mitsuba's principled BSDF."""
 
 TEXT = """\
@@ -114,7 +114,7 @@ def study(
         gradient=GRADIENT.words(),
         compile=COMPILE.words(),
         compile_gradient=COMPILE_GRADIENT.words(),
-        principled=PRINCIPLED.words(),
+        principled=TO_PRINCIPLED.words(),
         verdicts=_verdicts(materials, rows),
     )
     content = {"environment": surroundings, "peers": missing or "ran", "rows": [asdict(row) for row in rows]}
@@ -165,8 +165,8 @@ class _Problem:
 
     def compiled_value(self) -> tuple[Callable[[], Any], float, float]:
         """A value, the seconds that it took to compile, and the bytes that it holds beside inputs and results."""
-        program, seconds = _compiled(self.values, self._arguments)
-        return _waiting(program, self._arguments), seconds, float(program.memory_analysis().temp_size_in_bytes)
+        program, seconds = timing.compiled(self.values, self._arguments)
+        return timing.waiting(program, self._arguments), seconds, float(program.memory_analysis().temp_size_in_bytes)
 
     def compiled_gradient(self) -> tuple[Callable[[], Any], float]:
         """A value with its gradient, and the seconds that it took to compile."""
@@ -176,31 +176,16 @@ class _Problem:
 
         target = BRIGHTER * jax.jit(self.values)(*self._arguments)
         arguments = (*self._arguments, target)
-        program, seconds = _compiled(jax.value_and_grad(loss), arguments)
-        return _waiting(program, arguments), seconds
+        program, seconds = timing.compiled(jax.value_and_grad(loss), arguments)
+        return timing.waiting(program, arguments), seconds
 
     def principled(self) -> Textured:
         """Mitsuba's, of as many texels."""
-        return Textured("principled", principled_maps(self.texels), *self.directions)
+        return Textured("principled", maps_of(PRINCIPLED, self.texels, "float32"), *self.directions)
 
     def conductor(self) -> Textured:
         """Mitsuba's rough metal, of as many texels."""
-        generator = np.random.default_rng(0)
-        maps: Maps = {
-            "eta": generator.uniform(0.2, 1.5, (self.texels, 3)),
-            "k": generator.uniform(2, 5, (self.texels, 3)),
-        }
-        return Textured("roughconductor", maps | {"alpha": generator.uniform(0.05, 0.6, self.texels)}, *self.directions)
-
-
-def _compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, float]:
-    found: list[Any] = []
-    seconds = once(lambda: found.append(jax.jit(function).lower(*arguments).compile()))
-    return found[0], seconds
-
-
-def _waiting(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[[], Any]:
-    return lambda: jax.block_until_ready(program(*arguments))
+        return Textured("roughconductor", maps_of(CONDUCTOR, self.texels, "float32"), *self.directions)
 
 
 HEADER = ("material", "transport", "type", "texels", "us a texel", "gradient", "compile s", "its gradient s",
@@ -242,7 +227,7 @@ def _verdicts(materials: Sequence[Material], rows: Sequence[Row]) -> str:
                 slowest(GRADIENT, "gradient"),
                 slowest(COMPILE, "compile_value"),
                 slowest(COMPILE_GRADIENT, "compile_gradient"),
-                slowest(PRINCIPLED, "principled"),
+                slowest(TO_PRINCIPLED, "principled"),
             )
         )
     return table(("material", "value", "gradient", "compile", "its gradient", "principled"), lines)

@@ -11,7 +11,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
-from benchmarks.measuring import operations
+from benchmarks.measuring import operations, timing
 from benchmarks.measuring.timing import interleaved, once
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.peers import functions as peers
@@ -107,8 +107,8 @@ def measure(scene: Scene, precision: str, size: Size, with_peers: bool) -> list[
     )
     for work, function, arrays in programs:
         arguments: tuple[Any, ...] = (scene.arrays(precision), *map(jnp.asarray, arrays))
-        compiled, compile_seconds = _compiled(function, arguments)
-        ways: dict[str, Callable[[], Any]] = {"layerjax": _waiting(compiled, arguments)}
+        compiled, compile_seconds = timing.compiled(function, arguments)
+        ways: dict[str, Callable[[], Any]] = {"layerjax": timing.waiting(compiled, arguments)}
         result: Any = ways["layerjax"]()
         if work == "value":
             ways["numpy"] = lambda: model(plain, *columns, scene.side)
@@ -170,16 +170,6 @@ def markdown(rows: list[Row]) -> str:
 def as_json(rows: list[Row]) -> list[dict[str, Any]]:
     """The rows as plain data."""
     return [asdict(row) for row in rows]
-
-
-def _compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Callable[..., Any], float]:
-    found: list[Any] = []
-    seconds = once(lambda: found.append(jax.jit(function).lower(*arguments).compile()))
-    return found[0], seconds
-
-
-def _waiting(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[[], Any]:
-    return lambda: jax.block_until_ready(function(*arguments))
 
 
 def _row(

@@ -27,6 +27,8 @@ from jax import Array
 
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector
+from layerjax.microsurface.energy_tables import index_variable
+from layerjax.microsurface.splines import taps
 from layerjax.quadrature import gauss_legendre, panels
 from layerjax.tables import load
 from layerjax.transport.statistical.variance import bounded_refracted_cosine, roughness, transmission_scale, variance
@@ -35,9 +37,6 @@ Table = Mapping[str, np.ndarray]
 
 GRAIN = 0.04
 """Distance from the critical cosine, and alpha, below which the grid is uniform in them; above, in the logarithm."""
-
-LARGEST_INDEX = 4.0
-"""Of the coat over that outside, or the other way round."""
 
 NODES = 24
 """Cosines of a mean over diffuse light, in each of its two panels."""
@@ -241,13 +240,6 @@ def cosine_variable(cosine: Array, ior: Array) -> Array:
     return (jnp.arcsinh((cosine - critical) / GRAIN) + low) / (low + high)
 
 
-def index_variable(ior: Array) -> Array:
-    """Where an index lies on the axis of its side of 1, in [0, 1]: dense near 1, where it matters to grazing light."""
-    squared = (jnp.log(ior) / math.log(LARGEST_INDEX)) ** 2
-    some = squared > 0
-    return jnp.where(some, jnp.exp(jnp.log(jnp.where(some, squared, 1.0)) / 6.0), 0.0)
-
-
 def roughness_variable(alpha: Array) -> Array:
     """Where an alpha lies on its axis, in [0, 1]."""
     return jnp.arcsinh(alpha / GRAIN) / math.asinh(1.0 / GRAIN)
@@ -275,13 +267,8 @@ def _transmission_parts(table: Table, cosine: Array, alpha: Array, ior: Array) -
 
 def spline(place: Array, coefficients: int) -> tuple[Array, Array]:
     """First of four coefficients of a uniform cubic spline on [0, 1], all their indices, and their weights."""
-    intervals = coefficients - 3
-    x = at_most(at_least(place, 0.0), 1.0) * intervals
-    first = jnp.clip(jnp.floor(x), 0, intervals - 1)
-    f = x - first
-    g = 1.0 - f
-    weights = [g**3, 4.0 - 3.0 * f * f * (1.0 + g), 4.0 - 3.0 * g * g * (1.0 + f), f**3]
-    return first.astype(jnp.int32)[..., None] + np.arange(4), jnp.stack(weights, axis=-1) / 6.0
+    first, weights, _ = taps(place, coefficients)
+    return first[..., None] + np.arange(4), jnp.stack(weights, axis=-1)
 
 
 def _pick(values: np.ndarray, dtype: jnp.dtype, *index: Array) -> Array:

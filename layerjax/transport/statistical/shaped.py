@@ -91,12 +91,9 @@ def shaped(stack: Stack, options: Options, cosine: Array, upward: bool) -> Shape
     found = statistics(stack, cosine, options, upward)
     reflected, facet = _returning(found, cosine)
     transmitted, escaping = _passing(stack, found, cosine, upward)
-    unscaled = _lobe_energies([*reflected, *transmitted])
-    if facet is not None:
-        unscaled = [
-            _unscaled(*facet, cosine) if lobe.alpha is None else energy
-            for lobe, energy in zip([*reflected, *transmitted], unscaled, strict=True)
-        ]
+    unscaled = _together(mirror_energy, [*reflected, *transmitted])
+    if facet is not None:  # its lobe is the first
+        unscaled[0] = _of_facet(*facet, cosine)
     count = len(reflected)
     beyond = [channels.times(energy, share) for energy, share in zip(unscaled[count:], escaping, strict=True)]
     return Shaped(tuple(map(_scaled, reflected, unscaled[:count])), tuple(map(_scaled, transmitted, beyond)), facet)
@@ -169,17 +166,11 @@ def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tu
     return lobes, _together(lambda cosine, width: retained_share(cosine, width, leaves / reference), lobes)
 
 
-def _lobe_energies(lobes: Sequence[_Lobe]) -> list[Channels]:
-    """Energies of the lobes of a surface that reflects all; 1 for facets themselves."""
-    found = iter(_together(mirror_energy, [lobe for lobe in lobes if lobe.alpha is not None]))
-    return [(jnp.ones(()),) if lobe.alpha is None else next(found) for lobe in lobes]
-
-
 def _together(energy: Callable[[Array, Array], Array], lobes: Sequence[_Lobe]) -> list[Channels]:
-    """energy(cosine, alpha) of every lobe and channel, at one look."""
+    """energy(cosine, alpha) of every lobe and channel, at one look; nothing for a lobe that is the facet itself."""
     widths = [(lobe.cosine, width) for lobe in lobes for width in lobe.alpha or ()]
     if not widths:
-        return []
+        return [() for _ in lobes]
     cosines, alphas = (jnp.stack(jnp.broadcast_arrays(*part)) for part in zip(*widths, strict=True))
     values = iter(energy(cosines, alphas))
     return [tuple(next(values) for _ in lobe.alpha or ()) for lobe in lobes]
@@ -189,7 +180,7 @@ def _widened(variance: Channels, spread: Channels | None, order: int) -> Channel
     return variance if spread is None or order == 0 else each(lambda v, s: v + order * s, variance, spread)
 
 
-def _unscaled(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
+def _of_facet(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
     """Energy that the facets of the first interface or base reflect at their first collision."""
     if isinstance(what, Conductor):
         return metal_levels(what, cosine, relative, "single", smooth)

@@ -33,10 +33,10 @@ def near(found, wanted, root_mean_square: float, largest: float) -> None:
 
 def test_mirrors_and_metals() -> None:
     cosine, alpha = rough()
-    near(tables.mirror_energy(cosine, alpha), by_quadrature.lobe_energy(cosine, alpha, points=24), 2e-4, 1e-3)
+    near(tables.mirror_energy(cosine, alpha), by_quadrature.lobe_energy(cosine, alpha, points=24), 1e-4, 6e-4)
     rng = np.random.default_rng(2)
     ior, k = 0.02 * 500.0 ** rng.uniform(size=COUNT), 0.3 + 20.0 * rng.uniform(size=COUNT) ** 1.5
-    for microfacets, errors in (("single", (1e-3, 1e-2)), ("multiple", (2.5e-3, 4e-2))):
+    for microfacets, errors in (("single", (1e-3, 7e-3)), ("multiple", (2e-3, 3e-2))):
         (found,) = tables.conductor_energies(cosine, alpha, (jnp.asarray(ior),), (jnp.asarray(k),), microfacets)
         near(found, by_quadrature.conductor_energy(cosine, alpha, ior, k, microfacets, points=24), *errors)
 
@@ -47,13 +47,13 @@ def test_interfaces(below: bool) -> None:
     found = tables.interface_energies(cosine, alpha, ior, "single")
     wanted = by_quadrature.interface_energies(cosine, alpha, ior, "single", points=16)
     for mine, other in zip(found, wanted, strict=True):
-        near(mine, other, 2.5e-3, 4e-2)
-    near(tables.single_reflectance(cosine, alpha, ior), wanted[0], 2.5e-3, 4e-2)
+        near(mine, other, 2e-3, 3e-2)
+    near(tables.single_reflectance(cosine, alpha, ior), wanted[0], 2e-3, 3e-2)
     reflected, passed = tables.interface_energies(cosine, alpha, ior, "multiple")
     np.testing.assert_allclose(reflected + passed, 1.0, rtol=1e-12)
     wide = alpha > 0.01  # what walks have told of
     wanted = by_quadrature.interface_energies(cosine, alpha, ior, "multiple", points=16)[0]
-    near(reflected[wide], wanted[wide], 4e-3, 4e-2)
+    near(reflected[wide], wanted[wide], 2e-3, 3e-2)
 
 
 def test_retained_light() -> None:
@@ -64,7 +64,10 @@ def test_retained_light() -> None:
     layer = np.clip(critical + 2.0 * alpha * rng.normal(size=COUNT), 1e-3, 1.0)
     cosine = np.where(rng.uniform(size=COUNT) < 0.5, cosine, layer)
     near(
-        tables.retained_share(cosine, alpha, ratio), by_quadrature.retained(cosine, alpha, ratio, points=24), 2e-3, 2e-2
+        tables.retained_share(cosine, alpha, ratio),
+        by_quadrature.retained(cosine, alpha, ratio, points=24),
+        1.5e-3,
+        1.2e-2,
     )
     np.testing.assert_array_equal(tables.retained_share(jnp.asarray(0.5), jnp.asarray(0.2), jnp.array([1.0, 2.0])), 1.0)
 
