@@ -1,3 +1,3 @@
 """Makers of the tables that `layerjax.tables` ships: ``python -m layerjax.precompute NAME``. Nothing imports them."""
 
-NAMES = ("microsurface", "energies", "diffuse_interface", "spongecake", "vmf_diffuse")
+NAMES = ("microsurface", "energies", "diffuse_interface", "streams", "spongecake", "vmf_diffuse")

@@ -64,12 +64,12 @@ def make(coarse: bool = False, report: Report = print) -> dict[str, np.ndarray]:
 def dielectric(side: str, dense: float) -> dict[str, Values]:
     """Coefficients of the energies of interfaces on one side of an index of 1."""
     shape = SHAPES[side]
-    cosine, alpha, ior = _grid(side, dense)
-    reflected, passed = _batched(
+    cosine, alpha, ior = dielectric_grid(side, shape, dense)
+    reflected, passed = batched(
         lambda c, a, n: by_quadrature.interface_energies(c, a, n, "single", points=POINTS), cosine, alpha, ior
     )
-    mirror = _batched(lambda c, a, n: (by_quadrature.lobe_energy(c, a, points=POINTS),), cosine, alpha, ior)[0]
-    multiple = _batched(_all_facets, cosine, alpha, ior)[0]
+    mirror = batched(lambda c, a, n: (by_quadrature.lobe_energy(c, a, points=POINTS),), cosine, alpha, ior)[0]
+    multiple = batched(all_facets, cosine, alpha, ior)[0]
     return {
         "multiple": fitted(np.sqrt(multiple + FADED), shape),
         "single": fitted(np.sqrt(reflected / mirror + FADED), shape),
@@ -77,9 +77,9 @@ def dielectric(side: str, dense: float) -> dict[str, Values]:
     }
 
 
-def _grid(side: str, dense: float) -> tuple[Values, Values, Values]:
-    """Cosine, alpha and index at points of a table's axes, (x, y, z) each."""
-    x, y, z = (np.linspace(0.0, 1.0, int(dense * count)) for count in SHAPES[side])
+def dielectric_grid(side: str, shape: Sequence[int], dense: float) -> tuple[Values, Values, Values]:
+    """Cosine, alpha and index at points of the axes of a table of so many coefficients, (x, y, z) each."""
+    x, y, z = (np.linspace(0.0, 1.0, int(dense * count)) for count in shape)
     warp, sign = (DENSER, 1.0) if side == "denser" else (THINNER, -1.0)
     alpha = np.maximum(rough_of(y, warp.grain), LEAST_ALPHA)[None, :, None]
     ior = np.exp(sign * np.log(tables.LARGEST_INDEX) * z**3)[None, None, :]
@@ -91,7 +91,7 @@ def _grid(side: str, dense: float) -> tuple[Values, Values, Values]:
     return cosine, alpha, ior
 
 
-def _all_facets(cosine: Array, alpha: Array, ior: Array) -> tuple[Array]:
+def all_facets(cosine: Array, alpha: Array, ior: Array) -> tuple[Array]:
     """Reflectance of interfaces, all facets together: the first by quadrature, of the rest what walks give back."""
     first, reflected_on, refracted_on = by_quadrature.first_event(cosine, alpha, ior, points=POINTS)
     wide = jnp.maximum(alpha, NARROWEST_WALKED)
@@ -110,7 +110,7 @@ def metals(dense: float) -> dict[str, Values]:
     def columns(values: Values) -> Values:
         return np.concatenate([fitted(values[..., k], SHAPES["mirror"]).ravel() for k in range(values.shape[-1])])
 
-    return {name: columns(_batched(way, cosine, alpha)[0]) for name, way in (("mirror", _single), ("first", _all))}
+    return {name: columns(batched(way, cosine, alpha)[0]) for name, way in (("mirror", _single), ("first", _all))}
 
 
 def _single(cosine: Array, alpha: Array) -> tuple[Array]:
@@ -175,7 +175,7 @@ def retained(dense: float) -> Values:
 
     def odds(cosine: Values) -> Values:
         arguments = np.broadcast_arrays(np.clip(cosine, LEAST_COSINE, 1.0), alpha, ratio)
-        share = _batched(lambda c, a, r: (by_quadrature.retained(c, a, r, points=POINTS),), *arguments)[0]
+        share = batched(lambda c, a, r: (by_quadrature.retained(c, a, r, points=POINTS),), *arguments)[0]
         with np.errstate(divide="ignore"):
             return np.clip(np.arctanh(2.0 * share - 1.0), -tables.MOST, tables.MOST)
 
@@ -185,7 +185,7 @@ def retained(dense: float) -> Values:
     return fitted(np.where(beyond > 1.0, further, odds(beyond)), SHAPES["retained"]).ravel()
 
 
-def _batched(function: Callable[..., tuple[Array, ...]], *arguments: Values) -> list[Values]:
+def batched(function: Callable[..., tuple[Array, ...]], *arguments: Values) -> list[Values]:
     """function of arrays of one shape, a few thousand entries at a time."""
     shape = arguments[0].shape
     flat = [argument.ravel() for argument in arguments]

@@ -27,12 +27,30 @@ from layerjax.transport.statistical.diffuse import (
 
 
 class CoatedBase(eqx.Module):
-    """A coat on a Lambertian base. tau: transmittance along the normal by channels; None: it absorbs nothing."""
+    """A coat on a Lambertian base. tau: transmittance along the normal by channels; None: it absorbs nothing.
+    reflectance: of the base.
+    """
 
     alpha: Array
     ior: Array
     tau: Channels | None
-    albedo: Channels
+    reflectance: Channels
+
+    def value(self, wi: Vector, wo: Vector) -> Channels:
+        """BRDF of the light that has reached the base, 0 unless both directions are above."""
+        edge = horizon(wi[2].dtype)
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        there, back = (_arriving(self, sanitised(w, valid)[2]) for w in (wi, wo))
+        returned = tuple(reflection(load("diffuse_interface"), self.alpha, self.ior, t) for t in _taus(self))
+        one = jnp.ones_like(wi[2])
+        level = each(lambda r, rho: closed_form(one, one, r, rho, self.ior), returned, self.reflectance)
+        return select(valid, times(there, back, level))
+
+    def albedo(self, wi: Vector) -> Channels:
+        """Energy of `value` for light along wi, above."""
+        means = [coat_means(self.alpha, self.ior, t) for t in _taus(self)]
+        leaving, returned = tuple(mean.leaving for mean in means), tuple(mean.returned for mean in means)
+        return each(indirect_energy, _arriving(self, wi[2]), leaving, returned, self.reflectance)
 
 
 def is_coated(stack: Stack) -> bool:
@@ -50,24 +68,6 @@ def make_coated(stack: Stack) -> CoatedBase:
     depths = [per_channel(jnp.asarray(layer.thickness)) for layer in stack.layers[1:] if isinstance(layer, Medium)]
     tau = tuple(jnp.exp(-depth) for depth in total(depths)) if depths else None
     return CoatedBase(jnp.asarray(face.alpha), jnp.asarray(face.ior), tau, per_channel(jnp.asarray(base.albedo)))
-
-
-def coated_value(part: CoatedBase, wi: Vector, wo: Vector) -> Channels:
-    """BRDF of the light that has reached the base, 0 unless both directions are above."""
-    edge = horizon(wi[2].dtype)
-    valid = (wi[2] > edge) & (wo[2] > edge)
-    there, back = (_arriving(part, sanitised(w, valid)[2]) for w in (wi, wo))
-    returned = tuple(reflection(load("diffuse_interface"), part.alpha, part.ior, t) for t in _taus(part))
-    one = jnp.ones_like(wi[2])
-    level = each(lambda r, rho: closed_form(one, one, r, rho, part.ior), returned, part.albedo)
-    return select(valid, times(there, back, level))
-
-
-def coated_albedo(part: CoatedBase, wi: Vector) -> Channels:
-    """Energy of `coated_value` for light along wi, above."""
-    means = [coat_means(part.alpha, part.ior, t) for t in _taus(part)]
-    leaving, returned = tuple(mean.leaving for mean in means), tuple(mean.returned for mean in means)
-    return each(indirect_energy, _arriving(part, wi[2]), leaving, returned, part.albedo)
 
 
 def _taus(part: CoatedBase) -> Sequence[Array]:

@@ -64,6 +64,18 @@ class DiffuseBase(eqx.Module):
     level: Array
     energy: Array
 
+    def value(self, wi: Vector, wo: Vector) -> Channels:
+        """BRDF of the light that has reached the base, 0 unless both directions are above."""
+        edge = horizon(wi[2].dtype)
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        there, back = (_arriving(self, sanitised(w, valid)) for w in (wi, wo))
+        return select(valid, times(there, back, per_channel(self.level)))
+
+    def albedo(self, wi: Vector) -> Channels:
+        """Energy of `value` for light along wi, above."""
+        there, factor = _arriving(self, wi), per_channel(self.energy)
+        return tuple(pick(there, c) * pick(factor, c) for c in range(max(len(there), len(factor))))
+
 
 def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> DiffuseBase:
     """The diffuse part of a simplified stack over a diffuse base."""
@@ -146,20 +158,6 @@ def _alike(a: Array, b: Array) -> tuple[Array, Array]:
     """Both with as many channels, their first axis."""
     channels = max(a.shape[0], b.shape[0])
     return jnp.broadcast_to(a, (channels, *a.shape[1:])), jnp.broadcast_to(b, (channels, *b.shape[1:]))
-
-
-def diffuse_value(part: DiffuseBase, wi: Vector, wo: Vector) -> Channels:
-    """BRDF of the light that has reached the base, 0 unless both directions are above."""
-    edge = horizon(wi[2].dtype)
-    valid = (wi[2] > edge) & (wo[2] > edge)
-    there, back = (_arriving(part, sanitised(w, valid)) for w in (wi, wo))
-    return select(valid, times(there, back, per_channel(part.level)))
-
-
-def diffuse_albedo(part: DiffuseBase, wi: Vector) -> Channels:
-    """Energy of `diffuse_value` for light along wi, above."""
-    there, factor = _arriving(part, wi), per_channel(part.energy)
-    return tuple(pick(there, c) * pick(factor, c) for c in range(max(len(there), len(factor))))
 
 
 def _arriving(part: DiffuseBase, w: Vector) -> Channels:

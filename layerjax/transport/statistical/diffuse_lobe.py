@@ -31,6 +31,24 @@ class DiffuseLobe(eqx.Module):
     energy: Array
     alpha: Array
 
+    def value(self, wi: Vector, wo: Vector) -> Channels:
+        """BRDF of the lobe, 0 unless both directions are above."""
+        edge = horizon(wi[2].dtype)
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        energies, seen = self.albedo(sanitised(wi, valid)), sanitised(wo, valid)
+        return tuple(
+            jnp.where(valid, indirect_lobe(seen, alpha, energy), 0.0)
+            for alpha, energy in zip(self.alpha, energies, strict=True)
+        )
+
+    def albedo(self, wi: Vector) -> Channels:
+        """Energy of `value` for light along wi, above."""
+        place = jnp.arctan2(wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])) * (2.0 * (POINTS - 1) / np.pi)
+        first = jnp.clip(jnp.floor(place) - 1.0, 0.0, POINTS - 4.0).astype(jnp.int32)
+        taps = [weight[..., None] * self.energy[first + j] for j, weight in enumerate(cubic(place - first))]
+        rows = sum(taps[1:], taps[0])
+        return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points
+
 
 def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:
     """What keeps a simplified stack with layers of these names from having this lobe; None if nothing does."""
@@ -71,23 +89,3 @@ def make_diffuse_lobe(stack: Stack) -> DiffuseLobe:
 
     energy, alpha = jax.vmap(lobe, out_axes=(1, 0))(jnp.stack([pick(albedos, c) for c in range(channels)]), through)
     return DiffuseLobe(energy, alpha)
-
-
-def lobe_value(part: DiffuseLobe, wi: Vector, wo: Vector) -> Channels:
-    """BRDF of the lobe, 0 unless both directions are above."""
-    edge = horizon(wi[2].dtype)
-    valid = (wi[2] > edge) & (wo[2] > edge)
-    energies, seen = lobe_albedo(part, sanitised(wi, valid)), sanitised(wo, valid)
-    return tuple(
-        jnp.where(valid, indirect_lobe(seen, alpha, energy), 0.0)
-        for alpha, energy in zip(part.alpha, energies, strict=True)
-    )
-
-
-def lobe_albedo(part: DiffuseLobe, wi: Vector) -> Channels:
-    """Energy of `lobe_value` for light along wi, above."""
-    place = jnp.arctan2(wi[2], safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])) * (2.0 * (POINTS - 1) / np.pi)
-    first = jnp.clip(jnp.floor(place) - 1.0, 0.0, POINTS - 4.0).astype(jnp.int32)
-    taps = [weight[..., None] * part.energy[first + j] for j, weight in enumerate(cubic(place - first))]
-    rows = sum(taps[1:], taps[0])
-    return tuple(at_least(rows[..., c], 0.0) for c in range(rows.shape[-1]))  # a cubic may fall below its points

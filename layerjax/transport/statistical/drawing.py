@@ -12,12 +12,13 @@ from layerjax.normals.ggx import ggx_sample
 from layerjax.surfaces import Surface
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.single_scattering import Media, SingleScattering
-from layerjax.transport.statistical.coated_base import CoatedBase, coated_albedo, coated_value
-from layerjax.transport.statistical.diffuse_base import DiffuseBase, diffuse_albedo, diffuse_value
-from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe, lobe_albedo, lobe_value
+from layerjax.transport.statistical.coated_base import CoatedBase
+from layerjax.transport.statistical.diffuse_base import DiffuseBase
+from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe
 from layerjax.transport.statistical.shaped import Shaped, folded, unfolded
+from layerjax.transport.statistical.streamed_base import StreamedBase
 
-DiffusePart = DiffuseBase | CoatedBase | DiffuseLobe | Surface
+DiffusePart = DiffuseBase | CoatedBase | StreamedBase | DiffuseLobe | Surface
 """Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""
 
 
@@ -91,18 +92,14 @@ def diffuse_energy(diffuse: DiffusePart, wi: Vector, nodes: int) -> Channels:
     """Energy of the light that has met a diffuse base, of any form; `nodes`: see `layerjax.albedo`."""
     if isinstance(diffuse, Surface):
         return SingleScattering().albedo(Media((), diffuse), wi, nodes)[0]
-    if isinstance(diffuse, CoatedBase):
-        return coated_albedo(diffuse, wi)
-    return diffuse_albedo(diffuse, wi) if isinstance(diffuse, DiffuseBase) else lobe_albedo(diffuse, wi)
+    return diffuse.albedo(wi)
 
 
 def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
     """BRDF of the light that has met a diffuse base, of any form; 0 unless both directions are above."""
     if isinstance(diffuse, Surface):
         return SingleScattering().evaluate(Media((), diffuse), wi, wo, "reflection")
-    if isinstance(diffuse, CoatedBase):
-        return coated_value(diffuse, wi, wo)
-    return diffuse_value(diffuse, wi, wo) if isinstance(diffuse, DiffuseBase) else lobe_value(diffuse, wi, wo)
+    return diffuse.value(wi, wo)
 
 
 def _probabilities(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:

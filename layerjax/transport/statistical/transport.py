@@ -43,8 +43,9 @@ from layerjax.transport.statistical.shaped import (
     shaped,
     unfolded,
 )
+from layerjax.transport.statistical.streamed_base import is_streamed, make_streamed
 
-Diffuse = Literal["exact", "lobe"]
+Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
 
@@ -78,9 +79,11 @@ class Statistical(DeterministicTransport):
         scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
             collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
             that lobe cannot be told from the light that nothing met, and both are left out.
-        diffuse: light that has met a diffuse base: ``"exact"``, closed form with transmittances from tables (of one
-            coat that absorbs at most, over a `Lambertian`, ``microfacets="multiple"``) or by adding-doubling; or
-            ``"lobe"``, one GGX lobe from tables (2022), for interfaces and absorbing media over a `Lambertian`.
+        diffuse: light that has met a diffuse base: ``"tables"``, a closed form with transmittances from tables and few
+            streams, at every texel (over a `Lambertian`, ``microfacets="multiple"``, where no medium above the first
+            interface scatters; what else there is as if ``"exact"``); ``"exact"``, those of an adding-doubling solve
+            for every stack; or ``"lobe"``, one GGX lobe from tables (2022), for interfaces and absorbing media over a
+            `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
         own_side: whether light from inside meets the reflectance of its own side, or by reciprocity that from outside.
 
@@ -91,7 +94,7 @@ class Statistical(DeterministicTransport):
     symmetric: bool = eqx.field(static=True, default=True)
     microfacets: Microfacets = eqx.field(static=True, default="multiple")
     scattering: Scattering = eqx.field(static=True, default="orders")
-    diffuse: Diffuse = eqx.field(static=True, default="exact")
+    diffuse: Diffuse = eqx.field(static=True, default="tables")
     angles: bool = eqx.field(static=True, default=False)
     own_side: bool = eqx.field(static=True, default=False)
 
@@ -129,7 +132,7 @@ class Statistical(DeterministicTransport):
             elif self._solves(stack):
                 diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
-                diffuse = make_coated(stack)
+                diffuse = make_coated(stack) if is_coated(stack) else make_streamed(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -182,7 +185,7 @@ class Statistical(DeterministicTransport):
         """Whether the diffuse part of a simplified stack needs a solve of its own."""
         if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
             return False
-        return self.diffuse == "lobe" or self.microfacets == "single" or not is_coated(stack)
+        return self.diffuse != "tables" or self.microfacets == "single" or not is_streamed(stack)
 
     def _shaped(self, state: Lit, cosine: Array, upward: bool) -> Shaped:
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side, state.smooth)

@@ -6,8 +6,8 @@ import pytest
 
 import layerjax as lj
 from layerjax.stack import simplify
-from layerjax.transport.statistical.coated_base import coated_albedo, coated_value, is_coated, make_coated
-from layerjax.transport.statistical.diffuse_base import diffuse_albedo, diffuse_value, make_diffuse
+from layerjax.transport.statistical.coated_base import is_coated, make_coated
+from layerjax.transport.statistical.diffuse_base import make_diffuse
 
 COAT, DYE = lj.Interface(1.5, 0.05), lj.Medium([0.3, 2.0], 0.0)
 
@@ -20,10 +20,10 @@ def test_smooth_coats_are_as_solved(layers) -> None:
     angles = np.random.default_rng(0).uniform(0.05, 1.4, (2, 200))
     wi, wo = ((jnp.sin(t), 0.0 * t, jnp.cos(t)) for t in map(jnp.asarray, angles))
     part, solved = make_coated(stack), make_diffuse(stack, stack.base, "multiple")
-    for found, wanted in zip(coated_value(part, wi, wo), diffuse_value(solved, wi, wo), strict=True):
+    for found, wanted in zip(part.value(wi, wo), solved.value(wi, wo), strict=True):
         apart = np.asarray(found - wanted)
         assert np.sqrt(np.sum(apart**2) / np.sum(np.asarray(wanted) ** 2)) < 4e-3
-    for found, wanted in zip(coated_albedo(part, wi), diffuse_albedo(solved, wi), strict=True):
+    for found, wanted in zip(part.albedo(wi), solved.albedo(wi), strict=True):
         np.testing.assert_allclose(found, wanted, atol=4e-3)
 
 

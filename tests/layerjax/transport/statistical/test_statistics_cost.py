@@ -44,15 +44,18 @@ def test_smooth_interfaces(microfacets):
 
 
 def test_bases():
-    """A diffuse base under several interfaces or haze asks for a solver, and nothing else does; bare it is itself."""
-    solved = program([COAT, lj.Interface(1.8, 0.1)], DIFFUSE), program([COAT, HAZE], DIFFUSE)
+    """A diffuse base right under haze asks for a solver, and nothing else does unasked; bare it is itself."""
+    two = [COAT, lj.Interface(1.8, 0.1)]
+    solved = program([HAZE], DIFFUSE), program(two, DIFFUSE, diffuse="exact")
     read = (
         program([COAT], None),
         program([COAT]),
         program([COAT], DIFFUSE),
         program([COAT, lj.Medium(0.7, 0.0)], DIFFUSE),
+        program(two, DIFFUSE),
+        program([COAT, HAZE], DIFFUSE),
     )
-    assert all(found["dot_general"] > 20 for found in solved)
+    assert all(found["dot_general"] > 10 for found in solved)
     assert all(found["dot_general"] < 10 for found in read)
     assert operations([], DIFFUSE) < 12 < operations([], METAL) < operations([COAT])
 

@@ -1,0 +1,194 @@
+"""Layers between diffuse light by few streams, added up from the base: see `layerjax.transport.statistical.streams`.
+
+As in `layerjax.transport.adding_doubling`, of one Fourier mode. A slab that scatters is Z = tanh(h sqrt(Q P)) sqrt(Q
+P)^-1 Q and W, the same with P and Q changed over, h half its thickness: net flux over its sum where the two sides are
+lit alike, and the other way round where they are lit with opposite signs. Both are doubled from a thin slab, Z <- 2 (1
++ Z W)^-1 Z: sums of what is positive, nothing cancels.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax.channels import per_channel
+from layerjax.stack import Medium, is_known
+from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, matmul, times
+
+STEPS = 18
+"""Doublings of a slab: from one thinner than 0.02 to half of the thickest medium of the box, 1e4."""
+
+MOMENTS = 2 * STREAMS
+"""Of a phase function that are kept; the rest of it counts as light that goes straight on (delta-M)."""
+
+
+class Below(NamedTuple):
+    """What lies under a level of a stack, over a base that absorbs. Leading axes: channels or 1.
+
+    onward: share of each stream that falls on it that arrives at the base, (C or 1, STREAMS). reflected: what it sends
+    back, (C or 1, STREAMS, STREAMS), None if nothing. returned: share of diffuse light from the base that comes back to
+    it, (C or 1,). ratio: index at this level over that above the base, squared.
+    """
+
+    onward: Array
+    reflected: Array | None
+    returned: Array
+    ratio: Array
+
+
+def base(dtype: Any) -> Below:
+    """The base itself."""
+    zero, whole = jnp.zeros(1, dtype), jnp.asarray(DIFFUSE, dtype)[None]
+    return Below(whole, None, zero, jnp.ones((), dtype))
+
+
+def under_face(below: Below, what: Face, ior: Array) -> Below:
+    """An interface on top. ior: index below it over that above."""
+    return _under(below, what, below.ratio / (ior * ior))
+
+
+def under_medium(below: Below, medium: Medium) -> Below:
+    """A medium on top."""
+    dtype = below.onward.dtype
+    thickness = jnp.stack(per_channel(jnp.asarray(medium.thickness, dtype)))
+    if _is_clear(medium):
+        passed = jnp.exp(-thickness[:, None] / jnp.asarray(NODES, dtype))
+        reflected = None if below.reflected is None else passed[:, :, None] * below.reflected * passed[:, None, :]
+        return below._replace(onward=below.onward * passed, reflected=reflected)
+    reflected, passed = slab(thickness, *_scattering(medium, dtype))
+    return _under(below, Face(passed, passed, reflected, reflected), below.ratio)
+
+
+def collisions(medium: Medium, dtype: Any) -> Array:
+    """Optical depth of what does not go straight on, by channels."""
+    thickness = jnp.stack(per_channel(jnp.asarray(medium.thickness, dtype)))
+    if _is_clear(medium):
+        return thickness
+    albedo, g = _scattering(medium, dtype)
+    return thickness * (1.0 - albedo * g**MOMENTS)
+
+
+def _scattering(medium: Medium, dtype: Any) -> tuple[Array, Array]:
+    albedo = jnp.stack(per_channel(jnp.asarray(medium.albedo, dtype)))
+    return albedo, jnp.asarray(medium.phase.forward_lobe, dtype)
+
+
+def _under(below: Below, what: Face, ratio: Array) -> Below:
+    met = meeting(below, what.bottom)
+    reflected = what.top
+    if below.reflected is not None:
+        reflected = reflected + matmul(what.up, matmul(below.reflected, matmul(met.turns, what.down)))
+    return Below(times(jnp.swapaxes(what.down, -1, -2), met.onward), reflected, met.returned, ratio)
+
+
+class Meeting(NamedTuple):
+    """What lies under a level, and what is above it and turns light back.
+
+    onward: share of each stream down there that arrives at the base, at once or later; again: of each stream up there.
+    returned: of diffuse light from the base what comes back. turns: of light down there to all that ever goes down.
+    """
+
+    onward: Array
+    again: Array
+    returned: Array
+    turns: Array
+
+
+def meeting(below: Below, bottom: Array) -> Meeting:
+    """bottom: what is above sends back of light from below, (C or 1, STREAMS, STREAMS)."""
+    turns = jnp.asarray(np.eye(STREAMS), bottom.dtype)
+    onward = below.onward
+    if below.reflected is not None:
+        turns = inverse(turns - matmul(bottom, below.reflected))
+        onward = times(jnp.swapaxes(turns, -1, -2), onward)
+    again = times(jnp.swapaxes(bottom, -1, -2), onward)
+    emitted = below.onward * below.ratio  # of diffuse light from the base, by reciprocity
+    return Meeting(onward, again, below.returned + jnp.sum(again * emitted, axis=-1), turns)
+
+
+class Roof(NamedTuple):
+    """An interface, and media under it. bottom: what they send back of light from below; inside: of light just behind
+    the interface what falls on what lies under the media. (C or 1, STREAMS, STREAMS) each.
+    """
+
+    bottom: Array
+    inside: Array
+
+
+def roof(what: Face) -> Roof:
+    """The interface alone."""
+    return Roof(what.bottom[None], jnp.asarray(np.eye(STREAMS), what.bottom.dtype)[None])
+
+
+def over_medium(above: Roof, medium: Medium) -> Roof:
+    """A medium more under it."""
+    dtype = above.bottom.dtype
+    thickness = jnp.stack(per_channel(jnp.asarray(medium.thickness, dtype)))
+    if _is_clear(medium):
+        passed = jnp.exp(-thickness[:, None] / jnp.asarray(NODES, dtype))
+        return Roof(passed[:, :, None] * above.bottom * passed[:, None, :], passed[:, :, None] * above.inside)
+    reflected, passed = slab(thickness, *_scattering(medium, dtype))
+    turns = inverse(jnp.asarray(np.eye(STREAMS), dtype) - matmul(above.bottom, reflected))
+    falling = matmul(passed, turns)
+    return Roof(reflected + matmul(falling, matmul(above.bottom, passed)), matmul(falling, above.inside))
+
+
+def slab(thickness: Array, albedo: Array, g: Array) -> tuple[Array, Array]:
+    """Reflection and transmission of a medium with a Henyey-Greenstein phase function, by channels."""
+    straight = g**MOMENTS
+    through = 1.0 - albedo * straight
+    thickness, albedo = thickness * through, albedo * (1.0 - straight) / through
+    thickness, albedo = jnp.broadcast_arrays(thickness, albedo)
+    kept = [(g**order - straight) / (1.0 - straight) for order in range(MOMENTS)]
+    removed = jnp.asarray(np.diag(1.0 / NODES), thickness.dtype)
+
+    def rate(parity: int) -> Array:
+        scattered = sum(kept[order] * jnp.asarray(_HARMONICS[order], g.dtype) for order in range(parity, MOMENTS, 2))
+        return removed - albedo[:, None, None] * scattered
+
+    def doubled(pair: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        net, sums = pair
+        turns = 2.0 * inverse(one + matmul(net, sums))
+        return (matmul(turns, net), matmul(jnp.swapaxes(turns, -1, -2), sums)), None
+
+    one = jnp.asarray(np.eye(STREAMS), thickness.dtype)
+    thin = (thickness * 0.5 ** (STEPS + 1))[:, None, None]
+    (net, sums), _ = jax.lax.scan(doubled, (thin * rate(0), thin * rate(1)), None, length=STEPS)
+    alike, opposed = inverse(one + net), inverse(one + sums)
+    return alike - opposed, alike + opposed - one
+
+
+_HARMONICS = [
+    (2 * order + 1) * np.outer(*[np.sqrt(WEIGHTS / NODES) * np.polynomial.Legendre.basis(order)(NODES)] * 2)
+    for order in range(MOMENTS)
+]
+"""Of a phase function's moments what they scatter from stream to stream."""
+
+
+@jax.custom_jvp
+def inverse(matrix: Array) -> Array:
+    """Inverse of (..., STREAMS, STREAMS) matrices that need no pivoting, by Gauss-Jordan elimination."""
+    rows = jnp.arange(STREAMS)
+
+    def eliminate(k: Array, matrix: Array) -> Array:
+        here = rows == k
+        row = jnp.sum(jnp.where(here[:, None], matrix, 0.0), axis=-2)
+        column = jnp.sum(jnp.where(here, matrix, 0.0), axis=-1)
+        pivot = 1.0 / jnp.sum(jnp.where(here, row, 0.0), axis=-1, keepdims=True)
+        row = jnp.where(here, pivot, pivot * row)
+        rest = jnp.where(here, 0.0, matrix) - column[..., :, None] * row[..., None, :]
+        return jnp.where(here[:, None], row[..., None, :], rest)
+
+    return jax.lax.fori_loop(0, STREAMS, eliminate, matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    result = inverse(*primals)
+    return result, -matmul(result, matmul(tangents[0], result))
+
+
+def _is_clear(medium: Medium) -> bool:
+    return is_known(medium.albedo, 0.0)

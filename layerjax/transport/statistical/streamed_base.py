@@ -1,0 +1,188 @@
+"""Light that has reached a Lambertian base under several interfaces or haze: the closed form, at every texel.
+
+The same closed form as `layerjax.transport.statistical.diffuse_base`, f = T(i) T(o) rho / (pi n^2 (1 - rho R)), which
+has T and R from an exact solve; here they are those of few streams (`layerjax.transport.statistical.streams`).
+
+Behind a narrow interface light is a beam, and polynomials of the cosine ring where an interface begins to reflect
+totally. So the light that enters is followed along two cosines that have its moments, to the second interface and
+between the two, as far as it stays a beam; what is scattered on the way, or turned back wide, is in the streams.
+
+Two interfaces (indices 1.2 to 2 at random, alpha .01 to .6) beside the solve, T over its mean: rms 1e-3 to 6e-3,
+largest 2e-2; with an optical depth of 1 between them 5e-3 to 1.5e-2, largest 7e-2. BSDFs of light from the base,
+relative L2: below 1e-2, and below 5e-2 where the index falls by a third (from 1.9 to 1.3).
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._numerics import at_least, horizon
+from layerjax.channels import Channels, each, per_channel, select, times, total
+from layerjax.directions import Vector, sanitised
+from layerjax.stack import Interface, Medium, Stack, is_known
+from layerjax.surfaces import Lambertian
+from layerjax.transport.statistical import stream_layers, streams
+from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
+from layerjax.transport.statistical.lobes import precision
+
+BEAM, TURNED = 0.01, 0.001
+"""Variances of the cosine of light at which it is half a beam: to the second interface, and once that has reflected it.
+"""
+
+NARROW = 0.1
+"""Width of the second interface at which, in clear media, half is left to the streams, which do not ring where it is
+wide; where media absorb they have less of what errs one way on the way there and the other way on the way back."""
+
+
+class Second(NamedTuple):
+    """The second interface: its width, the index behind it over that before it, and of the light behind it what arrives
+    at the base, by polynomials and channels; None if it lies on the base.
+    """
+
+    alpha: Array
+    ior: Array
+    onward: Channels | None
+
+
+class StreamedBase(eqx.Module):
+    """What becomes of light behind the first interface, and above it. (STREAMS,) by polynomials, and by channels.
+
+    above: depth of what absorbs above that interface; None if nothing does. alpha, ior: of the interface. depth: of the
+    media behind it, of what goes not straight on; None if there are none. onward: share of the light behind these that
+    arrives at the base. again: of light that goes up there, passes them, and comes back from the interface. scattered:
+    what of light just behind the interface arrives, and of light that goes up there, if it is scattered in the media;
+    None if it is not. level: rho / (pi n^2 (1 - rho R)). energy: albedo over T(i).
+    """
+
+    above: Channels | None
+    alpha: Array
+    ior: Array
+    depth: Channels | None
+    onward: Channels
+    again: Channels
+    scattered: tuple[Channels, Channels] | None
+    second: Second | None
+    level: Channels
+    energy: Channels
+
+    def value(self, wi: Vector, wo: Vector) -> Channels:
+        """BRDF of the light that has reached the base, 0 unless both directions are above."""
+        edge = horizon(wi[2].dtype)
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        there, back = (_arriving(self, sanitised(w, valid)[2]) for w in (wi, wo))
+        return select(valid, times(there, back, self.level))
+
+    def albedo(self, wi: Vector) -> Channels:
+        """Energy of `value` for light along wi, above."""
+        return times(_arriving(self, wi[2]), self.energy)
+
+
+def is_streamed(stack: Stack) -> bool:
+    """Whether the first layer of a simplified stack that is not just absorbing is an interface, over a Lambertian."""
+    if not isinstance(stack.base, Lambertian):
+        return False
+    return isinstance(next((layer for layer in stack.layers if not _absorbs(layer)), None), Interface)
+
+
+def make_streamed(stack: Stack) -> StreamedBase:
+    """The diffuse part of a stack for which `is_streamed`."""
+    assert isinstance(stack.base, Lambertian)
+    dtype = precision(stack)
+    places = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
+    interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
+    alphas = [jnp.asarray(layer.alpha, dtype) for layer in interfaces]
+    ratios = [behind / before for before, behind in pairwise(indices)]
+    together = streams.face(jnp.stack(alphas), jnp.stack(ratios))  # at one look
+    faces = [streams.Face(*(part[k] for part in together)) for k in range(len(alphas))]
+    below, second = stream_layers.base(dtype), None
+    first, end = places[0], places[1] if len(places) > 1 else len(stack.layers)
+    for place in reversed(range(end, len(stack.layers))):
+        layer = stack.layers[place]
+        if isinstance(layer, Interface):
+            k = places.index(place)
+            onward = per_channel(streams.by_polynomials(below.onward)) if place + 1 < len(stack.layers) else None
+            second = Second(alphas[k], ratios[k], onward)
+            below = stream_layers.under_face(below, faces[k], ratios[k])
+        else:
+            below = stream_layers.under_medium(below, layer)
+    media = [layer for layer in stack.layers[first + 1 : end] if isinstance(layer, Medium)]
+    roof = stream_layers.roof(faces[0])
+    for medium in media:
+        roof = stream_layers.over_medium(roof, medium)
+    met = stream_layers.meeting(below, roof.bottom)
+    depth = _depth(media, dtype)
+    behind = streams.times(jnp.swapaxes(roof.inside, -1, -2), met.onward)
+    again, scattered = met.again, None
+    if not all(map(_absorbs, media)):
+        assert depth is not None
+        straight = jnp.exp(-jnp.stack(depth)[:, None] / jnp.asarray(streams.NODES, dtype))
+        once = met.onward * straight
+        again = straight * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
+        down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
+        scattered = per_channel(down), per_channel(up)
+    above = _depth([layer for layer in stack.layers[:first] if isinstance(layer, Medium)], dtype)
+    out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind) * jnp.asarray(streams.DIFFUSE, dtype)
+    if above is not None:
+        out = out * jnp.exp(-jnp.stack(above)[:, None] / jnp.asarray(streams.NODES, dtype))
+    leaving = per_channel(jnp.sum(out, axis=-1) / indices[-1] ** 2)  # by reciprocity
+    albedo, returned, one = per_channel(jnp.asarray(stack.base.albedo)), per_channel(met.returned), jnp.ones((), dtype)
+    return StreamedBase(
+        above=above,
+        alpha=alphas[0],
+        ior=indices[1],
+        depth=depth,
+        onward=per_channel(streams.by_polynomials(met.onward)),
+        again=per_channel(streams.by_polynomials(again)),
+        scattered=scattered,
+        second=second,
+        level=each(lambda r, rho: closed_form(one, one, r, rho, indices[-1]), returned, albedo),
+        energy=each(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
+    )
+
+
+def _depth(media: list[Medium], dtype: np.dtype) -> Channels | None:
+    """Of what goes not straight through media."""
+    return total([per_channel(stream_layers.collisions(medium, dtype)) for medium in media]) if media else None
+
+
+def _arriving(part: StreamedBase, cosine: Array) -> Channels:
+    passed, shares = streams.entering(cosine, part.alpha, part.ior)
+    there = _along_two(part, 1.0 - passed, *streams.two_cosines(shares))
+    if part.scattered is not None:
+        there = each(lambda t, row: t + streams.along(shares, row), there, part.scattered[0])
+    there = tuple(passed * at_least(t, 0.0) for t in there)
+    return there if part.above is None else each(lambda t, d: t * jnp.exp(-d / cosine), there, part.above)
+
+
+def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: Array, spread: Array) -> Channels:
+    """Share of light behind the first interface, along cosines (2, ...), that goes straight on and arrives.
+
+    reflectance: of that interface, from outside and, of a beam, from inside.
+    """
+    values = streams.polynomials(cosines)
+    found: Channels = tuple(streams.along(values, row) for row in part.onward)
+    through = (jnp.ones_like(spread),) if part.depth is None else tuple(jnp.exp(-d / cosines) for d in part.depth)
+    if part.second is not None:
+        passed, shares = streams.entering(cosines, part.second.alpha, part.second.ior)
+        once: Channels = (passed,)
+        if part.second.onward is not None:
+            once = tuple(passed * streams.along(shares, row) for row in part.second.onward)
+        narrow = 1.0 / (1.0 + (spread / TURNED) ** 2)
+        back: Channels = tuple((1.0 - narrow) * streams.along(values, row) for row in part.again)
+        if part.scattered is not None:
+            back = each(lambda b, row: b + streams.along(values, row), back, part.scattered[1])
+        turns = tuple(1.0 - narrow * reflectance * (1.0 - passed) * t * t for t in through)
+        beam = each(lambda o, b, turns: (o + (1.0 - passed) * b) / turns, once, back, turns)
+        wide = part.second.alpha**4 / (part.second.alpha**4 + NARROW**4)
+        share = tuple((1.0 - wide * t * t) / (1.0 + (spread / BEAM) ** 2) for t in through)
+        found = each(lambda f, b, s: f + s * (b - f), found, beam, share)
+    return tuple(jnp.sum(weights * f, axis=0) for f in times(found, through))
+
+
+def _absorbs(layer: Interface | Medium) -> bool:
+    return isinstance(layer, Medium) and is_known(layer.albedo, 0.0)

@@ -1,0 +1,149 @@
+"""Diffuse light between layers by few streams, beside the solver with many and what is known in closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax.stack import Stack, simplify
+from layerjax.transport.statistical import stream_layers, streams
+from layerjax.transport.statistical.diffuse_base import make_diffuse
+from layerjax.transport.statistical.streamed_base import is_streamed, make_streamed
+
+COAT, INNER, DYE = lj.Interface(1.5, 0.1), lj.Interface(1.9, 0.3), lj.Medium([0.3, 1.0], 0.0)
+HAZE = lj.Medium([0.5, 2.0], 0.9, lj.HenyeyGreenstein(0.7))
+BASE = lj.Lambertian([0.3, 0.9])
+ERROR, FALLING = 1e-2, 5e-2
+"""Of light from the base, as `streamed_base` states them: elsewhere, and where the index falls from layer to layer."""
+STRUCTURES = {
+    "two interfaces": [COAT, INNER],
+    "dye between": [COAT, DYE, INNER],
+    "down in index": [INNER, DYE, lj.Interface(1.3, 0.05)],
+    "haze": [COAT, HAZE],
+    "haze over an interface": [COAT, HAZE, INNER],
+    "dye on top": [DYE, COAT, HAZE],
+    "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_light_from_the_base_is_as_solved(name: str) -> None:
+    stack = simplify(lj.Stack(STRUCTURES[name], BASE))
+    assert is_streamed(stack)
+    angles = np.random.default_rng(0).uniform(0.05, 1.4, (2, 200))
+    wi, wo = ((jnp.sin(t), 0.0 * t, jnp.cos(t)) for t in map(jnp.asarray, angles))
+    part, solved = make_streamed(stack), make_diffuse(stack, stack.base, "multiple")
+    error = FALLING if name == "down in index" else ERROR
+    for found, wanted in zip(part.value(wi, wo), solved.value(wi, wo), strict=True):
+        apart = np.asarray(found - wanted)
+        assert np.sqrt(np.sum(apart**2) / np.sum(np.asarray(wanted) ** 2)) < error
+    for found, wanted in zip(part.albedo(wi), solved.albedo(wi), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=error)
+
+
+def test_a_map_is_its_stacks() -> None:
+    """Over a diffuse base texels go together, and each is as its stack by itself; the exact solve stays an option."""
+    depths = np.asarray([[0.1, 0.4], [1.0, 2.0]])[..., None]  # one number for all channels
+    alphas = np.asarray([[0.1, 0.2], [0.3, 0.02]])
+
+    def stack(alpha, depth):
+        return lj.Stack([lj.Interface(1.5, alpha), lj.Medium(depth, 0.8, lj.HenyeyGreenstein(0.5)), INNER], BASE)
+
+    wi, wo = lj.direction(0.5, 0.0), lj.direction(0.9, 2.0)
+    together = lj.evaluate(stack(alphas, depths), wi, wo, lj.Statistical())
+    for place in np.ndindex(2, 2):
+        alone = lj.evaluate(stack(alphas[place], depths[place]), wi, wo, lj.Statistical())
+        np.testing.assert_allclose(together[place], alone, rtol=1e-9)
+    exact = lj.evaluate(stack(0.1, 0.1), wi, wo, lj.Statistical(diffuse="exact"))
+    np.testing.assert_allclose(together[0, 0], exact, rtol=ERROR)
+
+
+@pytest.mark.parametrize("layers", [[COAT, INNER], [COAT, lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8)), INNER]])
+def test_nothing_is_lost(layers) -> None:
+    """What diffuse light from the base does not return to it leaves: energy over a base that absorbs nothing is 1."""
+    stack = simplify(lj.Stack(layers, lj.Lambertian(1.0)))
+    (energy,) = make_streamed(stack).energy
+    np.testing.assert_allclose(energy, 1.0, atol=2e-6)
+
+
+@pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])
+@pytest.mark.parametrize("thickness", [1e-3, 1.0, 30.0])
+def test_slabs_are_as_the_solver_has_them(g: float, thickness: float) -> None:
+    """Diffuse reflectance and transmittance of a medium, beside 24 nodes and modes enough."""
+    reflected, passed = stream_layers.slab(jnp.asarray([thickness]), jnp.asarray([0.95]), jnp.asarray(g))
+    x, w = (np.asarray(part) for part in np.polynomial.legendre.leggauss(24))
+    cosine, weight = 0.5 * (x + 1.0), 0.5 * w * (x + 1.0)
+    directions = np.stack([np.sqrt(1.0 - cosine**2), 0.0 * cosine, cosine], axis=-1)
+    slab = lj.Stack([lj.Medium(thickness, 0.95, lj.HenyeyGreenstein(g))])
+    near, far = lj.albedo(slab, directions, lj.AddingDoubling(nodes=24, modes=4))
+    far = far + np.exp(-thickness / cosine)[:, None]
+    for matrix, energy in ((reflected, near), (passed, far)):
+        assert (
+            abs(float(streams.DIFFUSE @ matrix[0] @ streams.DIFFUSE) - float(weight @ np.asarray(energy)[:, 0])) < 2e-3
+        )
+
+
+def test_slabs_at_ends() -> None:
+    """No thickness, all absorbed, and lossless to the thickest of the box, either precision."""
+    for dtype, error in ((jnp.float64, 1e-12), (jnp.float32, 1e-5)):
+        thickness = jnp.asarray([0.0, 1.0, 1.0, 1e4], dtype)
+        albedo = jnp.asarray([0.7, 0.0, 1.0, 1.0], dtype)
+        for g in (-0.999, 0.0, 0.999):
+            reflected, passed = stream_layers.slab(thickness, albedo, jnp.asarray(g, dtype))
+            np.testing.assert_allclose(passed[0], np.eye(streams.STREAMS), atol=error)
+            np.testing.assert_allclose(reflected[:2], 0.0, atol=error)
+            np.testing.assert_allclose(passed[1], np.diag(np.exp(-1.0 / streams.NODES)), atol=2e-5)
+            whole = streams.DIFFUSE @ np.asarray(reflected + passed)[2:]
+            np.testing.assert_allclose(whole, [streams.DIFFUSE] * 2, atol=10 * error)
+
+
+def test_derivatives_of_slabs_at_ends() -> None:
+    def energy(thickness, albedo, g):
+        reflected, passed = stream_layers.slab(thickness[None], albedo[None], g)
+        return jnp.stack([streams.DIFFUSE @ part[0] @ streams.DIFFUSE for part in (reflected, passed)])
+
+    for place in ((0.0, 0.5, 0.3), (1.0, 0.0, 0.0), (1e4, 1.0, 0.999), (2.0, 1.0, -0.999)):
+        place = tuple(map(jnp.asarray, place))
+        for mode in (jax.jacfwd, jax.jacrev):
+            assert np.all(np.isfinite(np.stack(mode(energy, argnums=(0, 1, 2))(*place))))
+    step, at = 1e-5, [jnp.asarray(x) for x in (0.8, 0.6, 0.4)]
+    slopes = jax.jacfwd(energy, argnums=(0, 1, 2))(*at)
+    for k, slope in enumerate(slopes):
+        ahead, behind = ([x + s * step * (j == k) for j, x in enumerate(at)] for s in (1.0, -1.0))
+        np.testing.assert_allclose(slope, (energy(*ahead) - energy(*behind)) / (2.0 * step), rtol=1e-6, atol=1e-9)
+
+
+def test_packing_keeps_the_matrices() -> None:
+    """An interface is what the table has of it, and loses nothing whatever that says."""
+    random = np.random.default_rng(1)
+    entries = jnp.asarray(random.normal(size=(3, streams.ENTRIES)))
+    dense = jnp.asarray([1.0, 1.5, 4.0])
+    inward, outer, inner = map(np.asarray, streams.unpacked(entries, dense))
+    np.testing.assert_allclose(streams.packed(inward, outer, inner), entries, atol=1e-15)
+    for reflected in (outer, inner):
+        np.testing.assert_allclose(reflected, np.swapaxes(reflected, -1, -2), atol=1e-12)
+    first = np.eye(streams.STREAMS)[0]
+    np.testing.assert_allclose(inward[:, 0] + outer[:, 0], first[None].repeat(3, 0), atol=1e-12)
+    outward = np.swapaxes(inward, -1, -2) / np.asarray(dense)[:, None, None] ** 2
+    np.testing.assert_allclose(outward[:, 0] + inner[:, 0], first[None].repeat(3, 0), atol=1e-12)
+
+
+def test_the_box_is_finite_and_smooth() -> None:
+    """Values and gradients at corners of alpha and index, in float32, and slopes that do not jump across cells."""
+
+    def value(alpha, ior, depth):
+        stack = simplify(
+            Stack((lj.Interface(ior, alpha), lj.Medium(depth, 0.0), lj.Interface(ior * ior, alpha)), lj.Lambertian(0.9))
+        )
+        wi = (jnp.asarray(0.6), jnp.asarray(0.0), jnp.asarray(0.8))
+        return make_streamed(stack).value(wi, wi)[0]
+
+    slopes = jax.jit(jax.vmap(jax.value_and_grad(value, argnums=(0, 1, 2))))
+    corners = np.stack(np.meshgrid([1e-4, 0.3, 1.0], [0.5, 0.999, 1.0, 1.001, 2.0], [0.0, 1.0, 1e4]), -1).reshape(-1, 3)
+    found = slopes(*jnp.asarray(corners, jnp.float32).T)
+    assert all(np.all(np.isfinite(part)) for part in jax.tree.leaves(found))
+    line = jnp.linspace(0.2, 0.4, 2001)
+    along = slopes(line, jnp.full_like(line, 1.5), jnp.full_like(line, 0.3))[1][0]
+    jumps = np.abs(np.diff(np.asarray(along), 2))
+    assert np.max(jumps) < 20.0 * np.median(jumps) + 1e-6 * np.max(np.abs(along))
