@@ -92,24 +92,24 @@ def make_streamed(stack: Stack) -> StreamedBase:
     """The diffuse part of a stack for which `is_streamed`."""
     assert isinstance(stack.base, Lambertian)
     dtype = precision(stack)
-    places = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
     alphas = [jnp.asarray(layer.alpha, dtype) for layer in interfaces]
     ratios = [behind / before for before, behind in pairwise(indices)]
     together = streams.face(jnp.stack(alphas), jnp.stack(ratios))  # at one look
     faces = [streams.Face(*(part[k] for part in together)) for k in range(len(alphas))]
-    below, second = stream_layers.base(dtype), None
-    first, end = places[0], places[1] if len(places) > 1 else len(stack.layers)
-    for place in reversed(range(end, len(stack.layers))):
-        layer = stack.layers[place]
-        if isinstance(layer, Interface):
-            k = places.index(place)
-            onward = per_channel(streams.by_polynomials(below.onward)) if place + 1 < len(stack.layers) else None
-            second = Second(alphas[k], ratios[k], onward)
-            below = stream_layers.under_face(below, faces[k], ratios[k])
-        else:
+    first, *others = (place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface))
+    end = others[0] if others else len(stack.layers)
+    bottom = below = stream_layers.base(dtype)
+    second, k = None, len(faces)
+    for layer in reversed(stack.layers[end:]):
+        if isinstance(layer, Medium):
             below = stream_layers.under_medium(below, layer)
+            continue
+        k -= 1
+        onward = None if below is bottom else per_channel(streams.by_polynomials(below.onward))
+        second = Second(alphas[k], ratios[k], onward)
+        below = stream_layers.under_face(below, faces[k], ratios[k])
     media = [layer for layer in stack.layers[first + 1 : end] if isinstance(layer, Medium)]
     roof = stream_layers.roof(faces[0])
     for medium in media:
@@ -120,7 +120,7 @@ def make_streamed(stack: Stack) -> StreamedBase:
     again, scattered = met.again, None
     if not all(map(_absorbs, media)):
         assert depth is not None
-        straight = jnp.exp(-jnp.stack(depth)[:, None] / jnp.asarray(streams.NODES, dtype))
+        straight = stream_layers.straight(jnp.stack(depth))
         once = met.onward * straight
         again = straight * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
         down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
@@ -128,7 +128,7 @@ def make_streamed(stack: Stack) -> StreamedBase:
     above = _depth([layer for layer in stack.layers[:first] if isinstance(layer, Medium)], dtype)
     out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind) * jnp.asarray(streams.DIFFUSE, dtype)
     if above is not None:
-        out = out * jnp.exp(-jnp.stack(above)[:, None] / jnp.asarray(streams.NODES, dtype))
+        out = out * stream_layers.straight(jnp.stack(above))
     leaving = per_channel(jnp.sum(out, axis=-1) / indices[-1] ** 2)  # by reciprocity
     albedo, returned, one = per_channel(jnp.asarray(stack.base.albedo)), per_channel(met.returned), jnp.ones((), dtype)
     return StreamedBase(

@@ -5,6 +5,9 @@ of 4 by 4 and a stack a few products of them (`layerjax.transport.statistical.st
 tables (``python -m layerjax.precompute streams``), in the basis of polynomials that are orthonormal in the weight 2 u
 du; there the first one is diffuse light, and no energy is lost whatever else the tables say. Elsewhere streams are the
 amplitudes sqrt(2 u w) L(u) at the Gauss nodes, where absorption is diagonal.
+
+Errors beside the quadratures at random points (rms, largest): entries of interfaces 3e-4, 4e-3; moments of what enters
+a denser medium 3e-3, 4e-2; and a thinner one 1e-2, 0.2, these where alpha is below 0.01, about the critical cosine.
 """
 
 import functools
@@ -60,7 +63,7 @@ DIFFUSE = AT_NODES[:, 0]
 _MOMENTS_OF = np.linalg.inv(_coefficients())
 """From means of the polynomials to those of the powers of the cosine."""
 
-LEAST_SPREAD, BEAM, LEAST_COSINE = 1e-4, 3e-3, 0.02
+LEAST_SPREAD, SKEWED, LEAST_COSINE = 1e-4, 3e-3, 0.02
 """Of a lobe: its least variance, that at which its skewness fades, and the least of the two cosines."""
 
 
@@ -114,7 +117,7 @@ def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
     _, mean, square, cube = (jnp.sum(shares * jnp.asarray(row, shares.dtype), axis=-1) for row in _MOMENTS_OF)
     spread = at_least(square - mean * mean, LEAST_SPREAD)
     skew = cube - mean * (3.0 * square - 2.0 * mean * mean)
-    lean = skew * spread / (spread * spread + BEAM * BEAM)
+    lean = skew * spread / (spread * spread + SKEWED * SKEWED)
     apart = jnp.sqrt(lean * lean + 4.0 * spread)
     low, high = mean + 0.5 * (lean - apart), mean + 0.5 * (lean + apart)
     share = (mean - low) / apart
@@ -175,4 +178,5 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def times(matrix: Array, vector: Array) -> Array:
+    """Product of a small matrix and a vector."""
     return jnp.sum(matrix * vector[..., None, :], axis=-1)

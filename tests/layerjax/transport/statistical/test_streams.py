@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from layerjax.precompute.streams import diffuse_moments
 from layerjax.stack import Stack, simplify
 from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.diffuse_base import make_diffuse
@@ -64,14 +65,14 @@ def test_nothing_is_lost(layers) -> None:
     """What diffuse light from the base does not return to it leaves: energy over a base that absorbs nothing is 1."""
     stack = simplify(lj.Stack(layers, lj.Lambertian(1.0)))
     (energy,) = make_streamed(stack).energy
-    np.testing.assert_allclose(energy, 1.0, atol=2e-6)
+    np.testing.assert_allclose(energy, 1.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])
 @pytest.mark.parametrize("thickness", [1e-3, 1.0, 30.0])
 def test_slabs_are_as_the_solver_has_them(g: float, thickness: float) -> None:
     """Diffuse reflectance and transmittance of a medium, beside 24 nodes and modes enough."""
-    reflected, passed = stream_layers.slab(jnp.asarray([thickness]), jnp.asarray([0.95]), jnp.asarray(g))
+    reflected, passed = stream_layers.slab(jnp.asarray([thickness]), jnp.asarray([0.95]), jnp.asarray([g]))
     x, w = (np.asarray(part) for part in np.polynomial.legendre.leggauss(24))
     cosine, weight = 0.5 * (x + 1.0), 0.5 * w * (x + 1.0)
     directions = np.stack([np.sqrt(1.0 - cosine**2), 0.0 * cosine, cosine], axis=-1)
@@ -79,28 +80,33 @@ def test_slabs_are_as_the_solver_has_them(g: float, thickness: float) -> None:
     near, far = lj.albedo(slab, directions, lj.AddingDoubling(nodes=24, modes=4))
     far = far + np.exp(-thickness / cosine)[:, None]
     for matrix, energy in ((reflected, near), (passed, far)):
-        assert (
-            abs(float(streams.DIFFUSE @ matrix[0] @ streams.DIFFUSE) - float(weight @ np.asarray(energy)[:, 0])) < 2e-3
-        )
+        flux = float(streams.DIFFUSE @ matrix[0] @ streams.DIFFUSE)
+        assert abs(flux - float(weight @ np.asarray(energy)[:, 0])) < 3e-4  # as stated
 
 
-def test_slabs_at_ends() -> None:
-    """No thickness, all absorbed, and lossless to the thickest of the box, either precision."""
-    for dtype, error in ((jnp.float64, 1e-12), (jnp.float32, 1e-5)):
-        thickness = jnp.asarray([0.0, 1.0, 1.0, 1e4], dtype)
-        albedo = jnp.asarray([0.7, 0.0, 1.0, 1.0], dtype)
-        for g in (-0.999, 0.0, 0.999):
-            reflected, passed = stream_layers.slab(thickness, albedo, jnp.asarray(g, dtype))
-            np.testing.assert_allclose(passed[0], np.eye(streams.STREAMS), atol=error)
-            np.testing.assert_allclose(reflected[:2], 0.0, atol=error)
-            np.testing.assert_allclose(passed[1], np.diag(np.exp(-1.0 / streams.NODES)), atol=2e-5)
-            whole = streams.DIFFUSE @ np.asarray(reflected + passed)[2:]
-            np.testing.assert_allclose(whole, [streams.DIFFUSE] * 2, atol=10 * error)
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_slabs_at_ends(dtype) -> None:
+    """No thickness, all absorbed, and lossless to the thickest of the box.
+
+    Of a lossless slab rounding takes about the root of the precision, by which light loses its way in 1e4.
+    """
+    rounding, lost = (float(power * jnp.finfo(dtype).eps ** root) for power, root in ((32, 1.0), (1.0, 0.5)))
+    thickness = jnp.asarray([0.0, 1.0, 1.0, 1e4], dtype)
+    albedo = jnp.asarray([0.7, 0.0, 1.0, 1.0], dtype)
+    for g in (-0.999, 0.0, 0.999):
+        reflected, passed = jax.jit(stream_layers.slab)(thickness, albedo, jnp.asarray([g], dtype))
+        np.testing.assert_allclose(passed[0], np.eye(streams.STREAMS), atol=rounding)
+        np.testing.assert_allclose(reflected[:2], 0.0, atol=rounding)
+        # that the slab which doubling begins with is thin leaves (thickness / cosine / 2^19)^2 / 3
+        wanted = np.diag(np.exp(-1.0 / streams.NODES))
+        np.testing.assert_allclose(passed[1], wanted, atol=rounding + (2.0**-19 / streams.NODES[0]) ** 2 / 3.0)
+        whole = streams.DIFFUSE @ np.asarray(reflected + passed, float)[2:]
+        np.testing.assert_allclose(whole, [streams.DIFFUSE] * 2, atol=lost)
 
 
 def test_derivatives_of_slabs_at_ends() -> None:
     def energy(thickness, albedo, g):
-        reflected, passed = stream_layers.slab(thickness[None], albedo[None], g)
+        reflected, passed = stream_layers.slab(thickness[None], albedo[None], g[None])
         return jnp.stack([streams.DIFFUSE @ part[0] @ streams.DIFFUSE for part in (reflected, passed)])
 
     for place in ((0.0, 0.5, 0.3), (1.0, 0.0, 0.0), (1e4, 1.0, 0.999), (2.0, 1.0, -0.999)):
@@ -127,6 +133,28 @@ def test_packing_keeps_the_matrices() -> None:
     np.testing.assert_allclose(inward[:, 0] + outer[:, 0], first[None].repeat(3, 0), atol=1e-12)
     outward = np.swapaxes(inward, -1, -2) / np.asarray(dense)[:, None, None] ** 2
     np.testing.assert_allclose(outward[:, 0] + inner[:, 0], first[None].repeat(3, 0), atol=1e-12)
+
+
+def test_interfaces_are_as_their_quadrature() -> None:
+    """Between the points of the table. No entry is further off than is stated."""
+    random = np.random.default_rng(0)
+    alpha, ior = np.exp(random.uniform(np.log(1e-4), 0.0, 30)), np.exp(random.uniform(0.0, np.log(4.0), 30))
+    inward, outward = diffuse_moments(alpha, ior), diffuse_moments(alpha, 1.0 / ior)
+    found = streams.face(jnp.asarray(alpha), jnp.asarray(ior))
+    wanted = (
+        (found.down, inward.through + _rest(outward.later, inward.later)),
+        (found.top, inward.back + _rest(inward.returned, inward.returned)),
+        (found.bottom, outward.back + _rest(outward.returned, outward.returned)),
+    )
+    for matrix, moments in wanted:
+        apart = streams.AT_NODES.T @ np.asarray(matrix) @ streams.AT_NODES - moments
+        assert np.sqrt(np.mean(apart**2)) < 3e-4
+        assert np.max(np.abs(apart)) < 4e-3
+
+
+def _rest(out: np.ndarray, into: np.ndarray) -> np.ndarray:
+    """What first facets leave on the surface, t t' / <t>."""
+    return (out / np.maximum(out[:, :1], 1e-12))[:, :, None] * into[:, None, :]
 
 
 def test_the_box_is_finite_and_smooth() -> None:
