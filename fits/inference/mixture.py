@@ -90,6 +90,11 @@ class Mixture:
         return {f"{MIXTURE}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
+    def within(cls, arrays: dict[str, Any]) -> bool:
+        """Whether a mixture's `arrays` are among these."""
+        return f"{MIXTURE}centre" in arrays
+
+    @classmethod
     def from_arrays(cls, arrays: dict[str, Any]) -> "Mixture":
         """The mixture of these `arrays`."""
         return cls(*(np.asarray(arrays[f"{MIXTURE}{field.name}"]) for field in fields(cls)))

@@ -1,7 +1,10 @@
 """A few chains of the No-U-Turn sampler (Hoffman and Gelman 2014) by blackjax: for many parameters.
 
 Its metric is the covariance of the fit's approximation, which whitens the posterior, refined once in the warm-up; the
-length of its steps is found by dual averaging. blackjax is an extra, and imported on first use.
+length of its steps is found by dual averaging. Where the fit lies on a ridge, every step begins with a draw of the
+ridge's mixture, which is taken by the rule of Metropolis and Hastings: trajectories alone seldom find the way into a
+thin tail. The metric is then made of the higher half of the samples: one as wide as the tail makes steps short
+everywhere. blackjax is an extra, and imported on first use.
 """
 
 from collections.abc import Callable
@@ -9,6 +12,7 @@ from typing import Any
 
 import emcee
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -17,7 +21,7 @@ from fits.inference.chain import MemoryChain
 from fits.inference.ensemble import log_posteriors
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
-from fits.inference.mixture import Mixture
+from fits.inference.mixture import Leaps, Mixture
 from fits.problem.compiled import cores, in_shares
 from fits.problem.model import Model
 from fits.progress import Progress
@@ -51,44 +55,55 @@ class Nuts:
     def decide(self, progress: Progress | None) -> None:
         """Before the first step, and for all: starts, metric and length of steps, by a warm-up that is not kept."""
         generator = np.random.RandomState(self.seed)
-        initial = Mixture.of(self.fit) or Approximation.of(self.fit)
-        positions = first_positions(initial.draw, self._finite, self.chain.shape[0], generator)
-        metric, length, done = np.atleast_2d(np.cov(initial.draw(generator, DRAWS).T)), FIRST_STEP, 0
+        mixture, near = Mixture.of(self.fit), Approximation.of(self.fit)
+        positions = first_positions((mixture or near).draw, self._finite, self.chain.shape[0], generator)
+        if mixture is not None and mixture.held.any():  # its leaps know no bounds
+            mixture = None
+        leaps = None if mixture is None else mixture.leaps()
+        metric, length, done = np.atleast_2d(np.cov(near.draw(generator, DRAWS).T)), FIRST_STEP, 0
         for steps in WARM_UP:
             begin, update, end = _dual_averaging(TARGET)
-            state, visited = begin(length), []
+            state, visited, heights = begin(length), [], []
             for _ in range(steps):
                 done += 1
                 # before the chain's own steps, whose numbers are positive
-                positions, _, _, acceptance = self._step(positions, -done, float(np.exp(state.log_step_size)), metric)
+                stride = float(np.exp(state.log_step_size))
+                positions, height, _, acceptance = self._step(positions, -done, stride, metric, leaps)
                 state = update(state, float(np.mean(acceptance)))
                 visited.append(positions)
+                heights.append(height)
                 if progress is not None:
                     progress("warm-up", done, sum(WARM_UP))
             length = float(end(state))
             if done < sum(WARM_UP):
-                metric = _refined(metric, np.concatenate(visited[SETTLING:]))
-        self.chain.decide({"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""})
+                settled, level = np.concatenate(visited[SETTLING:]), np.concatenate(heights[SETTLING:])
+                metric = _refined(metric, settled if leaps is None else settled[level >= np.median(level)])
+        moves = {"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""}
+        self.chain.decide(moves | ({} if mixture is None else mixture.arrays()))
 
     def advance(self, step: int, tell: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""
         chain, moves = self.chain, self.chain.moves
         positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
+        leaps = Mixture.from_arrays(moves).leaps() if Mixture.within(moves) else None
         chain.grow(step - chain.iteration, None)
         random_state = np.random.RandomState(self.seed).get_state()  # part of a record, of no use here
         while chain.iteration < step:
             positions, heights, divergent, _ = self._step(
-                positions, chain.iteration + 1, float(moves["length"]), np.asarray(moves["metric"])
+                positions, chain.iteration + 1, float(moves["length"]), np.asarray(moves["metric"]), leaps
             )
             state = emcee.State(positions, log_prob=heights, random_state=random_state)
             chain.save_step(state, ~divergent)
             tell()
 
-    def _step(self, positions: Floats, number: int, length: float, metric: Floats) -> tuple[Any, ...]:
+    def _step(
+        self, positions: Floats, number: int, length: float, metric: Floats, leaps: Leaps | None
+    ) -> tuple[Any, ...]:
         """What `_step` gives, the chains on all cores: each follows as many gradients as its own trajectory takes."""
 
         def call(rows: Floats) -> tuple[Array, ...]:
-            return self.problem.call(_step, rows[:, 1:], rows[:, 0].astype(int), self.seed, number, length, metric)
+            places, chains = rows[:, 1:], rows[:, 0].astype(int)
+            return self.problem.call(_step, places, chains, self.seed, number, length, metric, leaps)
 
         rows = np.column_stack([np.arange(len(positions)), positions])
         found = in_shares(call, rows, -(-len(rows) // cores()), self._compiled)
@@ -112,7 +127,14 @@ def _refined(metric: Floats, samples: Floats) -> Floats:
 
 
 def _step(
-    model: Model, positions: Array, chains: Array, seed: Array, number: Array, length: Array, metric: Array
+    model: Model,
+    positions: Array,
+    chains: Array,
+    seed: Array,
+    number: Array,
+    length: Array,
+    metric: Array,
+    leaps: Leaps | None,
 ) -> tuple[Array, Array, Array, Array]:
     """Where a step takes chains (n, P) of these numbers, the log-posteriors there, whether they diverged, and their
     mean acceptance."""
@@ -123,9 +145,20 @@ def _step(
 
     def one(given: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
         index, position = given
+        of_path, of_leap = jax.random.split(jax.random.fold_in(key, index))
+        if leaps is not None:
+            position = _leapt(height, position, leaps, of_leap)
         # the state made anew: a chain that goes on from its file is the same to the last bit
         state = nuts.init(position, height)
-        state, info = kernel(jax.random.fold_in(key, index), state, height, length, metric)
+        state, info = kernel(of_path, state, height, length, metric)
         return state.position, state.logdensity, info.is_divergent, info.acceptance_rate
 
     return jax.lax.map(one, (chains, positions))
+
+
+def _leapt(height: Callable[[Array], Array], position: Array, leaps: Leaps, key: Array) -> Array:
+    """A draw of the leaps instead of a position (P,), or the position: both of the posterior if that is."""
+    of_draw, of_level = jax.random.split(key)
+    drawn, inside = leaps.draw(of_draw, ())
+    gain = height(drawn) - height(position) + leaps.log_density(position) - leaps.log_density(drawn)
+    return jnp.where(inside & (jnp.log(jax.random.uniform(of_level, dtype=position.dtype)) < gain), drawn, position)

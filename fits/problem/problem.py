@@ -126,7 +126,7 @@ class Problem:
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all problems of this structure."""
-        return run(function, self.split_model, *(jnp.asarray(argument) for argument in arguments))
+        return run(function, self.split_model, *jax.tree.map(jnp.asarray, arguments))
 
     @cached_property
     def split_model(self) -> tuple[Any, Static]:
