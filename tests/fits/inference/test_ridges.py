@@ -50,6 +50,21 @@ def test_albedo_times_scale(seed):
     np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
 
 
+def test_trajectories_leap_along_it_and_go_on_from_their_file(tmp_path):
+    """By NUTS, from end to end within steps: correlation goes with the leaps that are taken, not with the length."""
+    pytest.importorskip("blackjax")
+    fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
+    how = {"sampler": "nuts", "seed": 0, "allow_short": True}
+    posterior = sample(fitted, **how, max_steps=600)
+    levels = LEVEL / 10.0 + (1.0 - LEVEL / 10.0) * np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+    found, error = shares_below(posterior, "base.albedo", levels)
+    np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
+    assert posterior.effective_samples.min() > 200  # of 2,400 steps; without leaps chains stay about where they began
+    sample(fitted, **how, max_steps=200, path=tmp_path / "chain.h5")
+    longer = sample(fitted, **how, max_steps=600, path=tmp_path / "chain.h5")
+    np.testing.assert_array_equal(longer.chain, posterior.chain)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_haze_and_albedo_times_scale(seed):
     """By integration over thickness and albedo, with the scale integrated as the Gaussian that it nearly is."""
