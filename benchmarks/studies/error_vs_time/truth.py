@@ -24,6 +24,9 @@ STANDARD_ERRORS, TOLERANCE = 4.0, 0.01
 PROBED = 256
 """Paths by which the time of a walk is estimated."""
 
+ROUNDED = 1e-14
+"""1/sr: what sums of 64 modes of light of order 1 are rounded to in float64, and no path of a walk ever brings."""
+
 ROUNDING = 1e-9
 """Relative error of sums in float64 that nothing is told apart below, also where a truth is exact."""
 
@@ -197,7 +200,8 @@ def compare(
     """What estimates with standard errors say of the values, at the pairs of directions."""
     apart = np.abs(estimates - values)
     size = scale(values, albedo, directions)
-    noise = np.maximum(errors, ROUNDING * size)  # where all paths that count give the same, the error is rounding
+    # where all paths that count give the same, or none comes, the error is rounding
+    noise = np.maximum(np.maximum(errors, ROUNDING * size), ROUNDED)
     z = apart / noise
     weights = directions.weights[:, None]
     beyond = np.sum(weights * (apart**2 - noise**2)) / np.sum(weights * size**2)

@@ -84,7 +84,7 @@ def chosen(stack: Stack, followed: bool) -> Resolution:
         followed: whether light is followed along the directions asked for, so that nothing is read off tables.
     """
     nodes, modes = map(float, FOLLOWED if followed else READ)
-    for width, index in _lobes(stack):
+    for width, index in (*_lobes(stack), *_refracted(stack)):
         if width >= 1.0:  # broad: smooth at any resolution
             continue
         nodes = max(nodes, NODES / (width * _inclined(index or NODES_AS_UNDER)))
@@ -117,6 +117,25 @@ def _lobes(stack: Stack) -> Iterator[tuple[float, float | None]]:
                 yield _least(layer.phase.onward_width, ASSUMED_WIDTH), index
     if isinstance(stack.base, Conductor) and stack.layers:
         yield _least(stack.base.alpha, ASSUMED_WIDTH), index
+
+
+def _refracted(stack: Stack) -> Iterator[tuple[float, float | None]]:
+    """The same of what passes one interface to the next; nothing of those that are traced.
+
+    Light through interfaces is as narrow as facets deflect it. Through two of them alone it is known in closed form; on
+    the grid a slab of alpha 0.14 and index 1.5 is off by 7e-2 at 24 nodes, by 1e-3 at 48.
+    """
+    faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    if stack.base is not None or len(faces) < 2 or (len(faces) == 2 and not any(map(is_tilted, stack.layers))):
+        return
+    indices = [1.0, *(_least(face.ior, math.nan) for face in faces)]
+    for place, face in enumerate(faces):
+        alpha = _least(face.alpha, math.nan)
+        for here, there in ((place, place + 1), (place + 1, place)):
+            if 0 < here < len(faces):  # between two of them
+                width = alpha * abs(1.0 - indices[there] / indices[here])
+                if width > 0.0:  # none is deflected at equal indices, and nothing is known of a traced one
+                    yield width, max(1.0, indices[here])
 
 
 def _least(value: Any, assumed: float) -> float:

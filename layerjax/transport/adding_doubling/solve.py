@@ -55,8 +55,8 @@ def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) ->
     return Plan(resolution.nodes, resolution.modes, None, steps, _ranks(stack), microfacets)
 
 
-def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tuple[Grid, Layer]:
-    """The grid, and the whole stack as one layer.
+def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tuple[Grid, Layer, Layer]:
+    """The grid, the whole stack as one layer, and that less what is known in closed form, see `straight`.
 
     asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
     light passes it, ends) with an interface.
@@ -85,9 +85,7 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
         if tilted and not is_expanded:
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
-    if asked is not None:
-        whole = without_straight(stack, [found for found, _ in solved], whole)
-    return grid, whole
+    return grid, whole, without_straight(stack, [found for found, _ in solved], whole)
 
 
 def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None) -> list[Layer]:

@@ -20,6 +20,7 @@ from layerjax.surfaces.interface import interface_transmission, is_straight
 from layerjax.transport.adding_doubling.asked import asked_region, turn
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
+from layerjax.transport.adding_doubling.resolution import is_tilted
 
 POINTS = (16, 12)
 """Points a panel, and in azimuth, of the facets of either side."""
@@ -53,6 +54,8 @@ def straight(stack: Stack) -> Straight | None:
 
 
 def _faces(stack: Stack) -> tuple[int, int] | None:
+    if any(map(is_tilted, stack.layers)):  # what they pass goes with the azimuth
+        return None
     faces = [place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface)]
     return (faces[0], faces[1]) if stack.base is None and len(faces) == 2 else None
 

@@ -64,6 +64,7 @@ class _End(NamedTuple):
 def make_tables(
     grid: Grid,
     whole: Layer,
+    rest: Layer,
     azimuths: int | None,
     opaque: bool,
     interaction_probability: Callable[[Vector], Channels | None],
@@ -72,7 +73,8 @@ def make_tables(
 
     Args:
         grid: the directions that it was solved at.
-        whole: the operators of all its layers together.
+        whole: the operators of all its layers together, whose energies are kept.
+        rest: of the same, what is read off the tables.
         azimuths: ordinates in azimuth; None: Fourier modes.
         opaque: only light from above, and what is reflected.
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
@@ -80,7 +82,7 @@ def make_tables(
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
     top, bottom = (_End(region, _lift(grid, region, modes, azimuths)) for region in (grid.regions[0], grid.regions[-1]))
-    values = _values(whole, top, bottom, azimuths, steps, opaque)
+    values = _values(rest, top, bottom, azimuths, steps, opaque)
 
     lit = [(top, whole.reflect_top, whole.transmit_down, 1.0)]
     if not opaque:

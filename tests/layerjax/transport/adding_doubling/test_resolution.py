@@ -9,6 +9,7 @@ from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADD
 
 FACE, PAINT = lj.Interface(1.5, 0.05), lj.Lambertian(0.5)
 HAZE = lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.9))
+SLAB = lj.Stack([lj.Interface(1.5, 0.3), lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.4)), lj.Interface(1.0, 0.3)])
 FIBERS = lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.3, (1.0, 0.0, 0.0)))
 
 
@@ -31,6 +32,8 @@ def flakes(alpha):
         (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 12),
         (lj.Stack([FACE, HAZE, lj.Interface(1.0, 0.6)]), True, 24),
         (lj.Stack([FACE, lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(-0.9))], PAINT), True, 24),
+        (lj.Stack([*SLAB.layers, lj.Medium(1.0, 0.9)]), False, 12),
+        (lj.Stack([*SLAB.layers, lj.Medium(1.0, 0.9), lj.Interface(1.5, 0.3)]), True, 32),
     ],
 )
 def test_narrow_lobes_behind_others_decide(stack, followed, least):
