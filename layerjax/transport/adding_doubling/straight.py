@@ -100,6 +100,8 @@ def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
     shape = jnp.broadcast_shapes(wi[2].shape, wo[2].shape)
     downward = wi[2] > 0
     over, under = select(downward, wi, wo), flip(select(downward, wo, wi))
+    if 0 in shape:
+        return (jnp.zeros(shape, over[2].dtype),)
     edge = horizon(over[2].dtype)
     valid = (over[2] > edge) & (under[2] > edge)
     rows = [jnp.broadcast_to(jnp.where(valid, x, y), shape).ravel() for x, y in ((over[2], 0.5), (under[2], 0.5))]
