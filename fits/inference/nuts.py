@@ -78,6 +78,8 @@ class Nuts:
             if done < sum(WARM_UP):
                 settled, level = np.concatenate(visited[SETTLING:]), np.concatenate(heights[SETTLING:])
                 metric = _refined(metric, settled if leaps is None else settled[level >= np.median(level)])
+            elif mixture is not None:
+                mixture = mixture.refined(np.concatenate(visited))
         moves = {"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""}
         self.chain.decide(moves | ({} if mixture is None else mixture.arrays()))
 
