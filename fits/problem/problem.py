@@ -28,6 +28,11 @@ from layerjax.stack import with_known
 Floats = NDArray[np.float64]
 
 
+def _is_vector(argument: Any) -> bool:
+    """Whether numbers are listed, which make an array; a named tuple holds arrays."""
+    return type(argument) in (list, tuple)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A stack with `Free` leaves, the measurements that it should explain, and how they scatter about it.
@@ -126,7 +131,8 @@ class Problem:
 
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all problems of this structure."""
-        return run(function, self.split_model, *jax.tree.map(jnp.asarray, arguments))
+        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
+        return run(function, self.split_model, *arrays)
 
     @cached_property
     def split_model(self) -> tuple[Any, Static]:
