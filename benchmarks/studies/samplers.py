@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -118,7 +118,7 @@ def study(
     settings = rounded(
         {"transport": repr(TRANSPORT), "noise": NOISE, "ess": wanted, "parameters": coated_haze.PARAMETERS}
     )
-    done = _held(directory, settings) if resume else []
+    done = _held(directory, settings, posteriors) if resume else []
     surroundings = environment.describe()
     text, paths = "", (Path(), Path())
     for name, made in posteriors.items():
@@ -126,9 +126,10 @@ def study(
         fit = made() if missing else None
         for sampler in missing:
             assert fit is not None
-            done.append(_sampled(name, sampler, fit, wanted))
+            found = _sampled(name, sampler, fit, wanted)
+            done.append(found)
             text, paths = _save(done, settings, surroundings, posteriors, directory)
-            report(f"{name}, {sampler}: {done[-1].effective:,.0f} effective samples, {done[-1].seconds:.0f} s")
+            report(f"{name}, {sampler}: {found.effective:,.0f} effective samples, {found.seconds:.0f} s")
     return (text, paths) if text else _save(done, settings, surroundings, posteriors, directory)
 
 
@@ -158,15 +159,15 @@ def apart(one: Sampled, plain: Sampled) -> float:
     return float(np.max(np.abs(np.subtract(one.quantiles, plain.quantiles)) / np.array(plain.deviations)))
 
 
-def _held(directory: Path, settings: Mapping[str, Any]) -> list[Sampled]:
-    """What the directory holds; ValueError if it was sampled with other settings."""
+def _held(directory: Path, settings: Mapping[str, Any], posteriors: Container[str]) -> list[Sampled]:
+    """What the directory holds of these posteriors; ValueError if it was sampled with other settings."""
     path = directory / f"{NAME}.json"
     if not path.exists():
         return []
     content = json.loads(path.read_text())
     if content["settings"] != settings:
         raise ValueError(f"{path}: sampled with other settings, it cannot be resumed")
-    return [Sampled(**record) for record in content["chains"]]
+    return [Sampled(**record) for record in content["chains"] if record["posterior"] in posteriors]
 
 
 def _save(
@@ -177,6 +178,8 @@ def _save(
     directory: Path,
 ) -> tuple[str, tuple[Path, Path]]:
     """Write all chains so far and what they say; returns the markdown and the paths."""
+    order = [(name, sampler) for name in posteriors for sampler in SAMPLERS]
+    done.sort(key=lambda one: order.index((one.posterior, one.sampler)))
     plain = {one.posterior: one for one in done if one.sampler == PLAIN}
     text = TEXT.format(
         environment=environment_lines(surroundings),

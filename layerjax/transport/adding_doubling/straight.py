@@ -6,8 +6,10 @@ are integrated over along the facets that either side sees, and the two sums wei
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -25,7 +27,7 @@ from layerjax.transport.adding_doubling.resolution import is_tilted
 POINTS = (16, 12)
 """Points a panel, and in azimuth, of the facets of either side."""
 
-AT_ONCE = 1 << 19
+AT_ONCE = 1 << 17
 """Rays that are followed together."""
 
 TINY = 1e-18
@@ -104,10 +106,19 @@ def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
         return (jnp.zeros(shape, over[2].dtype),)
     edge = horizon(over[2].dtype)
     valid = (over[2] > edge) & (under[2] > edge)
-    rows = [jnp.broadcast_to(jnp.where(valid, x, y), shape).ravel() for x, y in ((over[2], 0.5), (under[2], 0.5))]
-    rows.append(jnp.broadcast_to(turn(over, flip(under)), shape).ravel())
+    cosines = (jnp.where(valid, over[2], 0.5), jnp.where(valid, under[2], 0.5))
+    rows = [jnp.broadcast_to(row, shape).ravel() for row in (valid, *cosines, turn(over, flip(under)))]
+    passed = partial(_passed, state)
+
+    def nothing(*pairs: Array) -> Channels:
+        return tuple(jnp.zeros(found.shape, found.dtype) for found in jax.eval_shape(passed, *pairs))
+
+    def some(rows: list[Array]) -> Channels:  # pairs on one side, which often lie together, are left out
+        crossing, *pairs = rows
+        return jax.lax.cond(jnp.any(crossing), passed, nothing, *pairs)
+
     rays = rows[0].size * 8 * POINTS[0] * POINTS[1]
-    found = by_rows(lambda rows: _passed(state, *rows), tuple(rows), rays // AT_ONCE)
+    found = by_rows(some, rows, rays // AT_ONCE)
     outside = total(
         [*optical_depths(state.media[0], over), *optical_depths(state.media[2], flip(under)), (0.0 * over[2],)]
     )
