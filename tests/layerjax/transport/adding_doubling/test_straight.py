@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from layerjax.directions import split
+from layerjax.transport.adding_doubling.straight import evaluate_straight, straight
 
 SOLVER = lj.AddingDoubling(nodes=6, modes=6)
 THETA_I, THETA_O, PHI = (
@@ -53,6 +55,24 @@ def test_is_the_same_beside_tables(above):
         exact = np.asarray(lj.evaluate(stack, WI, WO, lj.AddingDoubling(nodes=24)))
         errors = np.zeros_like(exact)
     assert np.all(np.abs(read - exact) < 4.0 * errors + 2e-3 * (exact + 0.1 * np.max(exact)))
+
+
+def test_pairs_on_one_side_are_left_out():
+    """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros."""
+    wi, wo = jnp.tile(WI, (40, 1)), jnp.tile(WO, (40, 1))  # more than one chunk of pairs
+    same_side = jnp.arange(len(wi)) < len(wi) // 2
+    mixed = jnp.where(same_side[:, None], wi, wo)
+
+    def values(alpha, wo):
+        return evaluate_straight(straight(slab(1.5, alpha, 1.2, 0.1)), split(wi), split(wo))[0]
+
+    compiled = jax.jit(lambda alpha, wo: (values(alpha, wo), jax.jacfwd(values)(alpha, wo)))
+    for crossing, some, none in zip(compiled(0.05, wo), compiled(0.05, mixed), compiled(0.05, wi), strict=True):
+        np.testing.assert_allclose(some, jnp.where(same_side, 0.0, crossing), rtol=1e-12)
+        np.testing.assert_array_equal(none, 0.0)
+        assert np.any(np.asarray(some) != 0.0)
+    slope = jax.jit(jax.grad(lambda alpha: jnp.sum(values(alpha, mixed))))(0.05)
+    np.testing.assert_allclose(slope, jnp.sum(compiled(0.05, mixed)[1]), rtol=1e-9)
 
 
 def test_is_reciprocal_and_turns_upside_down():
