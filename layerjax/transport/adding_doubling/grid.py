@@ -23,6 +23,7 @@ from jax import Array
 
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.quadrature import gauss_legendre
+from layerjax.transport.adding_doubling.interpolate import cubic
 
 COSINE_FLOOR = 1e-7
 """Stands for the cosines of a panel without extent (two equal indices), whose nodes have no weight."""
@@ -210,8 +211,8 @@ def table_matrix(nodes: int) -> tuple[np.ndarray, np.ndarray]:
     return x, vander @ _projection(nodes)
 
 
-def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, tuple[Array, ...]]:
-    """First index and the four weights of the cubic that interpolates a table (panel by panel) at directions."""
+def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, Array]:
+    """Where a table (panel by panel) is read at directions: the first of four points, and the place from there."""
     points = TABLE_DENSITY * grid.nodes
     panel = _panel(grid, ior * ior * sine2)
     low, high = grid.bounds(panel, ior * ior)
@@ -221,12 +222,13 @@ def stencil(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array,
     t = (2.0 / jnp.pi) * jnp.arctan2(safe_sqrt(rest2 / (1.0 + x)), safe_sqrt(x))
     place = t * (points - 1)
     first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)) - 1.0, 0.0, points - 4.0)
-    return first.astype(jnp.int32) + panel * points, cubic(place - first)
+    return first.astype(jnp.int32) + panel * points, place - first
 
 
 def interpolated(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Array) -> Array:
     """Row of a table (points, columns) at directions, shape ``cosine.shape + (columns,)``; see `stencil`."""
-    first, weights = stencil(grid, ior, cosine, sine2)
+    first, place = stencil(grid, ior, cosine, sine2)
+    weights = cubic(place)
     return sum((weights[j][..., None] * rows[first + j] for j in range(1, 4)), weights[0][..., None] * rows[first])
 
 
@@ -247,9 +249,3 @@ def at_table_points(grid: Grid, values: Array) -> Array:
     _, matrix = table_matrix(grid.nodes)
     split = values.reshape(*values.shape[:-1], -1, grid.nodes) @ jnp.asarray(matrix.T, values.dtype)
     return split.reshape(*values.shape[:-1], -1)
-
-
-def cubic(place: Array) -> tuple[Array, Array, Array, Array]:
-    """Weights of values at 0, 1, 2, 3 in the cubic through them."""
-    a, b, c, d = place, place - 1.0, place - 2.0, place - 3.0
-    return b * c * d * (-1 / 6), a * c * d * 0.5, a * b * d * -0.5, a * b * c * (1 / 6)

@@ -5,9 +5,8 @@ A table is finer than the grid: polynomials in the cosine and Fourier series in 
 summed at its azimuths, 0 to pi, so that a pair reads 64 numbers however many modes there are.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +18,8 @@ from jax import Array
 from layerjax._numerics import horizon, not_negative, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
-from layerjax.transport.adding_doubling.grid import Grid, Region, cubic, stencil, table_matrix
+from layerjax.transport.adding_doubling.grid import Grid, Region, stencil, table_matrix
+from layerjax.transport.adding_doubling.interpolate import Axis, look_up
 from layerjax.transport.adding_doubling.operators import Layer, Operator, turned
 from layerjax.transport.contract import Side
 
@@ -28,10 +28,6 @@ AZIMUTH_DENSITY = 2
 
 MODE_DENSITY = 3
 """Steps of a table from azimuth 0 to pi for each Fourier mode."""
-
-
-Points = tuple[Array, Array]
-"""Four offsets into a table along one of its axes, and their weights: (4, ...) each."""
 
 
 class Tables(eqx.Module):
@@ -182,29 +178,8 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
     if tables.steps is not None:
         axes.append(_azimuth_points(into, out, tables.steps))
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
-    found = _contracted(tables.values, start, axes)
+    found = look_up(tables.values, start, axes)
     return tuple(factor * not_negative(value) for value in found)
-
-
-def _contracted(values: Channels, start: Array, axes: Sequence[Points]) -> Channels:
-    """Sum of the entries at start and the offsets of all axes, times their weights; four along the last axis a step."""
-    flat = [value.reshape(-1) for value in values]
-    *outer, (offsets, weights) = axes
-
-    def step(sums: Channels, which: Array) -> tuple[Channels, None]:
-        place, weight = start, jnp.ones((), weights.dtype)
-        for (near, share), k in zip(outer, which, strict=True):
-            place, weight = place + near[k], weight * share[k]
-        added = []
-        for entries in flat:
-            read = [weights[k] * entries.at[place + offsets[k]].get(mode="promise_in_bounds") for k in range(4)]
-            added.append(weight * (read[0] + read[1] + read[2] + read[3]))
-        return tuple(total + more for total, more in zip(sums, added, strict=True)), None
-
-    shape = jnp.broadcast_shapes(start.shape, *(weights.shape[1:] for _, weights in axes))
-    zero = jnp.zeros(shape, weights.dtype)
-    every = np.asarray(list(itertools.product(range(4), repeat=len(outer))), np.int32)
-    return jax.lax.scan(step, (zero,) * len(flat), jnp.asarray(every))[0]
 
 
 def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
@@ -217,8 +192,7 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
     axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
     near, far = (
-        _contracted(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes)
-        for table in (tables.near, tables.far)
+        look_up(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in (tables.near, tables.far)
     )
     energies = [_shared(*pair) for pair in zip(near, far, strict=True)]
     sides = (tuple(jnp.where(valid, energy[side], 0.0) for energy in energies) for side in range(2))
@@ -244,32 +218,27 @@ def _inside(w: Vector, valid: Array) -> Vector:
     return (jnp.where(valid, w[0], 0.6), jnp.where(valid, w[1], 0.0), jnp.where(valid, jnp.abs(w[2]), 0.8))
 
 
-def _points(tables: Tables, w: Vector, ior: Array, turn: float, stride: int) -> list[Points]:
+def _points(tables: Tables, w: Vector, ior: Array, turn: float, stride: int) -> list[Axis]:
     """Where a direction lies in a table whose directions are `stride` apart: in cosine, and with ordinates azimuth."""
     first, polar = stencil(tables.grid, ior, w[2], w[0] * w[0] + w[1] * w[1])
     if tables.azimuths is None:
-        return [(stride * _four(first), jnp.stack(polar))]
+        return [Axis(first, polar, stride)]
     count = AZIMUTH_DENSITY * tables.azimuths
     at_pole = (w[0] == 0) & (w[1] == 0)
     phi = jnp.arctan2(jnp.where(at_pole, 0.0, w[1]), jnp.where(at_pole, 1.0, w[0])) + turn
     place = phi * (count / (2.0 * np.pi))
     corner = jax.lax.stop_gradient(jnp.floor(place))
-    around = _four(corner.astype(jnp.int32) - 1) % count
-    weights = jnp.stack(cubic(place - corner + 1.0))
-    return [(stride * count * _four(first), jnp.stack(polar)), (stride * around, weights)]
+    around = Axis(corner.astype(jnp.int32) - 1, place - corner + 1.0, stride, count)
+    return [Axis(first, polar, stride * count), around]
 
 
-def _azimuth_points(wi: Vector, wo: Vector, steps: int) -> Points:
+def _azimuth_points(wi: Vector, wo: Vector, steps: int) -> Axis:
     """Where the azimuth between the directions of travel lies in a table."""
     sine, cosine = wi[1] * wo[0] - wi[0] * wo[1], -(wi[0] * wo[0] + wi[1] * wo[1])
     at_pole = (sine == 0) & (cosine == 0)
     place = (steps / np.pi) * jnp.arctan2(jnp.abs(jnp.where(at_pole, 0.0, sine)), jnp.where(at_pole, 1.0, cosine))
     first = jnp.clip(jax.lax.stop_gradient(jnp.floor(place)), 0, steps - 1)
-    return _four(first.astype(jnp.int32)), jnp.stack(cubic(place - first + 1.0))
-
-
-def _four(first: Array) -> Array:
-    return jnp.stack([first + k for k in range(4)])
+    return Axis(first.astype(jnp.int32), place - first + 1.0, 1)
 
 
 def _waves(modes: int, steps: int) -> np.ndarray:

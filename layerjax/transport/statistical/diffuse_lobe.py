@@ -16,7 +16,7 @@ from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, sanitised
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Lambertian
-from layerjax.transport.adding_doubling.grid import cubic
+from layerjax.transport.adding_doubling.interpolate import cubic
 from layerjax.transport.statistical.diffuse import Coat, indirect_lobe, stack_lobe
 from layerjax.transport.statistical.lobes import precision
 from layerjax.transport.statistical.shaped import GRAZING
