@@ -56,7 +56,8 @@ def look_up(tables: Sequence[Array], start: Array, axes: Sequence[Axis]) -> Chan
         place, weight = start, jnp.ones((), zero.dtype)
         for axis, k in zip(outer, which, strict=True):
             place = place + axis.offset(k)
-            weight = weight * jnp.select([k == each for each in range(3)], cubic(axis.place)[:3], cubic(axis.place)[3])
+            *others, last = cubic(axis.place)
+            weight = weight * jnp.select([k == each for each in range(3)], others, last)
         found = (_summed(entries, place, inner) for entries in flat)
         return tuple(total + weight * more for total, more in zip(sums, found, strict=True)), None
 

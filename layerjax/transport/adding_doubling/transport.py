@@ -61,7 +61,7 @@ class AddingDoubling(DeterministicTransport):
     """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
 
     Carries everything that a `Stack` holds; von Mises-Fisher normals with ``microfacets="single"`` only. The work per
-    stack is done in `prepare`; a pair then costs about a microsecond, or 20 to 65 with two interfaces and no base,
+    stack is done in `prepare`; a pair then costs about a microsecond, or 20 to 65 through two interfaces and no base,
     where light that refracts at both and meets nothing else is integrated over their facets. `evaluate` of a stack that
     begins (and, if light passes it, ends) with an interface, along up to 256 distinct cosines that are known
     beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the

@@ -57,7 +57,7 @@ def test_is_the_same_beside_tables(above):
     assert np.all(np.abs(read - exact) < 4.0 * errors + 2e-3 * (exact + 0.1 * np.max(exact)))
 
 
-def test_pairs_on_one_side_are_left_out():
+def test_pairs_on_one_side_are_zero_and_change_no_others():
     """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros."""
     wi, wo = jnp.tile(WI, (40, 1)), jnp.tile(WO, (40, 1))  # more than one chunk of pairs
     same_side = jnp.arange(len(wi)) < len(wi) // 2
