@@ -11,6 +11,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, PartitionSpec
@@ -51,19 +52,23 @@ def _usable(*inputs: Any) -> int:
     return everywhere
 
 
-def over_devices(function: Callable[[Any], Any], rows: Any, least: int) -> Any:
+def over_devices(function: Callable[[Any], Any], rows: Any, least: int, filled: bool = False) -> Any:
     """function over arrays that share their first axis, and whose results do: as many of its rows on every device.
 
-    function: closes over what all rows need. least: rows of a share below which it does not pay. Nor does it where a
-    device would have more rows than another: to gather what they found takes longer than to find it.
+    function: closes over what all rows need. least: rows of a share below which it does not pay. filled: whether shares
+    that are not even are filled up; where a row is cheap, to gather what they found takes longer than to find it.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
     devices = _in_use.get()
-    if devices == 1 or count % devices or count < devices * least:
+    missing = -count % devices
+    if devices == 1 or count < devices * least or (missing and not filled):
         return function(rows)
     split = PartitionSpec(ROWS)
     shared = jax.shard_map(function, mesh=_mesh(devices), in_specs=split, out_specs=split, check_vma=False)
-    return shared(rows)
+    if not missing:
+        return shared(rows)
+    more = jax.tree.map(lambda row: jnp.concatenate([row, row[:missing]]), rows)
+    return jax.tree.map(lambda found: found[:count], shared(more))
 
 
 @cache

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._batching import even_chunks
 from layerjax._devices import compiled, over_devices
 from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
@@ -105,7 +106,7 @@ def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequ
 
     # numbered: a map may be left without a number that differs, where all its layers are known not to be there
     rows = (numbers, tuple(own), jnp.arange(texels))
-    return over_devices(partial(_side_by_side, one, together), rows, least=together)
+    return over_devices(partial(_side_by_side, one, together), rows, least=together, filled=True)
 
 
 def _side_by_side(one: Callable[..., Any], together: int, rows: Any) -> Any:
@@ -113,8 +114,7 @@ def _side_by_side(one: Callable[..., Any], together: int, rows: Any) -> Any:
     if together == 1:
         return jax.lax.map(jax.checkpoint(lambda row: one(*row)), rows)
     texels = jax.tree.leaves(rows)[0].shape[0]
-    chunks = -(-texels // together)
-    size = -(-texels // chunks)
+    chunks, size = even_chunks(texels, -(-texels // together))
     missing = chunks * size - texels
 
     def in_chunks(array: Array) -> Array:

@@ -30,11 +30,12 @@ def everything(alpha, k, wi, wo):
     of_texels = jax.jit(jax.grad(lambda a: jnp.sum(lj.evaluate(metal(a, k), wi[:1], wo[:1], over) ** 2)))(alphas)
     drawn = lj.sample(metal(alpha, k), wi, jax.random.key(0), over)
     density = lj.pdf(metal(alpha, k), wi, wo, over)
-    return found, slopes, forward, texels, of_texels, drawn, density
+    odd = lj.evaluate(metal(alphas[1:], k), wi[:1], wo[:1], over)
+    return found, slopes, forward, texels, of_texels, drawn, density, odd
 
 
 split = everything(0.3, k, wi, wo)
-assert all(len(part.sharding.device_set) == 2 for part in (split[0], split[3], *split[5], split[6]))
+assert all(len(part.sharding.device_set) == 2 for part in (split[0], split[3], *split[5], split[6], split[7]))
 with jax.default_device(second):
     whole = everything(0.3, k, wi, wo)
 assert all(len(part.sharding.device_set) == 1 for part in jax.tree.leaves(whole))

@@ -126,10 +126,10 @@ def make_streamed(stack: Stack) -> StreamedBase:
         down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
         scattered = per_channel(down), per_channel(up)
     above = _depth([layer for layer in stack.layers[:first] if isinstance(layer, Medium)], dtype)
-    out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind) * jnp.asarray(streams.DIFFUSE, dtype)
+    out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind)
     if above is not None:
         out = out * stream_layers.straight(jnp.stack(above))
-    leaving = per_channel(jnp.sum(out, axis=-1) / indices[-1] ** 2)  # by reciprocity
+    leaving = per_channel(streams.dot(out, jnp.asarray(streams.DIFFUSE, dtype)) / indices[-1] ** 2)  # by reciprocity
     albedo, returned, one = per_channel(jnp.asarray(stack.base.albedo)), per_channel(met.returned), jnp.ones((), dtype)
     return StreamedBase(
         above=above,

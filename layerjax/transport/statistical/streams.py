@@ -14,6 +14,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -105,7 +106,7 @@ def _columns(name: str, start: Array | np.ndarray, counts: Sequence[Any], places
 
 def along(shares: Array, onward: Array) -> Array:
     """Share of such light that arrives, by its polynomials."""
-    return jnp.sum(shares * onward, axis=-1)
+    return dot(shares, onward)
 
 
 def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
@@ -114,7 +115,7 @@ def two_cosines(shares: Array) -> tuple[Array, Array, Array]:
 
     Of a beam, whose third moment is the rounding of a table, they are even about the mean.
     """
-    _, mean, square, cube = (jnp.sum(shares * jnp.asarray(row, shares.dtype), axis=-1) for row in _MOMENTS_OF)
+    _, mean, square, cube = (dot(shares, jnp.asarray(row, shares.dtype)) for row in _MOMENTS_OF)
     spread = at_least(square - mean * mean, LEAST_SPREAD)
     skew = cube - mean * (3.0 * square - 2.0 * mean * mean)
     lean = skew * spread / (spread * spread + SKEWED * SKEWED)
@@ -173,10 +174,20 @@ def by_polynomials(onward: Array) -> Array:
 
 
 def matmul(a: Array, b: Array) -> Array:
-    """Product of small matrices, as sums: XLA calls a library for every product that it is told of."""
-    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+    """Product of small matrices, term by term.
+
+    XLA calls a library for every product that it is told of, and in single precision for every sum along an axis, which
+    takes several times as long; and it would work out the factors anew for each of the sums that they are in.
+    """
+    a, b = jax.lax.optimization_barrier(a), jax.lax.optimization_barrier(b)
+    return dot(a[..., :, None, :], jnp.swapaxes(b, -1, -2)[..., None, :, :])
 
 
 def times(matrix: Array, vector: Array) -> Array:
     """Product of a small matrix and a vector."""
-    return jnp.sum(matrix * vector[..., None, :], axis=-1)
+    return dot(matrix, vector[..., None, :])
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Sum of the products of so many streams, or polynomials."""
+    return sum((a[..., k] * b[..., k] for k in range(1, STREAMS)), a[..., 0] * b[..., 0])
