@@ -27,8 +27,10 @@ Side = Literal["all", "reflection", "transmission"]
 
 Uniforms = tuple[Array, Array, Array]
 
-TEXELS = 2048
-"""Of a map of stacks, worked on together where a stack costs a few numbers: what they need stays in the cache."""
+TEXELS = 2000
+"""Of a map of stacks, worked on together where a stack costs a few numbers: what they need stays in the cache.
+
+No power of 2: arrays of 2048 numbers get into each other's way in it, and gradients take twice as long."""
 
 
 class Transport(eqx.Module):
