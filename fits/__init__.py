@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from fits.inference.identifiability import Combination as Combination
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
+    from fits.inference.prediction import Prediction as Prediction
+    from fits.inference.prediction import predict as predict
     from fits.inference.sampling import sample as sample
+    from fits.problem.correlated import Correlated as Correlated
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -44,6 +47,7 @@ _HOMES = {
     "Geometry": "data.geometry",
     "slices": "data.geometry",
     "Combination": "inference.identifiability",
+    "Correlated": "problem.correlated",
     "Noise": "problem.likelihood",
     "Measurements": "data.measurements",
     "fit": "inference.optimise",
@@ -53,6 +57,8 @@ _HOMES = {
     "Normal": "problem.parameters",
     "Uniform": "problem.parameters",
     "Posterior": "inference.posterior",
+    "Prediction": "inference.prediction",
+    "predict": "inference.prediction",
     "sample": "inference.sampling",
     "Problem": "problem.problem",
     "report": "reporting.html",

@@ -14,6 +14,9 @@ import numpy as np
 from fits._files import write_bytes, write_text, write_together
 from fits.cli.interrupts import hint
 from fits.cli.places import refuse_existing, require_free_place
+from fits.cli.predictions import held_out, print_scores
+from fits.cli.predictions import predict as predict
+from fits.cli.setting import use_jax
 from fits.data.formats import read
 from fits.data.measurements import Measurements
 from fits.progress import show_progress
@@ -28,7 +31,7 @@ DONE, DOUBTFUL = 0, 1
 
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
-    _use_jax()
+    use_jax()
     from fits.inference.nuts import require_blackjax
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
@@ -36,11 +39,13 @@ def fit(arguments: Namespace) -> int:
 
     directory = Path(arguments.out)
     results.check_directory(directory, arguments.force)
-    data = _measurements(arguments)
+    data, unseen = held_out(_measurements(arguments), arguments)
     given = read_problem(arguments.stack)
     objective = arguments.objective or given.objective
     if arguments.sample and objective != "likelihood":
         raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
+    if unseen is not None and objective != "likelihood":
+        raise ValueError(f"--hold-out needs the objective 'likelihood': {objective!r} says nothing of readings")
     if arguments.sample and arguments.sampler == "nuts":
         require_blackjax()
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
@@ -70,6 +75,8 @@ def fit(arguments: Namespace) -> int:
         tables.print_table(table, sys.stdout)
     for sentence in (*verdicts.outcome(result), f"Report: {directory / results.REPORT}"):
         print(sentence)
+    if unseen is not None:
+        print_scores(result, unseen, "Readings that were held out")
     if arguments.sample:
         return _sample(directory, arguments)
     return DONE if result.converged else DOUBTFUL
@@ -77,7 +84,7 @@ def fit(arguments: Namespace) -> int:
 
 def sample(arguments: Namespace) -> int:
     """Sample the posterior of a saved fit, going on with the chain that is there."""
-    _use_jax()
+    use_jax()
     return _sample(Path(arguments.directory), arguments)
 
 
@@ -137,7 +144,7 @@ def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
 
 def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, if asked for beside others."""
-    _use_jax()
+    use_jax()
     from fits.reporting import results
     from fits.reporting.html import report as write_page
 
@@ -164,7 +171,7 @@ def compare(arguments: Namespace) -> int:
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
     refuse_existing(arguments.out, arguments.force)
-    _use_jax()
+    use_jax()
     from fits.inference.compare import compare as run_compare
     from fits.reporting import tables
 
@@ -209,7 +216,7 @@ def convert(arguments: Namespace) -> int:
 def simulate(arguments: Namespace) -> int:
     """Write what a goniometer would measure of a stack."""
     require_free_place(arguments, ".csv", "measurements")
-    _use_jax()
+    use_jax()
     from fits.data.geometry import slices
     from fits.problem.simulate import simulate as run_simulation
     from fits.problem.stack_file import read_problem
@@ -238,7 +245,7 @@ def _write_measurements(data: Measurements, arguments: Namespace) -> int:
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file."""
     require_free_place(arguments, ".png", "pictures")
-    _use_jax()
+    use_jax()
     from fits.problem.stack_file import read_problem
     from fits.reporting.plots.data import as_png
     from fits.reporting.render import render as run_render
@@ -273,25 +280,6 @@ def write_report(
     text = page(result, posterior, images, others, name)
     pictures = {f"{picture}.png": content for picture, content in images.items()}
     write_together(folder, {**pictures, results.REPORT: text.encode()})
-
-
-def _use_jax() -> None:
-    """Double precision, all cores, and compiled programs kept in the user's cache folder from one run to the next."""
-    import warnings
-
-    import jax
-
-    from fits.problem.compiled import devices_of_cores
-
-    # arviz announces its next version on import; compiled programs that cannot be kept are compiled again
-    warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
-    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
-    jax.config.update("jax_enable_x64", True)
-    devices_of_cores()
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "layerjax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def _measurements(arguments: Namespace) -> Measurements:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from fits.cli.interrupts import raised_again
+from fits.cli.numbers import angle, count, degrees, level, seed
 
 OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
@@ -59,7 +60,17 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     parser.add_argument("--traceback", action="store_true", help="show where an error comes from (for bug reports)")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_fit, _add_sample, _add_report, _add_compare, _add_info, _add_convert, _add_simulate, _add_render):
+    for add in (
+        _add_fit,
+        _add_sample,
+        _add_predict,
+        _add_report,
+        _add_compare,
+        _add_info,
+        _add_convert,
+        _add_simulate,
+        _add_render,
+    ):
         add(commands)
     return parser
 
@@ -74,8 +85,8 @@ def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
     parser.add_argument("--stack", required=True, metavar="TOML", help="the stack, with its free parameters")
     parser.add_argument("--out", required=True, metavar="DIR", help="result directory to write")
-    parser.add_argument("--starts", type=_count, default=32, metavar="N", help="starting points (default: %(default)s)")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
+    parser.add_argument("--starts", type=count, default=32, metavar="N", help="starting points (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
     parser.add_argument(
         "--solver",
         choices=("least_squares", "bounded"),
@@ -88,6 +99,10 @@ def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
         help="what is minimised; all but the likelihood give no posterior (default: the stack file's, or likelihood)",
     )
     _add_reading(parser)
+    _add_only(parser, "fit")
+    parser.add_argument(
+        "--hold-out", nargs="+", default=(), metavar="WHAT", help="leave these readings out, and score their prediction"
+    )
     parser.add_argument("--sample", action="store_true", help="sample the posterior as well (see `layerjax sample`)")
     _add_sampling(parser)
     _add_force(parser, "replace DIR if it holds an earlier result")
@@ -102,8 +117,37 @@ def _add_sample(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
     _add_sampling(parser)
-    parser.add_argument("--seed", type=_seed, metavar="S", help="seed (default: the chain's, or 0)")
+    parser.add_argument("--seed", type=seed, metavar="S", help="seed (default: the chain's, or 0)")
     _add_force(parser, "throw an earlier chain away and start again")
+
+
+def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = _command(
+        commands,
+        "predict",
+        "predict readings elsewhere from a saved result, or score readings",
+        "layerjax predict result --incidence 30,70 --out predicted.csv",
+    )
+    parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
+    parser.add_argument("--incidence", type=degrees, nargs="+", metavar="DEG", help="polar angles of the light")
+    parser.add_argument(
+        "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
+    )
+    parser.add_argument("--at", metavar="FILE", help="in place of --incidence: readings, whose prediction is scored")
+    _add_format(parser)
+    _add_only(parser, "predict")
+    parser.add_argument("--out", metavar="CSV", help="file to write; its name ends in .csv")
+    _add_force(parser, "overwrite the file")
+
+
+def _add_only(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=(),
+        metavar="WHAT",
+        help=f"{what} these readings alone: incidence=10,50  plane=0  angle=-60:60  share=0.2",
+    )
 
 
 def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
@@ -178,9 +222,9 @@ def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument(
         "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
     )
-    parser.add_argument("--noise", type=_level, default=0.0, metavar="REL", help="relative noise (default: none)")
-    parser.add_argument("--floor", type=_level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
+    parser.add_argument("--noise", type=level, default=0.0, metavar="REL", help="relative noise (default: none)")
+    parser.add_argument("--floor", type=level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
     _add_force(parser, "overwrite the file")
 
 
@@ -195,7 +239,7 @@ def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "material", metavar="NAME|TOML", help="a material of the gallery, or a stack (free parameters at their start)"
     )
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
-    parser.add_argument("--size", type=_count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
+    parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
     _add_force(parser, "overwrite the file")
 
 
@@ -209,14 +253,18 @@ def _command(
 
 def _add_reading(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("reading the data")
-    group.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
-    group.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
+    _add_format(group)
     group.add_argument(
-        "--mask-retro", type=_angle, metavar="DEG", help="leave out readings within DEG of retro-reflection"
+        "--mask-retro", type=angle, metavar="DEG", help="leave out readings within DEG of retro-reflection"
     )
     group.add_argument(
-        "--mask-grazing", type=_angle, metavar="DEG", help="leave out readings beyond DEG from the normal"
+        "--mask-grazing", type=angle, metavar="DEG", help="leave out readings beyond DEG from the normal"
     )
+
+
+def _add_format(parser: "argparse._ActionsContainer") -> None:
+    parser.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
+    parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
 
 
 def _add_sampling(parser: argparse.ArgumentParser) -> None:
@@ -225,11 +273,14 @@ def _add_sampling(parser: argparse.ArgumentParser) -> None:
         "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
     )
     group.add_argument(
-        "--walkers", type=_count, metavar="N", help="an even number (default: the chain's, or 32; 4 chains of nuts)"
+        "--walkers",
+        type=count,
+        metavar="N",
+        help="an even number (default: the chain's, or 32; 4 chains of nuts)",
     )
     group.add_argument(
         "--ess",
-        type=_count,
+        type=count,
         metavar="N",
         help="go on until the worst parameter has N effective samples (default: until the chain is long enough)",
     )
@@ -238,7 +289,7 @@ def _add_sampling(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
     )
-    group.add_argument("--max-steps", type=_count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
+    group.add_argument("--max-steps", type=count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
     group.add_argument(
         "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"
     )
@@ -266,35 +317,6 @@ class _Version(argparse.Action):
 
         print(f"layerjax {__version__}")
         parser.exit()
-
-
-def _count(word: str) -> int:
-    return int(_number(word, int, 1, None))
-
-
-def _seed(word: str) -> int:
-    return int(_number(word, int, 0, 2**32 - 1))
-
-
-def _angle(word: str) -> float:
-    return _number(word, float, 0.0, 90.0)
-
-
-def _level(word: str) -> float:
-    return _number(word, float, 0.0, None)
-
-
-def _number(word: str, kind: type[int] | type[float], low: float, high: float | None) -> float:
-    allowed = f"{'a whole number' if kind is int else 'a number'} " + (
-        f">= {low:g}" if high is None else f"in [{low:g}, {high:g}]"
-    )
-    try:
-        value = kind(word)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{word!r} given, must be {allowed}") from None
-    if not low <= value <= (float("inf") if high is None else high) or value == float("inf"):
-        raise argparse.ArgumentTypeError(f"{word} given, must be {allowed}")
-    return value
 
 
 def _one_line(error: Exception) -> str:

@@ -44,22 +44,22 @@ class Descent(NamedTuple):
 
 
 def descend(model: Model, start: Array, fresh: Array, most_steps: Array) -> Descent:
-    """Levenberg-Marquardt from `start` (P,) in the unit box. Not `fresh`: near a minimum, with sigma free at once."""
+    """Levenberg-Marquardt from `start` (P,) in the unit box. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
-    varying = likelihood and model.varying
+    varying = likelihood and bool(model.logarithmic)
     solver = BoxLevenbergMarquardt(atol=PROMISE if likelihood else 0.0)
-    options = {"watch": lambda beside: beside[1], **({"logarithmic": (2,)} if varying else {})}
+    options = {"watch": lambda beside: beside[1], **({"logarithmic": model.logarithmic} if varying else {})}
 
-    def residuals(unit: Array, fixed_sigma: Array) -> Any:
-        return model.linear_parts(model.box.from_unit(unit), fixed_sigma if varying else None)
+    def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
+        return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
 
-    def stage(unit: Array, held: tuple[Array, Array]) -> tuple[Array, Descent]:
-        fixed_sigma, most = held
+    def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
+        *first_step, most = held
         solution: Any = optx.least_squares(
             residuals,
             solver,
             unit,
-            args=fixed_sigma,
+            args=tuple(first_step),
             has_aux=True,
             options={**options, "most_steps": most},
             max_steps=None,
@@ -78,14 +78,19 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array) -> Desc
         )
         return solution.value, found
 
-    sigmas, most = jnp.full((1, 1, 1), jnp.nan), most_steps[None]
-    if varying:  # far from the data, a noise level grows until everything fits: go near it first, with sigma held
+    sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
+    if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
+        sigmas, most, shared = (
+            jnp.stack([sigmas[0]] * 2),
+            jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]),
+            jnp.arange(2.0),
+        )
+    if model.varying:
         parts = model.build(model.box.from_unit(start))
         typical = jnp.mean(jnp.abs(model.values))  # a tenth of it keeps readings near 0 from outweighing all others
         held = total_sigma(jnp.abs(model.values) + 0.1 * typical, model.variance, parts.relative, parts.floor)
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
-        most = jnp.stack([jnp.where(fresh, most_steps, 0), most_steps])
-    _, stages = jax.lax.scan(stage, start, (sigmas, most))
+    _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
     finite = jnp.isfinite(last.cost)
     return last._replace(

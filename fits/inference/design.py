@@ -131,7 +131,7 @@ class Design:
     def build(self, initial: Approximation | Mixture) -> Built:
         """The surrogate of the lowest degree that is found to be good, or the last one of the highest."""
         dimension = len(self.problem.names)
-        residuals = self.problem.count * (2 if self.problem.model.varying else 1)
+        residuals = self.problem.model.rows
         degrees = affordable_degrees(dimension, residuals, POINTS)
         if not degrees:
             return Built(None, f"no surrogate of {dimension} parameters: exact evaluations alone")

@@ -118,13 +118,16 @@ class Fit:
 
     @cached_property
     def residuals(self) -> Floats:
-        """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure."""
-        return np.asarray(self.problem.call(Model.standardised_at, self.vector, self.predicted), float)
+        """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure.
 
-    @property
+        With correlated noise, what is left of it beside the errors that readings share.
+        """
+        return np.asarray(self.problem.call(Model.unshared_at, self.vector, self.predicted), float)
+
+    @cached_property
     def chi_square(self) -> float:
-        """Sum of squared `residuals`; for a named objective this is its value and has no absolute scale."""
-        return float(np.sum(self.residuals**2))
+        """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
+        return float(self.problem.call(Model.chi_square_at, self.vector, self.predicted))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -141,7 +144,7 @@ class Fit:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
         if not self.is_posterior:
             return float("nan")
-        return float(np.sum(self.problem.call(Model.log_likelihood_per_datum_at, self.vector, self.predicted)))
+        return float(self.problem.call(Model.log_likelihood_at, self.vector, self.predicted))
 
     @property
     def correlation(self) -> Floats:

@@ -65,5 +65,5 @@ def _excess(problem: Problem, lowest: End, predicted: Floats) -> float:
     freedom = problem.count - len(lowest.vector)
     if problem.objective != "likelihood":
         return 2.0 * lowest.cost / max(freedom, 1)
-    residuals = np.asarray(problem.call(Model.standardised_at, lowest.vector, predicted), float)
-    return max(1.0, float(np.sum(residuals**2)) / freedom if freedom > 0 else 1.0)
+    chi_square = float(problem.call(Model.chi_square_at, lowest.vector, predicted))
+    return max(1.0, chi_square / freedom if freedom > 0 else 1.0)

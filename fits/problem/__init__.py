@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fits._lazy import names_from
 
 if TYPE_CHECKING:
+    from fits.problem.correlated import Correlated as Correlated
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Problem": "problem",
+    "Correlated": "correlated",
     "Noise": "likelihood",
     "Free": "parameters",
     "Uniform": "parameters",

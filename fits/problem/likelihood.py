@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import gammaln
 
+from fits.problem.correlated import Correlated
 from fits.problem.parameters import Free
 from fits.problem.values import shown
 
@@ -37,6 +38,8 @@ class Noise:
     use_sigma: take the measurement's own sigma where it has one.
     tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
     then sigma.
+    correlated: errors of the model that neighbouring readings share, beside those: `Correlated`, or True for one whose
+    numbers are all free; only with Gaussian tails.
     Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
@@ -47,6 +50,7 @@ class Noise:
     use_sigma: bool = True
     tails: Tails = "gaussian"
     degrees_of_freedom: float = 4.0
+    correlated: Correlated | bool = False
 
     def __post_init__(self) -> None:
         for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
@@ -61,6 +65,12 @@ class Noise:
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
+        if self.correlated is True:
+            object.__setattr__(self, "correlated", Correlated())
+        if not (self.correlated is False or isinstance(self.correlated, Correlated)):
+            raise ValueError(f"Noise.correlated is {shown(self.correlated)}; it must be true, false or Correlated")
+        if self.correlated and self.tails != "gaussian":
+            raise ValueError(f"Noise.tails is {self.tails!r}; with correlated noise it must be gaussian")
 
 
 def _check_range(field: str, value: Any, low: float, high: float) -> None:
@@ -92,7 +102,12 @@ def tail_residual(z: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
 
 def sigma_residual(sigma: Array, lowest: Array) -> Array:
     """Residual whose half square is log(sigma / lowest) + 1/2; at least 1, so that its slope is finite."""
-    return jnp.sqrt(1.0 + 2.0 * jnp.log(jnp.maximum(sigma / lowest, 1.0)))
+    return level_residual(jnp.log(jnp.maximum(sigma / lowest, 1.0)))
+
+
+def level_residual(level: Array) -> Array:
+    """Residual whose half square is a level + 1/2, which is at least 0."""
+    return jnp.sqrt(1.0 + 2.0 * level)
 
 
 def information_weights(tails: Tails, degrees_of_freedom: Array) -> tuple[Array, Array]:

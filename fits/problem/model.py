@@ -4,6 +4,7 @@
 structure and shape: new data, bounds or fixed numbers do not recompile.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, cast
 
@@ -19,6 +20,7 @@ from fits.problem.likelihood import (
     Objective,
     Tails,
     information_weights,
+    level_residual,
     log_density,
     named_residual,
     sigma_residual,
@@ -26,6 +28,7 @@ from fits.problem.likelihood import (
     total_sigma,
 )
 from fits.problem.parameters import Box, Template
+from fits.problem.process import Correlation, Places, Process, Whitened
 from layerjax._shapes import require_single
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
@@ -40,12 +43,16 @@ Side = Literal["all", "reflection"]
 
 
 class Parts(NamedTuple):
-    """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model."""
+    """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
+
+    correlation: of errors that readings share, None where they share none.
+    """
 
     stack: Any
     scale: Array
     relative: Array
     floor: Array
+    correlation: Correlation | None
 
 
 class Model(eqx.Module):
@@ -64,6 +71,7 @@ class Model(eqx.Module):
         transport: how the values are computed.
         side: "reflection" if all directions lie above.
         known: what is known of the directions beforehand.
+        process: errors that readings share, None where they share none.
         objective, tails: see `Problem` and `Noise`.
         varying: whether sigma depends on the parameters.
     """
@@ -78,6 +86,7 @@ class Model(eqx.Module):
     degrees_of_freedom: Array
     transport: Transport
     known: lj.KnownDirections | None
+    process: Process | None
     side: Side = eqx.field(static=True)
     objective: Objective = eqx.field(static=True)
     tails: Tails = eqx.field(static=True)
@@ -108,45 +117,109 @@ class Model(eqx.Module):
             return -self._named(predicted)
         return (self.values - predicted) / self.sigma_at(vector, predicted)
 
+    def unshared_at(self, vector: Array, predicted: Array) -> Array:
+        """`standardised_at`, without the errors that readings share as far as the data tell them."""
+        if self.process is None:
+            return self.standardised_at(vector, predicted)
+        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
+        return -self.process.by_reading(found.residuals, len(self.values))
+
+    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
+        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 where readings share no errors."""
+        if self.process is None:
+            return jnp.sum(self.standardised_at(vector, predicted) ** 2)
+        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
+        return jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
+
+    def whitened_at(self, vector: Array, predicted: Array, sigma: Array, shared: Array | float = 1.0) -> Whitened:
+        """Residuals without what they share, with these parameters, what they predict and the scale of the noise.
+
+        shared: what the amplitude of that is multiplied by.
+        """
+        at = self._correlation(vector)
+        assert self.process is not None
+        at = at._replace(amplitude=shared * at.amplitude)
+        return self.process.whitened((predicted - self.values) / sigma, predicted / sigma, at)
+
+    def lack_at(self, vector: Array, places: Places) -> tuple[Array, Array]:
+        """What the model lacks elsewhere relative to its value, as far as the data say: mean and sd, (M, C)."""
+        predicted = self.predict(vector)
+        at = self._correlation(vector)
+        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
+        assert self.process is not None
+        return self.process.elsewhere(found, places, at, self.values.shape[-1])
+
+    @property
+    def logarithmic(self) -> tuple[int, ...]:
+        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
+        return tuple(range(2, 2 + self.varying + (self.process is not None)))
+
+    @property
+    def rows(self) -> int:
+        """Number of `residuals` without those of the prior."""
+        own = self.values.size * (1 + self.varying)
+        return own if self.process is None else own + self.process.rows_beside(self.values.shape[-1])
+
     def cost_at(self, vector: Array, predicted: Array) -> Array:
         """Half the sum of squared residuals with these parameters and what they predict, (N, C)."""
         return half_squares(self._residuals(vector, predicted, self.sigma_at(vector, predicted)))
 
-    def residuals(self, vector: Array, fixed_sigma: Array | None = None) -> tuple[Array, ...]:
+    def residuals(self, vector: Array) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
 
-        The third of them, where sigma varies with the parameters, is that of log sigma. `fixed_sigma` (N, C), where it
-        is finite, replaces sigma: the first step towards a fit of noise levels.
+        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
+        `logarithmic`).
         """
-        return self.linear_parts(vector, fixed_sigma)[0]
+        return self.linear_parts(vector)[0]
 
     def linear_parts(
-        self, vector: Array, fixed_sigma: Array | None = None
+        self, vector: Array, first_step: tuple[Array, Array] | None = None
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """See `residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
 
         The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
+
+        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
+        and how much of the errors that readings share counts.
         """
         predicted = self.predict(vector)
         sigma = self.sigma_at(vector, predicted)
-        rows = self._information_rows(predicted, sigma)
-        if fixed_sigma is not None:
+        rows = self._information_rows(vector, predicted, sigma)
+        shared: Array | float = 1.0
+        if first_step is not None:
+            fixed_sigma, shared = first_step
             sigma = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma)
-        return self._residuals(vector, predicted, sigma), (predicted, rows)
+        return self._residuals(vector, predicted, sigma, shared), (predicted, rows)
 
     def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """Normalised log-density of each datum, (N, C)."""
+        """Normalised log-density of each datum, (N, C); where readings share errors, given all others."""
         return self.log_likelihood_per_datum_at(vector, self.predict(vector))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-density of each datum, (N, C), from the values (N, C) that the parameters predict."""
+        """`log_likelihood_per_datum`, (N, C), from the values (N, C) that the parameters predict."""
         sigma = self.sigma_at(vector, predicted)
-        return log_density((self.values - predicted) / sigma, sigma, self.tails, self.degrees_of_freedom)
+        z = (self.values - predicted) / sigma
+        if self.process is None:
+            return log_density(z, sigma, self.tails, self.degrees_of_freedom)
+        found = self.whitened_at(vector, predicted, sigma)
+        own, precision = self.process.given_others(found, predicted / sigma, self._correlation(vector))
+        width = sigma / jnp.sqrt(precision)
+        return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
     def log_likelihood(self, vector: Array) -> Array:
-        """Normalised log-likelihood: the sum of the log-densities of all data."""
-        return jnp.sum(self.log_likelihood_per_datum(vector))
+        """Normalised log-likelihood of all data."""
+        return self.log_likelihood_at(vector, self.predict(vector))
+
+    def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
+        """Normalised log-likelihood of all data, from the values (N, C) that the parameters predict."""
+        if self.process is None:
+            return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
+        sigma = self.sigma_at(vector, predicted)
+        found = self.whitened_at(vector, predicted, sigma)
+        squares = jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
+        levels = jnp.sum(found.levels) + jnp.sum(jnp.log(sigma))
+        return -0.5 * squares - levels - 0.5 * self.values.size * math.log(2.0 * math.pi)
 
     def log_prior(self, vector: Array) -> Array:
         """Log-density of the physical vector, -inf outside the bounds."""
@@ -162,23 +235,39 @@ class Model(eqx.Module):
         assert self.objective != "likelihood"
         return named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:]))
 
-    def _residuals(self, vector: Array, predicted: Array, sigma: Array) -> tuple[Array, ...]:
+    def _correlation(self, vector: Array) -> Correlation:
+        at = self.build(vector).correlation
+        assert at is not None
+        return at
+
+    def _residuals(
+        self, vector: Array, predicted: Array, sigma: Array, shared: Array | float = 1.0
+    ) -> tuple[Array, ...]:
         if self.objective != "likelihood":
             return (self._named(predicted),)
-        z = (predicted - self.values) / sigma
-        parts = [tail_residual(z, self.tails, self.degrees_of_freedom), self.box.prior_residuals(vector)]
-        if self.varying:
-            parts.append(sigma_residual(sigma, self.lowest))
-        return tuple(parts)
+        levels = [sigma_residual(sigma, self.lowest)] if self.varying else []
+        if self.process is None:
+            data = tail_residual((predicted - self.values) / sigma, self.tails, self.degrees_of_freedom)
+        else:
+            found = self.whitened_at(vector, predicted, sigma, shared)
+            data = jnp.concatenate([found.residuals.reshape(-1), found.latent])
+            levels.append(level_residual(found.levels))
+        return (data, self.box.prior_residuals(vector), *levels)
 
-    def _information_rows(self, predicted: Array, sigma: Array) -> Array:
+    def _information_rows(self, vector: Array, predicted: Array, sigma: Array) -> Array:
         if self.objective != "likelihood":
             return self._named(predicted).reshape(-1)
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
-        rows = jnp.sqrt(of_mean) * (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
-        if self.varying:
-            rows = jnp.concatenate([rows, jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)])
-        return rows
+        of_data = predicted / jax.lax.stop_gradient(sigma)
+        levels = [jnp.log(sigma).reshape(-1)] if self.varying else []
+        if self.process is None:
+            rows = of_data.reshape(-1)
+        else:
+            at, relative = jax.lax.stop_gradient((self._correlation(vector), predicted / sigma))
+            found = self.process.whitened(of_data, relative, at)
+            rows = jnp.concatenate([found.residuals.reshape(-1), found.latent])
+            levels.append(self.whitened_at(vector, predicted, sigma).levels)
+        return jnp.concatenate([jnp.sqrt(of_mean) * rows, *(jnp.sqrt(of_level) * level for level in levels)])
 
 
 def half_squares(residuals: tuple[Array, ...]) -> Array:

@@ -6,7 +6,7 @@
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, get_args
 
@@ -20,9 +20,11 @@ from numpy.typing import ArrayLike, NDArray
 import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.problem.compiled import Static, run
+from fits.problem.correlated import Correlated, numbers_of
 from fits.problem.likelihood import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise, Objective
-from fits.problem.model import Model, Parts, Transport
+from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
+from fits.problem.process import Process, make_process
 from layerjax.stack import with_known
 
 Floats = NDArray[np.float64]
@@ -109,6 +111,19 @@ class Problem:
         """Scaled BSDF of the used samples, (N, C), in 1/sr."""
         return self.call(Model.predict, vector)
 
+    def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
+        """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
+        wi, wo = np.asarray(wi, float), np.asarray(wo, float)
+        model = replace(
+            self.model,
+            wi=jnp.asarray(wi),
+            wo=jnp.asarray(wo),
+            known=lj.known_directions(wi, wo) if _uses_known(self.transport) else None,
+            side=_side(wi, wo),
+        )
+        arrays, static = eqx.partition(model, eqx.is_array)
+        return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
+
     def residuals(self, vector: ArrayLike) -> Array:
         """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
         return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
@@ -175,14 +190,15 @@ def _assemble(problem: Problem) -> _Assembled:
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
     levels = _noise_levels(problem.noise, used)
-    template, names, free = split(_numbers(problem, levels), _parameter_name)
+    process = make_process(used) if problem.noise.correlated else None
+    template, names, free = split(_numbers(problem, levels, process), _parameter_name)
     if not names:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
     if problem.objective == "likelihood":
         _require_noise(levels)
     else:
-        _refuse_likelihood_only(problem.objective, levels, free)
-    model = _model(problem, used, levels, template, Box.of(free))
+        _refuse_likelihood_only(problem, levels, free)
+    model = _model(problem, used, levels, template, Box.of(free), process)
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
     _require_same_channels(model, start, used)
     return _Assembled(names, start, low, high, model)
@@ -208,17 +224,22 @@ def _noise_levels(noise: Noise, used: Measurements) -> _Levels:
     return _Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
 
 
-def _numbers(problem: Problem, levels: _Levels) -> tuple[Any, ...]:
+def _numbers(problem: Problem, levels: _Levels, process: Process | None) -> tuple[Any, ...]:
     """All that a parameter may stand for, in the order of `Parts`."""
     # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
     stack = with_known(problem.stack) if isinstance(problem.stack, lj.Stack) else problem.stack
     scale = 1.0 if problem.scale is None else problem.scale
-    return (stack, *(x if is_free(x) else jnp.asarray(x) for x in (scale, levels.relative, levels.floor)))
+    correlation = None
+    if process is not None:
+        assert isinstance(problem.noise.correlated, Correlated)
+        correlation = numbers_of(problem.noise.correlated, process, problem.data.values.shape[1])
+    rest = (scale, levels.relative, levels.floor, correlation)
+    return (stack, *jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free))
 
 
 def _parameter_name(path: str) -> str:
     """The name of a place in the tuple that `_numbers` returns."""
-    for index, name in enumerate(("", "scale", "noise.relative", "noise.floor")):
+    for index, name in enumerate(("", "scale", "noise.relative", "noise.floor", "noise.correlated")):
         if path.startswith(f"[{index}]"):
             return (name + path.removeprefix(f"[{index}]")).lstrip(".")
     return path
@@ -229,8 +250,11 @@ def _require_noise(levels: _Levels) -> None:
         raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
 
 
-def _refuse_likelihood_only(objective: str, levels: _Levels, free: tuple[Free, ...]) -> None:
+def _refuse_likelihood_only(problem: Problem, levels: _Levels, free: tuple[Free, ...]) -> None:
+    objective = problem.objective
     fitted = [name for name in ("relative", "floor") if is_free(getattr(levels, name))]
+    if problem.noise.correlated:
+        raise ValueError(f"noise.correlated stands beside objective {objective!r}, which has no noise model")
     if fitted:
         raise ValueError(f"noise.{fitted[0]} is free, but objective {objective!r} has no noise model")
     weighted = [entry.prior for entry in free if isinstance(entry.prior, Normal | LogNormal)]
@@ -238,8 +262,9 @@ def _refuse_likelihood_only(objective: str, levels: _Levels, free: tuple[Free, .
         raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; leave it out")
 
 
-def _model(problem: Problem, used: Measurements, levels: _Levels, template: Template, box: Box) -> Model:
-    above = bool(np.all(used.wi[:, 2] > 0) and np.all(used.wo[:, 2] > 0))
+def _model(
+    problem: Problem, used: Measurements, levels: _Levels, template: Template, box: Box, process: Process | None
+) -> Model:
     return Model(
         template=template,
         box=box,
@@ -251,11 +276,20 @@ def _model(problem: Problem, used: Measurements, levels: _Levels, template: Temp
         degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
         transport=problem.transport,
         known=lj.known_directions(used.wi, used.wo) if _uses_known(problem.transport) else None,
-        side="reflection" if above else "all",
+        process=process,
+        side=_side(used.wi, used.wo),
         objective=problem.objective,
         tails=problem.noise.tails,
         varying=levels.varying,
     )
+
+
+def _side(wi: Floats, wo: Floats) -> Side:
+    return "reflection" if np.all(wi[:, 2] > 0) and np.all(wo[:, 2] > 0) else "all"
+
+
+def _over_vectors(model: Model, vectors: Array) -> Array:
+    return jax.lax.map(model.predict, vectors)
 
 
 def _uses_known(transport: Any) -> bool:
@@ -276,4 +310,6 @@ def _lowest(level: float | Free) -> float:
 def _unit(name: str) -> str:
     if name == "noise.floor":
         return "1/sr"
+    if name.startswith("noise.correlated.") and not name.endswith((".amplitude", ".channels")):
+        return "deg"
     return "optical depth" if re.sub(r"\[\d+\]$", "", name).endswith("thickness") else "1"

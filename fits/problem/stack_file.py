@@ -14,7 +14,8 @@
     kind = "Lambertian"
     albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
 
-    [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom
+    [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom,
+                                               # correlated: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
 Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
@@ -33,6 +34,7 @@ import tomli_w
 
 import layerjax as lj
 from fits._files import write_text
+from fits.problem.correlated import Correlated
 from fits.problem.likelihood import LEVELS, Noise, Objective
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
 from fits.problem.values import (
@@ -62,6 +64,7 @@ _TRANSPORTS: _Kinds = {
     if inspect.isclass(kind) and issubclass(kind, lj.Transport) and not inspect.isabstract(kind)
 }
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
+SHARED = "correlated"
 _FREE_KEYS = ("start", "low", "high", "prior")
 
 
@@ -258,11 +261,24 @@ def _noise(table: Any) -> Noise:
     table = require_table("noise", table)
     hints = get_type_hints(Noise)
     check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
-    given = {key: _value(f"noise.{key}", value, hints[key], f"Noise.{key}") for key, value in table.items()}
+    given: dict[str, Any] = {
+        key: _correlated(value) if key == SHARED else _value(f"noise.{key}", value, hints[key], f"Noise.{key}")
+        for key, value in table.items()
+    }
     try:
         return Noise(**given)
     except ValueError as error:
         raise ValueError(str(error).replace("Noise.", "noise.")) from None
+
+
+def _correlated(value: Any) -> Correlated | bool:
+    where = f"noise.{SHARED}"
+    if isinstance(value, bool):
+        return value
+    names = tuple(entry.name for entry in fields(Correlated))
+    check_keys(where, require_table(where, value), names)
+    given: dict[str, Any] = {key: _number_or_free(f"{where}.{key}", entry, ANY) for key, entry in value.items()}
+    return Correlated(**given)
 
 
 def _about(table: Any) -> dict[str, str]:
@@ -311,6 +327,9 @@ def _to_plain(value: Any) -> Any:
         return value
     if isinstance(value, lj.PhaseFunction | Prior):
         return _module_to_dict(value)
+    if isinstance(value, Correlated):
+        table = {entry.name: getattr(value, entry.name) for entry in fields(value)}
+        return {name: _to_plain(entry) for name, entry in table.items() if entry is not None} or True
     array = np.asarray(value)
     if array.dtype.kind == "i":
         return array.tolist()

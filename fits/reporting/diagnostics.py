@@ -1,4 +1,4 @@
-"""How a set of measurements is laid out in angle, and what structure the residuals of a fit have left along it.
+"""What structure the residuals of a fit have left along the angles of its measurements.
 
 White residuals are what the error bars assume. Here is the evidence: per incidence their mean and size, and over all of
 them the correlation of neighbours in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
@@ -9,76 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.data.geometry import LIGHT_AZIMUTH
+from fits.data.scans import incidences, scans
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
     from fits.inference.fit_result import Fit
-
-SAME_ANGLE = 0.5  # degrees: closer incidences are one incidence, closer azimuths one plane
-AT_NORMAL = 1e-6  # degrees from the normal below which a direction has no azimuth
-SHORTEST_TRACK = 5  # points in one plane before neighbours in it mean anything
-
-
-@dataclass(frozen=True)
-class Incidence:
-    """One direction of the light: its angles in degrees and the rows of the measurements that have it."""
-
-    theta: float
-    phi: float
-    rows: np.ndarray
-
-    @property
-    def label(self) -> str:
-        return f"θᵢ = {self.theta:g}°"
-
-
-def incidences(data: "Measurements") -> list[Incidence]:
-    """The distinct incident directions, by polar angle then azimuth; rows within `SAME_ANGLE` count as the same."""
-    # Angles come back from unit vectors: rounding first keeps a value that sits between two bins in one of them.
-    theta, phi = np.round(data.theta_i, 6), np.round(data.phi_i, 6) % 360.0
-    phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, phi)
-    keys = np.stack([np.round(theta / SAME_ANGLE), np.round(phi / SAME_ANGLE) % round(360 / SAME_ANGLE)], axis=-1)
-    unique, which = np.unique(keys, axis=0, return_inverse=True)
-    groups = [np.flatnonzero(which.ravel() == index) for index in range(len(unique))]
-    return [Incidence(_tidy(theta[rows]), _tidy(phi[rows]), rows) for rows in groups]
-
-
-def relative_azimuth(data: "Measurements") -> np.ndarray:
-    """Azimuth of the viewer seen from the mirror side, (N,) degrees in (-180, 180]: 0 is forward, 180 backward.
-
-    Light along the normal has no azimuth of its own: it counts as standing at `LIGHT_AZIMUTH`.
-    """
-    phi_i = np.where(data.theta_i < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
-    return 180.0 - (phi_i - data.phi_o) % 360.0
-
-
-def signed_angle(data: "Measurements") -> np.ndarray:
-    """Polar angle of the viewer, (N,) degrees, positive on the forward side of its own plane and negative behind."""
-    side = np.where(np.abs(relative_azimuth(data)) <= 90.0, 1.0, -1.0)
-    return side * data.theta_o
-
-
-def in_plane(data: "Measurements") -> np.ndarray:
-    """(N,) bool: the viewer lies in the plane of incidence, or the light in that of the viewer, to `SAME_ANGLE`."""
-    light, viewer = np.sin(np.radians(data.theta_i)), np.sin(np.radians(data.theta_o))
-    # near the normal the azimuth of the light hardly matters; on it, it counts as `relative_azimuth` says
-    arm = np.where(light < np.sin(np.radians(AT_NORMAL)), viewer, np.minimum(light, viewer))
-    off_plane = np.abs(np.sin(np.radians(relative_azimuth(data)))) * arm
-    return off_plane < np.sin(np.radians(SAME_ANGLE))
-
-
-def tracks(data: "Measurements") -> list[np.ndarray]:
-    """Rows in the order of the angle, one array per incidence and plane: neighbours in it are neighbours in angle."""
-    angle, azimuth = signed_angle(data), relative_azimuth(data) % 180.0
-    plane = np.where(in_plane(data), 0, np.round(azimuth / SAME_ANGLE).astype(int) % round(180 / SAME_ANGLE))
-    ordered = []
-    for incidence in incidences(data):
-        for index in np.unique(plane[incidence.rows]):
-            rows = incidence.rows[plane[incidence.rows] == index]
-            if len(rows) >= SHORTEST_TRACK:
-                ordered.append(rows[np.argsort(angle[rows], kind="stable")])
-    return ordered
 
 
 @dataclass(frozen=True)
@@ -185,7 +120,7 @@ def autocorrelation(data: "Measurements", residuals: np.ndarray, longest: int = 
 def _neighbours(data: "Measurements", residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
     # The mean is not subtracted: a bias over a stretch of angle is structure too.
     pairs = []
-    for rows in tracks(data):
+    for rows in scans(data):
         track = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
         if len(track) > lag:
             pairs.append((track[:-lag].ravel(), track[lag:].ravel()))
@@ -196,7 +131,3 @@ def _neighbours(data: "Measurements", residuals: np.ndarray, lag: int = 1) -> tu
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _tidy(angles: np.ndarray) -> float:
-    return round(float(np.mean(angles)), 2)

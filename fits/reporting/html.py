@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from fits._files import write_text
 from fits.data.measurements import Measurements
+from fits.data.scans import incidences
 from fits.reporting import tables, verdicts
-from fits.reporting.diagnostics import ResidualStructure, incidences, residual_label, residual_structure, standardised
+from fits.reporting.diagnostics import ResidualStructure, residual_label, residual_structure, standardised
 from fits.reporting.plots import data as pictures
 from fits.reporting.plots import model as model_pictures
 from fits.reporting.plots import parameters as parameter_pictures

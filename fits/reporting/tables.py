@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from fits.reporting.diagnostics import ResidualStructure, in_plane, incidences
+from fits.data.scans import in_plane, incidences
+from fits.reporting.diagnostics import ResidualStructure
 from fits.reporting.verdicts import identifiability
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import numpy as np
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
 from fits.inference.resolution import ENOUGH
+from fits.problem.model import Model
 from fits.reporting.diagnostics import ResidualStructure
 
 if TYPE_CHECKING:
@@ -61,8 +62,9 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
         ]
     ratio, freedom = fit.reduced_chi_square, fit.degrees_of_freedom
     sentences = [
+        *shared_errors(fit),
         f"Chi-square per degree of freedom is {ratio:.3g} ({fit.chi_square:.5g} over {freedom}); the right model with "
-        f"the right noise gives 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}."
+        f"the right noise gives 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}.",
     ]
     if _excess(fit) > MISFIT_SIGMAS:
         sentences.append(
@@ -94,6 +96,8 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
+    if fit.problem.model.process is not None:
+        sentences += shared_errors(fit)
     if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     if fit.at_bound:
@@ -109,11 +113,28 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
     return ["The model explains the data to within its noise, and the data resolve every parameter."], True
 
 
+def shared_errors(fit: "Fit") -> list[str]:
+    """How large the errors of the model are that neighbouring readings share, and how far they reach; none, nothing."""
+    process, at = fit.problem.model.process, fit.problem.build(fit.vector).correlation
+    if process is None or at is None:
+        return []
+    scatter = float(np.sum(np.square(fit.problem.call(Model.standardised_at, fit.vector, fit.predicted))))
+    share = 1.0 - float(np.sum(fit.residuals**2)) / scatter if scatter > 0.0 else 0.0
+    reach = [f"{float(at.angle):.2g} degrees along a scan"]
+    reach += [f"{float(at.incidence):.2g} between incidences"] if process.several_incidences else []
+    reach += [f"{float(at.azimuth):.2g} between planes"] if process.several_planes else []
+    return [
+        f"Neighbouring readings share errors of the model of {100.0 * float(at.amplitude):.2g} % of its value, alike "
+        f"over {listed(reach)}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
+        "bands of predictions, count them."
+    ]
+
+
 def outcome(fit: "Fit") -> list[str]:
     """A few lines for the terminal: how good, how sure, how it ended, and what the data leave open."""
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     sure = f"best minimum reached by {fit.minima[0].count} starts, alternatives as good: {len(fit.alternatives)}"
-    lines = [f"{good}; {sure}", f"Status: {fit.status}"]
+    lines = [f"{good}; {sure}", f"Status: {fit.status}", *shared_errors(fit)]
     if fit.unresolved:
         first, more = fit.unresolved[0], len(fit.unresolved) - 1
         lines.append(f"{_not_separated(first)}{f' ({more} more)' if more else ''}: see the table in the report.")
@@ -131,6 +152,8 @@ def noise_in_words(problem: "Problem") -> str:
             parts.append(f"a fitted {level} part")
         elif value > 0.0:
             parts.append(f"{value:.3g} {unit}")
+    if noise.correlated:
+        parts.append("errors that neighbouring readings share")
     tails = (
         "Gaussian" if noise.tails == "gaussian" else f"Student-t with {noise.degrees_of_freedom:g} degrees of freedom"
     )

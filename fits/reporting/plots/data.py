@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
-from fits.reporting.diagnostics import Incidence, in_plane, incidences, relative_azimuth, signed_angle
+from fits.data.scans import Incidence, in_plane, incidences, relative_azimuth, signed_angle
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements

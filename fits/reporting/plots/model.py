@@ -10,15 +10,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from fits.data.geometry import Floats, direction
-from fits.reporting.diagnostics import (
-    Incidence,
-    in_plane,
-    incidences,
-    over_all_rows,
-    residual_label,
-    signed_angle,
-    standardised,
-)
+from fits.data.scans import Incidence, in_plane, incidences, signed_angle
+from fits.reporting.diagnostics import over_all_rows, residual_label, standardised
 from fits.reporting.plots.data import (
     ANGLE_LABEL,
     CYCLE,

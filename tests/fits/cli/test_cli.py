@@ -20,24 +20,13 @@ from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.problem.problem import Problem
 from fits.reporting.results import load_fit, load_posterior, save_fit
+from tests.helpers.commands import refused
 from tests.helpers.files import contents
 from tests.helpers.places import ROOT
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6  # of the stack behind coat_data
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf\n"
 ROWS = "10,180,20,0,0.1\n10,180,30,0,0.1\n10,180,40,0,0.1\n"
-
-
-def refused(words: list[str], capsys: pytest.CaptureFixture[str], folder: Path) -> str:
-    """The one line on stderr of a command that must fail and leave the folder as it was."""
-    before = contents(folder)
-    assert main(words) == 2
-    output = capsys.readouterr()
-    assert output.out == ""
-    assert contents(folder) == before
-    assert output.err.startswith("layerjax: error: ")
-    assert output.err.count("\n") == 1
-    return output.err
 
 
 BAD_DATA = {

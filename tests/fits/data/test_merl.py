@@ -11,9 +11,9 @@ from fits.data.formats import read
 from fits.data.formats.merl import half_difference
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.measurements import Measurements
+from fits.data.scans import in_plane, incidences, relative_azimuth
 from fits.inference.optimise import fit
 from fits.problem.parameters import Free
-from fits.reporting.diagnostics import in_plane, incidences, relative_azimuth
 
 SHAPE = (90, 90, 180)
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500

@@ -9,6 +9,7 @@ import pytest
 import layerjax as lj
 from fits._files import read_json, write_json
 from fits.data.geometry import slices
+from fits.data.scans import incidences, signed_angle
 from fits.inference import refinement
 from fits.inference import resolution as resolution_module
 from fits.inference import starts as starts_module
@@ -20,7 +21,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reporting import results, verdicts
-from fits.reporting.diagnostics import incidences, residual_structure, signed_angle, standardised
+from fits.reporting.diagnostics import residual_structure, standardised
 from fits.reporting.html import page
 from fits.reporting.plots.model import curves_picture
 from tests.helpers.models import LINE, TRUTH, line, line_data

@@ -1,0 +1,86 @@
+"""Readings that a fit has not seen: left out of it, foretold, and scored."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits._files import write_text
+from fits.cli.places import require_free_place
+from fits.cli.setting import use_jax
+from fits.data.formats import read
+from fits.data.geometry import Geometry, slices
+from fits.data.measurements import Measurements
+from fits.data.selection import select
+
+if TYPE_CHECKING:
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+
+DONE = 0
+
+
+def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Measurements | None]:
+    """What is fitted, and what is held out; None if nothing is."""
+    keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
+    for words in arguments.only:
+        keep &= select(data, words)
+    for words in arguments.hold_out:
+        held |= select(data, words)
+    fitted = data.where(keep & ~held)
+    if not fitted.mask.any():
+        raise ValueError("--only and --hold-out leave nothing to fit")
+    for name, given in (("only", arguments.only), ("held out", arguments.hold_out)):
+        fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
+    if not arguments.hold_out:
+        return fitted, None
+    unseen = data.where(keep & held)
+    if not unseen.mask.any():
+        raise ValueError("--hold-out leaves nothing to score: what it holds out is masked, or not among --only")
+    return fitted, unseen
+
+
+def print_scores(result: "Fit | Posterior", readings: Measurements, title: str) -> None:
+    from fits.inference.prediction import predict as run_prediction
+    from fits.reporting import tables
+    from fits.reporting.predictions import scores_table
+
+    tables.print_table(scores_table(run_prediction(result, readings), readings, title), sys.stdout)
+
+
+def predict(arguments: Namespace) -> int:
+    """Write what would be read elsewhere, or print how well readings are foretold."""
+    if (arguments.incidence is None) == (arguments.at is None):
+        raise ValueError("predict needs one of --incidence and --at")
+    if arguments.at is None and arguments.out is None:
+        raise ValueError("predict --incidence needs --out FILE")
+    if arguments.out is not None:
+        require_free_place(arguments, ".csv", "predictions")
+    use_jax()
+    from fits.inference.prediction import predict as run_prediction
+    from fits.reporting import results, verdicts
+    from fits.reporting.predictions import prediction_csv
+
+    directory = Path(arguments.directory)
+    posterior = results.load_posterior(directory)
+    of = posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
+    if arguments.at is None:
+        at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth)
+    else:
+        at = readings = _predicted_readings(arguments)
+        print_scores(of, readings, f"Readings of {arguments.at}")
+    if arguments.out is not None:
+        write_text(arguments.out, prediction_csv(run_prediction(of, at)), force=arguments.force)
+        print(f"{arguments.out}: predictions in 1/sr")
+    return DONE
+
+
+def _predicted_readings(arguments: Namespace) -> Measurements:
+    data = read(arguments.at, format=arguments.format, quantity=arguments.quantity)
+    for words in arguments.only:
+        data = data.where(select(data, words))
+    if not data.mask.any():
+        raise ValueError(f"{arguments.at}: --only leaves nothing to predict")
+    return data

@@ -1,0 +1,236 @@
+"""What readings elsewhere will be: the model with its uncertainty, what it lacks, and the noise of a reading."""
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.special import logsumexp
+
+from fits.data.geometry import Geometry
+from fits.data.measurements import Measurements, Source
+from fits.inference.fit_result import Fit
+from fits.inference.laplace import Approximation
+from fits.inference.posterior import Posterior
+from fits.problem.model import Model
+from fits.problem.process import Places, places_of
+
+DRAWS = 256
+"""Vectors of parameters that a prediction is made with."""
+
+BESIDE = 8
+"""Readings that are drawn for each of them."""
+
+LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """What is expected of M values in C channels, in 1/sr: mean and sd, (M, C), and quantiles, (levels, M, C)."""
+
+    mean: Floats
+    sd: Floats
+    quantiles: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Of M pairs of directions in C channels.
+
+    Attributes:
+        wi, wo: directions, (M, 3).
+        channels: their names.
+        levels: of the quantiles.
+        model: of the stack's own value.
+        reading: of a new reading: that with what the model lacks, and with noise.
+        means, scales: of a reading with each of D vectors of parameters, (D, M, C), in 1/sr; given these it is
+            Gaussian, or has Student-t tails.
+        degrees_of_freedom: of these tails; infinite if it is Gaussian.
+    """
+
+    wi: Floats
+    wo: Floats
+    channels: tuple[str, ...]
+    levels: tuple[float, ...]
+    model: Band
+    reading: Band
+    means: Floats
+    scales: Floats
+    degrees_of_freedom: float
+
+    def log_density(self, values: Floats) -> Floats:
+        """Log-density of readings (M, C), each by itself."""
+        density = self._tails.logpdf((values - self.means) / self.scales) - np.log(self.scales)
+        return logsumexp(density, axis=0) - math.log(len(density))
+
+    def rank(self, values: Floats) -> Floats:
+        """Probability of a reading below each of these, (M, C)."""
+        return self._tails.cdf((values - self.means) / self.scales).mean(axis=0)
+
+    @property
+    def _tails(self) -> "stats.rv_frozen":
+        return stats.norm() if math.isinf(self.degrees_of_freedom) else stats.t(self.degrees_of_freedom)
+
+
+def predict(
+    of: Fit | Posterior,
+    at: Geometry | Measurements,
+    *,
+    levels: tuple[float, ...] = LEVELS,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """What the fitted stack is expected to reflect, and what would be read.
+
+    Args:
+        of: a fit, whose parameters are drawn from the approximation of its posterior by a Student-t, or a posterior.
+        at: pairs of directions, above or below; of `Measurements` their used samples, with their own sigma.
+        levels: of the quantiles, in (0, 1).
+        draws: vectors of parameters, at least 2.
+        seed: of these, and of the noise.
+
+    Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
+
+    Raises:
+        ValueError: a level or number of draws out of range, a fit of a named objective, or directions that the
+            transport cannot answer.
+    """
+    fit = of.fit if isinstance(of, Posterior) else of
+    if not fit.is_posterior:
+        raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
+    if not all(0.0 < level < 1.0 for level in levels):
+        raise ValueError(f"levels is {levels}; they must be in (0, 1)")
+    if draws < 2:
+        raise ValueError(f"draws is {draws}; it must be at least 2")
+    generator = np.random.default_rng(seed)
+    data = _measurements(fit, at)
+    vectors = _vectors(of, draws, generator)
+    values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
+    values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
+    noise = _noise(fit, vectors, values, data.sigma)
+    lack, unknown = _lack(fit, vectors, data, values.shape[-1])
+    means, scales = values * (1.0 + lack), np.sqrt((values * unknown) ** 2 + noise**2)
+    student = fit.problem.noise.tails == "student"
+    freedom = fit.problem.noise.degrees_of_freedom
+    shape = (BESIDE, *means.shape)
+    drawn = generator.standard_t(freedom, shape) if student else generator.standard_normal(shape)
+    readings = (means + scales * drawn).reshape(-1, *means.shape[1:])
+    return Prediction(
+        wi=data.wi,
+        wo=data.wo,
+        channels=fit.problem.data.channels,
+        levels=levels,
+        model=_band(values, levels),
+        reading=_band(readings, levels),
+        means=means,
+        scales=scales,
+        degrees_of_freedom=freedom if student else math.inf,
+    )
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well readings were predicted.
+
+    count: readings times channels. median_error, large_error: median and 95th percentile of |prediction / reading - 1|,
+    the prediction being the median; model_error: the median of that for the model's own value. within_half, within_95:
+    shares of readings in the central 50 and 95 % intervals. log_score: mean log-density of a reading.
+    """
+
+    count: int
+    median_error: float
+    large_error: float
+    model_error: float
+    within_half: float
+    within_95: float
+    log_score: float
+
+
+def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool_] | None = None) -> Scores:
+    """How well the used readings, at the predicted directions, were predicted; only those in `rows`, (M,), if given.
+
+    Raises:
+        ValueError: no reading is left, or they were taken elsewhere.
+    """
+    used = readings.used()
+    if used.wi.shape != prediction.wi.shape or not np.allclose(used.wo, prediction.wo) & np.allclose(
+        used.wi, prediction.wi
+    ):
+        raise ValueError("scores: the readings were taken elsewhere than where was predicted")
+    keep = np.ones(len(used), bool) if rows is None else rows
+    if not keep.any():
+        raise ValueError("scores: no reading is left to score")
+    values, rank = used.values[keep], prediction.rank(used.values)[keep]
+    median = np.median(prediction.means, axis=0)[keep]
+    size = np.maximum(np.abs(values), np.finfo(float).tiny)
+    error, of_model = (np.abs(part - values) / size for part in (median, prediction.model.mean[keep]))
+    return Scores(
+        count=values.size,
+        median_error=float(np.median(error)),
+        large_error=float(np.quantile(error, 0.95)),
+        model_error=float(np.median(of_model)),
+        within_half=float(np.mean((rank > 0.25) & (rank < 0.75))),
+        within_95=float(np.mean((rank > 0.025) & (rank < 0.975))),
+        log_score=float(np.mean(prediction.log_density(used.values)[keep])),
+    )
+
+
+def _band(values: Floats, levels: tuple[float, ...]) -> Band:
+    return Band(values.mean(axis=0), values.std(axis=0), np.quantile(values, levels, axis=0))
+
+
+def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
+    if isinstance(at, Measurements):
+        return at.used()
+    count, channels = len(at), fit.problem.data.channels
+    nothing = np.zeros((count, len(channels)))
+    return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
+
+
+def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> Floats:
+    if isinstance(of, Posterior):
+        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws)
+    positions = Approximation.of(of).draw(np.random.RandomState(generator.integers(2**31)), draws)
+    return np.asarray(jax.vmap(of.problem.model.box.constrain)(jnp.asarray(positions)), float)
+
+
+def _noise(fit: Fit, vectors: Floats, values: Floats, sigma: Floats | None) -> Floats:
+    """Scale of the noise of new readings, (D, M, C)."""
+    model = fit.problem.model
+    own = np.sqrt(np.asarray(model.variance))
+    if not own.any():
+        sigma = np.zeros(values.shape[1:])
+    elif sigma is None:
+        sigma = np.median(own / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0) * np.abs(values)
+    levels = [np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors)]
+    return np.sqrt(sigma**2 + (levels[0] * values) ** 2 + levels[1] ** 2)
+
+
+def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
+    def one(vector: Array) -> tuple[Array, Array]:
+        parts = model.build(vector)
+        return parts.relative, parts.floor
+
+    return jax.vmap(one)(vectors)
+
+
+def _lack(fit: Fit, vectors: Floats, data: Measurements, channels: int) -> tuple[Floats, Floats]:
+    """What the model lacks, relative to its value: mean and standard deviation, (D, M, C)."""
+    if fit.problem.model.process is None:
+        nothing = np.zeros((len(vectors), len(data), channels))
+        return nothing, nothing
+    mean, sd = fit.problem.call(_lack_at, vectors, *places_of(data))
+    return np.asarray(mean, float), np.asarray(sd, float)
+
+
+def _lack_at(model: Model, vectors: Array, *places: Array) -> tuple[Array, Array]:
+    def one(vector: Array) -> tuple[Array, Array]:
+        return model.lack_at(vector, Places(*places))
+
+    return jax.lax.map(one, vectors)

@@ -1,0 +1,63 @@
+"""Predictions as a table of text, and how well they foretold readings."""
+
+import csv
+import io
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits.data.geometry import azimuth, polar
+from fits.data.scans import incidences
+from fits.inference.prediction import scores
+from fits.reporting.tables import Table
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+    from fits.inference.prediction import Prediction, Scores
+
+
+def prediction_csv(prediction: "Prediction") -> str:
+    """A row for each pair of directions and channel: angles in degrees, all else in 1/sr."""
+    levels = [f"{100.0 * level:g}" for level in prediction.levels]
+    columns = [f"{what}_{part}" for what in ("model", "reading") for part in ("mean", "sd", *(f"q{q}" for q in levels))]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["theta_i", "phi_i", "theta_o", "phi_o", "channel", *columns])
+    angles = [polar(prediction.wi), azimuth(prediction.wi), polar(prediction.wo), azimuth(prediction.wo)]
+    bands = (prediction.model, prediction.reading)
+    for row in range(len(prediction.wi)):
+        place = [f"{angle[row]:.10g}" for angle in angles]
+        for index, channel in enumerate(prediction.channels):
+            numbers = [
+                number
+                for band in bands
+                for number in (band.mean[row, index], band.sd[row, index], *band.quantiles[:, row, index])
+            ]
+            writer.writerow([*place, channel, *(f"{number:.8g}" for number in numbers)])
+    return out.getvalue()
+
+
+def scores_table(prediction: "Prediction", readings: "Measurements", title: str) -> Table:
+    """How well the used readings were predicted, for each incidence and for all of them."""
+    used = readings.used()
+    every = incidences(used)
+    rows = [_row(one.label, scores(prediction, readings, _only(len(used), one.rows))) for one in every]
+    if len(every) > 1:
+        rows.append(_row("all", scores(prediction, readings)))
+    note = (
+        "error: of the prediction, |prediction / reading - 1|, its median and 95th percentile; of the stack alone, the "
+        "median. Shares of readings inside the bands of 50 and 95 %. Score: mean log-density of a reading."
+    )
+    heads = ("incidence", "readings", "error", "95 % below", "stack alone", "in 50 %", "in 95 %", "log score")
+    return Table(title, heads, tuple(rows), note)
+
+
+def _only(count: int, rows: np.ndarray) -> np.ndarray:
+    chosen = np.zeros(count, bool)
+    chosen[rows] = True
+    return chosen
+
+
+def _row(label: str, found: "Scores") -> tuple[str, ...]:
+    shares = (found.median_error, found.large_error, found.model_error, found.within_half, found.within_95)
+    return (label, f"{found.count:,}", *(f"{100.0 * share:.1f} %" for share in shares), f"{found.log_score:.2f}")

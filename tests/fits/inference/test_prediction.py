@@ -1,0 +1,120 @@
+"""Predictions beside what is known of them, and their scores by readings that were not fitted."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.data.selection import select
+from fits.inference.optimise import fit
+from fits.inference.prediction import predict, scores
+from fits.inference.sampling import sample
+from fits.problem.correlated import Correlated
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from fits.problem.problem import Problem
+from tests.helpers.models import COUNT, design, line, line_fit
+
+STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
+GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
+SIGMA = 0.02
+
+
+def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
+    """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
+    generator = np.random.default_rng(seed)
+    count = len(GEOMETRY)
+    empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
+    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 20.0, 25.0))
+    model = Problem(STACK, empty, line, noise).model
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+    process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
+    assert process is not None
+    assert at is not None
+    white = generator.standard_normal((process.scans, 1, process.nodes.shape[0]))
+    lack = np.asarray(process.drawn(white, at, count))
+    values = exact * (1.0 + lack + sigma * generator.standard_normal(exact.shape))
+    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
+
+
+def split(data: Measurements) -> tuple[Measurements, Measurements]:
+    held = select(data, "incidence=30,70")
+    return data.where(~held), data.where(held)
+
+
+def test_bands_of_a_line_are_those_of_regression() -> None:
+    found = line_fit()
+    data = found.problem.data
+    at = predict(found, data, draws=4000)
+    columns = design(COUNT)
+    covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
+    expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    # of a Student-t with 6 degrees of freedom for the parameters, whose variance is 1.5 times as large
+    np.testing.assert_allclose(at.model.sd[:, 0], np.sqrt(1.5) * expected, rtol=0.1)
+    np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(1.5 * expected**2 + 0.05**2), rtol=0.05)
+    np.testing.assert_allclose(at.model.mean, found.predicted, atol=0.1 * expected.max())
+    wide = at.reading.quantiles[-1] - at.reading.quantiles[0]
+    np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(1.2 * expected, 0.05), rtol=0.08)
+
+
+def test_a_posterior_says_the_same() -> None:
+    found = line_fit()
+    posterior = sample(found, walkers=16, max_steps=4000, progress=None)
+    at, by_fit = (predict(of, found.problem.data, draws=1000) for of in (posterior, found))
+    np.testing.assert_allclose(at.reading.sd, by_fit.reading.sd, rtol=0.08)
+    np.testing.assert_allclose(at.model.mean, by_fit.model.mean, atol=0.2 * by_fit.model.sd.max())
+
+
+def test_wrong_models_need_shared_errors() -> None:
+    """Of 10 sets whose model is wrong by 10 %: the bands hold what they say, those of noise alone do not."""
+    held: dict[bool, list[float]] = {True: [], False: []}
+    better = []
+    for seed in range(10):
+        fitted, unseen = split(readings(seed, 0.1))
+        found = {}
+        for shared in held:
+            noise = Noise(relative=SIGMA, floor=1e-4, correlated=shared)
+            found[shared] = scores(predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen), unseen)
+            held[shared].append(found[shared].within_95)
+        better.append(found[True].log_score - found[False].log_score)
+    # 82 unseen readings a set are alike: the standard error of the mean of 10 sets is about 0.03
+    assert 0.86 < np.mean(held[True]) < 0.99
+    assert np.mean(held[False]) < 0.7
+    assert np.mean(better) > 1.0
+
+
+def test_right_models_lose_little_by_it() -> None:
+    fitted, unseen = split(readings(1, 0.0))
+    noise = Noise(relative=SIGMA, floor=1e-4, correlated=True)
+    found = fit(STACK, fitted, transport=line, noise=noise, starts=2)
+    assert found.values["noise.correlated.amplitude"] < SIGMA
+    got = scores(predict(found, unseen), unseen)
+    assert got.within_95 > 0.9
+    assert got.median_error < SIGMA
+
+
+def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
+    fitted, unseen = split(readings(2, 0.0))
+    sigma = SIGMA * fitted.values
+    known = Measurements(fitted.wi, fitted.wo, fitted.values, sigma, fitted.mask, fitted.channels)
+    found = fit(STACK, known, transport=line, starts=2)
+    at = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
+    np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
+    again = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
+    np.testing.assert_array_equal(at.reading.quantiles, again.reading.quantiles)
+    assert unseen.mask.any()
+
+
+def test_bad_requests_are_refused() -> None:
+    found = line_fit()
+    with pytest.raises(ValueError, match=r"levels is \(0.5, 1.0\); they must be in \(0, 1\)"):
+        predict(found, found.problem.data, levels=(0.5, 1.0))
+    with pytest.raises(ValueError, match=r"draws is 1; it must be at least 2"):
+        predict(found, found.problem.data, draws=1)
+    named = fit(STACK, found.problem.data, transport=line, objective="cube_root", starts=1)
+    with pytest.raises(ValueError, match=r"a fit of 'cube_root' has no noise model"):
+        predict(named, found.problem.data)
+    at = predict(found, slices([30.0]))
+    with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
+        scores(at, found.problem.data)
