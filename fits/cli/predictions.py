@@ -30,7 +30,7 @@ def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Me
     for words in arguments.hold_out:
         held |= select(data, words)
     fitted = data.where(keep & ~held)
-    if not fitted.mask.any():
+    if data.mask.any() and not fitted.mask.any():
         raise ValueError("--only and --hold-out leave nothing to fit")
     for name, given in (("only", arguments.only), ("held out", arguments.hold_out)):
         fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted

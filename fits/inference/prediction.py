@@ -17,7 +17,7 @@ from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
 from fits.inference.posterior import Posterior
 from fits.problem.model import Model
-from fits.problem.process import Places, places_of
+from fits.problem.process import places
 
 DRAWS = 256
 """Vectors of parameters that a prediction is made with."""
@@ -225,12 +225,9 @@ def _lack(fit: Fit, vectors: Floats, data: Measurements, channels: int) -> tuple
     if fit.problem.model.process is None:
         nothing = np.zeros((len(vectors), len(data), channels))
         return nothing, nothing
-    mean, sd = fit.problem.call(_lack_at, vectors, *places_of(data))
+    mean, sd = fit.problem.call(_lack_at, vectors, places(data.wi, data.wo))
     return np.asarray(mean, float), np.asarray(sd, float)
 
 
-def _lack_at(model: Model, vectors: Array, *places: Array) -> tuple[Array, Array]:
-    def one(vector: Array) -> tuple[Array, Array]:
-        return model.lack_at(vector, Places(*places))
-
-    return jax.lax.map(one, vectors)
+def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
+    return jax.lax.map(lambda vector: model.lack_at(vector, where), vectors)

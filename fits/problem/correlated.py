@@ -1,17 +1,17 @@
 """What is asked of errors that readings share: see `fits.problem.process`."""
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.process import Correlation, Process
 from fits.problem.values import shown
 
-SHORTEST_LENGTH = 1.5
-"""Of a correlation, in distances of nodes."""
+SHORTEST = 1.5
+"""Length of a correlation, in steps of the grid of nodes, at least."""
 
-LEAST_LENGTH, LONGEST = 5.0, 30.0
-"""Of a length whose prior is not given, in degrees."""
+LONGEST = 15.0
+"""Of a length whose prior is not given, in degrees. What is alike farther than that is no error of a shape: it would
+take the place of the stack's level."""
 
 ANGLES = (0.1, 360.0)
 AMPLITUDES = (1e-6, 1.0)
@@ -21,16 +21,14 @@ AMPLITUDES = (1e-6, 1.0)
 class Correlated:
     """Errors of the model that neighbouring readings share, relative to its value.
 
-    amplitude: their standard deviation, unitless, in [1e-6, 1]. angle, incidence, azimuth: how far they reach along
-    a scan, between directions of the light, and between planes, in degrees in [0.1, 360]. channels: correlation of two
-    channels, in [0, 1]. Each a number, `Free`, or None for a free one with a wide prior; those that the data cannot
-    tell, of a single incidence, plane or channel, then have a fixed value.
+    amplitude: their standard deviation, unitless, in [1e-6, 1]. half, difference: how far they reach, in degrees in
+    [0.1, 360], in the angle of the half vector to the normal, and in that of light and viewer to the half vector.
+    channels: correlation of two channels, in [0, 1]. Each a number, `Free`, or None for a free one with a wide prior.
     """
 
     amplitude: float | Free | None = None
-    angle: float | Free | None = None
-    incidence: float | Free | None = None
-    azimuth: float | Free | None = None
+    half: float | Free | None = None
+    difference: float | Free | None = None
     channels: float | Free | None = None
 
     def __post_init__(self) -> None:
@@ -54,24 +52,18 @@ class Correlated:
 
 def numbers_of(given: Correlated, process: Process, channels: int) -> Correlation:
     """The numbers of a process, those that are left out filled in."""
-    step = float(process.nodes[1] - process.nodes[0])
-    shortest = SHORTEST_LENGTH * step
+    half, difference = (_length(SHORTEST * float(step)) for step in process.steps)
+    own = given.channels
+    if own is None:
+        own = Free(0.8, 0.0, 0.99) if channels > 1 else 0.0
     return Correlation(
         amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 0.5)) if given.amplitude is None else given.amplitude,
-        angle=_length(15.0, shortest) if given.angle is None else given.angle,
-        incidence=_or(given.incidence, _length(20.0, LEAST_LENGTH), process.several_incidences),
-        azimuth=_or(given.azimuth, _length(20.0, LEAST_LENGTH), process.several_planes),
-        channels=_or(given.channels, Free(0.8, 0.0, 0.99), channels > 1),
+        half=half if given.half is None else given.half,
+        difference=difference if given.difference is None else given.difference,
+        channels=own,
     )
 
 
-def _length(median: float, low: float) -> Free:
-    """What is alike farther than the longest is no error of a shape: it would take the place of the stack's level."""
-    low = min(low, 0.5 * LONGEST)
-    return Free(min(max(median, low), LONGEST), low, LONGEST, LogNormal(median, 0.4))
-
-
-def _or(given: Any, free: Free, told: bool) -> Any:
-    if given is not None:
-        return given
-    return free if told else free.start
+def _length(low: float) -> Free:
+    low, high = min(low, LONGEST), max(LONGEST, 1.4 * low)
+    return Free(max(10.0, low), low, high, LogNormal(10.0, 0.5))

@@ -28,7 +28,7 @@ from fits.problem.likelihood import (
     total_sigma,
 )
 from fits.problem.parameters import Box, Template
-from fits.problem.process import Correlation, Places, Process, Whitened
+from fits.problem.process import Correlation, Process, Whitened
 from layerjax._shapes import require_single
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
@@ -122,7 +122,7 @@ class Model(eqx.Module):
         if self.process is None:
             return self.standardised_at(vector, predicted)
         found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
-        return -self.process.by_reading(found.residuals, len(self.values))
+        return -found.residuals
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
         """z'S^-1 z of `standardised_at` z, with S their covariance: 1 where readings share no errors."""
@@ -141,8 +141,8 @@ class Model(eqx.Module):
         at = at._replace(amplitude=shared * at.amplitude)
         return self.process.whitened((predicted - self.values) / sigma, predicted / sigma, at)
 
-    def lack_at(self, vector: Array, places: Places) -> tuple[Array, Array]:
-        """What the model lacks elsewhere relative to its value, as far as the data say: mean and sd, (M, C)."""
+    def lack_at(self, vector: Array, places: Array) -> tuple[Array, Array]:
+        """What the model lacks at other `places` relative to its value, as far as the data say: mean and sd, (M, C)."""
         predicted = self.predict(vector)
         at = self._correlation(vector)
         found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))

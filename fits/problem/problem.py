@@ -190,7 +190,7 @@ def _assemble(problem: Problem) -> _Assembled:
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
     levels = _noise_levels(problem.noise, used)
-    process = make_process(used) if problem.noise.correlated else None
+    process = make_process(used.wi, used.wo) if problem.noise.correlated else None
     template, names, free = split(_numbers(problem, levels, process), _parameter_name)
     if not names:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")

@@ -261,11 +261,11 @@ def _noise(table: Any) -> Noise:
     table = require_table("noise", table)
     hints = get_type_hints(Noise)
     check_keys("noise", table, tuple(entry.name for entry in fields(Noise)))
-    given: dict[str, Any] = {
-        key: _correlated(value) if key == SHARED else _value(f"noise.{key}", value, hints[key], f"Noise.{key}")
-        for key, value in table.items()
-    }
     try:
+        given: dict[str, Any] = {
+            key: _correlated(value) if key == SHARED else _value(f"noise.{key}", value, hints[key], f"Noise.{key}")
+            for key, value in table.items()
+        }
         return Noise(**given)
     except ValueError as error:
         raise ValueError(str(error).replace("Noise.", "noise.")) from None

@@ -115,17 +115,15 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
 
 def shared_errors(fit: "Fit") -> list[str]:
     """How large the errors of the model are that neighbouring readings share, and how far they reach; none, nothing."""
-    process, at = fit.problem.model.process, fit.problem.build(fit.vector).correlation
-    if process is None or at is None:
+    at = fit.problem.build(fit.vector).correlation
+    if at is None:
         return []
     scatter = float(np.sum(np.square(fit.problem.call(Model.standardised_at, fit.vector, fit.predicted))))
     share = 1.0 - float(np.sum(fit.residuals**2)) / scatter if scatter > 0.0 else 0.0
-    reach = [f"{float(at.angle):.2g} degrees along a scan"]
-    reach += [f"{float(at.incidence):.2g} between incidences"] if process.several_incidences else []
-    reach += [f"{float(at.azimuth):.2g} between planes"] if process.several_planes else []
+    reach = f"{float(at.half):.2g} degrees of the half vector and {float(at.difference):.2g} of the difference"
     return [
         f"Neighbouring readings share errors of the model of {100.0 * float(at.amplitude):.2g} % of its value, alike "
-        f"over {listed(reach)}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
+        f"over {reach}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
         "bands of predictions, count them."
     ]
 

@@ -26,14 +26,14 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     generator = np.random.default_rng(seed)
     count = len(GEOMETRY)
     empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
-    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 20.0, 25.0))
+    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 12.0, 12.0))
     model = Problem(STACK, empty, line, noise).model
     exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
     process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
     assert process is not None
     assert at is not None
-    white = generator.standard_normal((process.scans, 1, process.nodes.shape[0]))
-    lack = np.asarray(process.drawn(white, at, count))
+    white = generator.standard_normal((process.nodes.shape[0], 1))
+    lack = np.asarray(process.drawn(white, at))
     values = exact * (1.0 + lack + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
 

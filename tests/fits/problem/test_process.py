@@ -1,12 +1,14 @@
 """Errors of the model that readings share, beside dense matrices that are built here from the definition alone."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.interpolate import CubicSpline
 
+import layerjax as lj
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
 from fits.inference.descent import here
@@ -15,7 +17,8 @@ from fits.problem.likelihood import Noise
 from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.problem.process import Correlation, Process, places_of
+from fits.problem.process import Correlation, make_process, places
+from fits.problem.stack_file import read_problem, write_problem
 
 FREE = Free(0.4, 0.0, 1.0)
 LAYOUTS = {
@@ -53,31 +56,45 @@ def matern(distance: np.ndarray, length: float) -> np.ndarray:
     return (1.0 + x) * np.exp(-x)
 
 
-def kernel(
-    one: Measurements, other: Measurements, at: Correlation, angles: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """Of relative errors between scans and along them."""
-    first, second = places_of(one), places_of(other)
-    apart = np.degrees(np.linalg.norm(first.wi[:, None] - second.wi[None], axis=-1))
-    turned = np.degrees(np.abs(np.sin(np.radians(first.plane[:, None] - second.plane[None]))))
-    scan = matern(apart, float(at.incidence)) * matern(turned, float(at.azimuth))
-    along = np.degrees(2.0 * np.abs(np.sin(np.radians(angles[0][:, None] - angles[1][None]) / 2.0)))
-    return float(at.amplitude) ** 2 * scan * matern(along, float(at.angle))
+def folded(data: Measurements) -> np.ndarray:
+    """Half angle, and difference angle as a vector of |cos| and |sin| of its azimuth, (N, 3), and the side, (N,)."""
+    rows = []
+    for wi, wo in zip(data.wi, data.wo, strict=True):
+        side = 2 if wi[2] * wo[2] <= 0 else int(wi[2] < 0)
+        one, other = (np.array([w[0], w[1], abs(w[2])]) for w in (wi, wo))
+        half = (one + other) / np.linalg.norm(one + other)
+        tilt, azimuth = np.arccos(min(half[2], 1.0)), np.arctan2(half[1], half[0])
+        # Rusinkiewicz 1998: turn the half vector onto the normal, about z and then about y
+        turn = np.array(
+            [[np.cos(azimuth), np.sin(azimuth), 0.0], [-np.sin(azimuth), np.cos(azimuth), 0.0], [0.0, 0.0, 1.0]]
+        )
+        lean = np.array([[np.cos(tilt), 0.0, -np.sin(tilt)], [0.0, 1.0, 0.0], [np.sin(tilt), 0.0, np.cos(tilt)]])
+        difference = lean @ turn @ one
+        theta = np.degrees(np.arccos(np.clip(difference[2], -1.0, 1.0)))
+        length = np.hypot(*difference[:2])
+        cosine, sine = np.abs(difference[:2]) / length if length > 1e-9 and tilt > 1e-9 else (1.0, 0.0)
+        rows.append([np.degrees(tilt), theta * cosine, theta * sine, side])
+    return np.array(rows)
 
 
-def dense(of: Problem, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of all readings, (N C,) and (N C, N C): the process on nodes, and cubic between them."""
-    model, data = of.model, of.data
-    at = model.build(jnp.asarray(vector)).correlation
-    process = model.process
-    assert isinstance(process, Process)
+def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
+    """Of relative errors between places."""
+    tilt = matern(np.abs(one[:, None, 0] - other[None, :, 0]), float(at.half))
+    apart = np.linalg.norm(one[:, None, 1:3] - other[None, :, 1:3], axis=-1)
+    alike = tilt * matern(apart, float(at.difference)) * (one[:, None, 3] == other[None, :, 3])
+    return float(at.amplitude) ** 2 * alike
+
+
+def dense(of: Problem, vector: np.ndarray, nodes: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of all readings, (N C,) and (N C, N C): of the process on nodes, or everywhere."""
+    model = of.model
+    at, process = model.build(jnp.asarray(vector)).correlation, model.process
+    assert process is not None
     predicted, sigma = (np.asarray(part(jnp.asarray(vector))) for part in (model.predict, model.sigma))
-    nodes = np.asarray(process.nodes)
-    cubic = CubicSpline(nodes, np.eye(len(nodes)), bc_type="not-a-knot")(places_of(data).angle)
     count, channels = predicted.shape
-    between = kernel(data, data, at, (np.zeros(count), np.zeros(count)))
-    gaps = np.degrees(2.0 * np.abs(np.sin(np.radians(nodes[:, None] - nodes) / 2.0)))
-    shared = between * (cubic @ matern(gaps, float(at.angle)) @ cubic.T)
+    weights, grid = np.asarray(process.weights), np.asarray(process.nodes)
+    own = folded(of.data)
+    shared = weights @ kernel(grid, grid, at) @ weights.T if nodes else kernel(own, own, at)
     colours = float(at.channels) + (1.0 - float(at.channels)) * np.eye(channels) if channels > 1 else np.ones((1, 1))
     full = np.einsum("nm,cd->ncmd", shared, colours).reshape(count * channels, -1)
     flat = predicted.ravel()
@@ -106,22 +123,55 @@ def test_each_reading_given_all_others(layout: str) -> None:
     np.testing.assert_allclose(np.ravel(of.log_likelihood_per_datum(of.start)), expected, atol=1e-4)
 
 
+def test_places_are_the_half_vector_and_difference() -> None:
+    for layout, geometry in LAYOUTS.items():
+        expected = folded(problem(layout).data)
+        # at a half vector along the normal, azimuths of the difference are rounding
+        upright = expected[:, 0] < 1e-5
+        found = places(geometry.wi, geometry.wo)
+        np.testing.assert_allclose(found[~upright], expected[~upright], atol=1e-6)
+        np.testing.assert_allclose(np.hypot(*found[upright, 1:3].T), np.hypot(*expected[upright, 1:3].T), atol=1e-6)
+
+
+def test_light_and_viewer_may_change_places() -> None:
+    generator = np.random.default_rng(3)
+    wi, wo = (w / np.linalg.norm(w, axis=-1, keepdims=True) for w in generator.standard_normal((2, 200, 3)))
+    np.testing.assert_allclose(places(wi, wo), places(wo, wi), atol=1e-6)
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(places(wi @ turn.T, wo @ turn.T), places(wi, wo), atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["one scan", "two incidences", "two planes"])
+def test_between_nodes_the_process_is_nearly_the_kernel(layout: str) -> None:
+    of = problem(layout, half=20.0, difference=20.0)
+    (_, found), (_, exact) = dense(of, of.start), dense(of, of.start, nodes=False)
+    found, exact = (part - np.diag(np.diagonal(part)) for part in (found, exact))
+    process = of.model.process
+    assert process is not None
+    # by so much is the variance too small along each axis half way between two nodes
+    middle = np.array([-1.0, 9.0, 9.0, -1.0]) / 16.0
+    gaps = float(np.max(process.steps)) * np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
+    lost = 1.0 - middle @ matern(gaps, 20.0) @ middle
+    axes = 3 if layout == "two planes" else 2
+    assert np.max(np.abs(found - exact)) < axes * lost * np.max(np.abs(exact))
+
+
 def test_errors_elsewhere_are_those_of_regression() -> None:
-    # readings on the nodes: nothing is interpolated
-    of = problem("two incidences", amplitude=0.2, angle=30.0, incidence=25.0)
-    at = of.model.build(jnp.asarray(of.start)).correlation
+    of = problem("two incidences", amplitude=0.2, half=20.0, difference=18.0)
+    model = of.model
+    at, process = model.build(jnp.asarray(of.start)).correlation, model.process
+    assert process is not None
     geometry = slices([30.0, 70.0], np.arange(-60.0, 81.0, 7.0), [0.0, 20.0])
     values = np.ones((len(geometry), 1))
     new = Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), ("value",))
     mean, covariance = dense(of, of.start)
-    angles = places_of(new).angle, places_of(of.data).angle
-    across = kernel(new, of.data, at, angles) * mean
+    across = kernel(folded(new), np.asarray(process.nodes), at) @ np.asarray(process.weights).T * mean
     solved = np.linalg.solve(covariance, across.T).T
     expected = solved @ (of.data.values.ravel() - mean)
     variance = 0.2**2 - np.sum(solved * across, axis=-1)
-    found, sd = of.call(Model.lack_at, of.start, places_of(new))
-    np.testing.assert_allclose(np.ravel(found), expected, atol=1e-6)
-    np.testing.assert_allclose(np.ravel(sd), np.sqrt(variance), atol=1e-5)
+    found, sd = of.call(Model.lack_at, of.start, places(new.wi, new.wo))
+    np.testing.assert_allclose(np.ravel(found), expected, atol=1e-5)
+    np.testing.assert_allclose(np.ravel(sd), np.sqrt(variance), atol=1e-4)
 
 
 def test_half_squares_are_minus_the_log_posterior() -> None:
@@ -171,23 +221,31 @@ def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
     np.testing.assert_allclose(found.gradient, of.call(lambda m, s: jax.grad(lambda t: cost(m, t))(s), unit), rtol=1e-8)
 
 
-def test_what_the_data_cannot_tell_is_no_parameter() -> None:
-    assert problem("one scan").names == ("['a']", "noise.correlated.amplitude", "noise.correlated.angle")
-    assert problem("two planes", 3).names[1:] == tuple(
-        f"noise.correlated.{name}" for name in ("amplitude", "angle", "incidence", "azimuth", "channels")
-    )
-    fixed = problem("two planes", amplitude=0.1, angle=20.0, incidence=30.0, azimuth=Free(20.0, 10.0, 50.0))
-    assert fixed.names == ("['a']", "noise.correlated.azimuth")
+def test_what_is_given_is_no_parameter() -> None:
+    every = tuple(f"noise.correlated.{name}" for name in ("amplitude", "half", "difference", "channels"))
+    assert problem("one scan").names == ("['a']", *every[:3])
+    assert problem("two planes", 3).names[1:] == every
+    fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0))
+    assert fixed.names == ("['a']", "noise.correlated.difference")
+    assert fixed.units["noise.correlated.difference"] == "deg"
+
+
+def test_readings_all_over_the_hemisphere_are_carried() -> None:
+    generator = np.random.default_rng(0)
+    wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in generator.standard_normal((2, 500, 3)))
+    process = make_process(np.abs(wi), np.abs(wo))
+    assert process.nodes.shape[0] <= 300
+    np.testing.assert_allclose(np.sum(process.weights, axis=-1), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"amplitude": -0.1}, r"Noise.correlated.amplitude is -0.1; it must be a number in \[1e-06, 1\]"),
-        ({"angle": Free(20.0, 0.0, 50.0)}, r"Noise.correlated.angle.low is 0.0; it must be a number in \[0.1, 360\]"),
+        ({"half": Free(20.0, 0.0, 50.0)}, r"Noise.correlated.half.low is 0.0; it must be a number in \[0.1, 360\]"),
         ({"channels": 1.5}, r"Noise.correlated.channels is 1.5; it must be a number in \[0, 1\]"),
-        ({"incidence": Free((20.0, 20.0), 1.0, 50.0)}, "Noise.correlated.incidence has 2 channels"),
-        ({"angle": "wide"}, "Noise.correlated.angle is 'wide'"),
+        ({"difference": Free((20.0, 20.0), 1.0, 50.0)}, "Noise.correlated.difference has 2 channels"),
+        ({"half": "wide"}, "Noise.correlated.half is 'wide'"),
     ],
 )
 def test_bad_numbers_are_refused(given: dict, message: str) -> None:
@@ -203,14 +261,33 @@ def test_bad_noise_is_refused() -> None:
     data = problem("one scan").data
     with pytest.raises(ValueError, match=r"noise.correlated stands beside objective 'cube_root'"):
         Problem({"a": FREE, "colour": 1.0}, data, transport, Noise(correlated=True), objective="cube_root")
-    generator = np.random.default_rng(0)
-    wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in generator.standard_normal((2, 60, 3)))
-    scattered = Measurements(np.abs(wi), np.abs(wo), np.ones((60, 1)), None, np.ones(60, bool), ("value",))
-    with pytest.raises(ValueError, match=r"60 readings lie on 60 scans, at most 48 may be"):
-        Problem({"a": FREE, "colour": np.ones(1)}, scattered, transport, Noise(correlated=True))
 
 
 def test_priors_of_one_s_own() -> None:
     own = Free(0.05, 0.01, 0.2, LogNormal(0.05, 0.3))
     of = problem("one scan", amplitude=own)
     assert (of.low[1], of.high[1]) == (0.01, 0.2)
+
+
+@pytest.mark.parametrize(
+    "given", [True, Correlated(), Correlated(amplitude=0.05, half=Free(12.0, 8.0, 20.0, LogNormal(12.0, 0.2)))]
+)
+def test_stack_files_keep_it(tmp_path: Path, given: Correlated | bool) -> None:
+    stack = lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
+    write_problem(tmp_path / "stack.toml", stack, noise=Noise(relative=0.03, correlated=given))
+    assert read_problem(tmp_path / "stack.toml").noise == Noise(relative=0.03, correlated=given)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("correlated = 0.1", "noise.correlated is 0.1"),
+        ("correlated = { angle = 3.0 }", "angle"),
+        ("correlated = { half = -3.0 }", "noise.correlated.half is -3.0"),
+        ("correlated = { half = { start = 10.0, low = 5.0 } }", "noise.correlated.half has no high"),
+    ],
+)
+def test_bad_stack_files_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    (tmp_path / "stack.toml").write_text(f'[base]\nkind = "Lambertian"\nalbedo = 0.5\n[noise]\n{line}\n')
+    with pytest.raises(ValueError, match=message):
+        read_problem(tmp_path / "stack.toml")
