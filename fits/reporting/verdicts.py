@@ -96,8 +96,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
-    if fit.problem.model.process is not None:
-        sentences += shared_errors(fit)
+    sentences += shared_errors(fit)
     if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     if fit.at_bound:

@@ -95,7 +95,7 @@ def test_right_models_lose_little_by_it() -> None:
 
 
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
-    fitted, unseen = split(readings(2, 0.0))
+    fitted, _ = split(readings(2, 0.0))
     sigma = SIGMA * fitted.values
     known = Measurements(fitted.wi, fitted.wo, fitted.values, sigma, fitted.mask, fitted.channels)
     found = fit(STACK, known, transport=line, starts=2)
@@ -103,7 +103,6 @@ def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
     again = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
     np.testing.assert_array_equal(at.reading.quantiles, again.reading.quantiles)
-    assert unseen.mask.any()
 
 
 def test_bad_requests_are_refused() -> None:
