@@ -80,7 +80,7 @@ def _curves(panels: Sequence[Axes], data: "Measurements", shown: list[Incidence]
             draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
         value_axis(axes, data.values[flat], value_label(data, channel))
     if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(ncols=2 if len(shown) > 4 else 1)
+        panels[0].legend(loc="upper right", ncols=2 if len(shown) > 4 else 1)
 
 
 def value_label(data: "Measurements", channel: int) -> str:
@@ -278,7 +278,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
             ylabel="density",
             title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}",
         )
-        axes.legend()
+        axes.legend(loc="upper right")
 
         axes = panels["lags"]
         correlation = autocorrelation(data, residuals)
@@ -287,7 +287,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
         if structure.pairs:
             noise = 2.0 / np.sqrt(structure.pairs)
             axes.axhspan(-noise, noise, color="#dddddd", zorder=0, label="white noise, 95 %")
-            axes.legend()
+            axes.legend(loc="upper right")
         axes.set(
             xlabel="readings apart, in one plane", ylabel="correlation", ylim=(-1.0, 1.0), title="Neighbours in angle"
         )

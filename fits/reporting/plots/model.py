@@ -89,7 +89,7 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             if index >= len(shown) - columns:
                 lower.set_xlabel(ANGLE_LABEL)
             if index == 0:
-                upper.legend()
+                upper.legend(loc="upper right")
     return figure
 
 
