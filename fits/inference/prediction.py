@@ -16,8 +16,10 @@ from fits.data.measurements import Measurements, Source
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
 from fits.inference.posterior import Posterior
+from fits.problem.logarithm import logarithm, size
+from fits.problem.logarithm import softness as soft
 from fits.problem.model import Model
-from fits.problem.process import places
+from fits.problem.nodes import places
 
 DRAWS = 256
 """Vectors of parameters that a prediction is made with."""
@@ -50,7 +52,8 @@ class Prediction:
         model: of the stack's own value.
         reading: of a new reading: that with what the model lacks, and with noise.
         means, scales: of a reading with each of D vectors of parameters, (D, M, C), in 1/sr; given these it is
-            Gaussian, or has Student-t tails.
+            Gaussian, or has Student-t tails. Where readings share errors, of its `logarithm`.
+        softness: of that, (M, C), in 1/sr; else None.
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
     """
 
@@ -62,16 +65,28 @@ class Prediction:
     reading: Band
     means: Floats
     scales: Floats
+    softness: Floats | None
     degrees_of_freedom: float
 
     def log_density(self, values: Floats) -> Floats:
         """Log-density of readings (M, C), each by itself."""
-        density = self._tails.logpdf((values - self.means) / self.scales) - np.log(self.scales)
-        return logsumexp(density, axis=0) - math.log(len(density))
+        density = self._tails.logpdf(self._offsets(values)) - np.log(self.scales)
+        slope = 0.0 if self.softness is None else np.log(np.asarray(size(values, self.softness)))
+        return logsumexp(density, axis=0) - math.log(len(density)) - slope
 
     def rank(self, values: Floats) -> Floats:
         """Probability of a reading below each of these, (M, C)."""
-        return self._tails.cdf((values - self.means) / self.scales).mean(axis=0)
+        return self._tails.cdf(self._offsets(values)).mean(axis=0)
+
+    def _offsets(self, values: Floats) -> Floats:
+        measured = values if self.softness is None else np.asarray(logarithm(values, self.softness))
+        return (measured - self.means) / self.scales
+
+    @property
+    def median(self) -> Floats:
+        """Of a reading, (M, C), in 1/sr."""
+        middle = np.median(self.means, axis=0)
+        return middle if self.softness is None else self.softness * np.sinh(middle)
 
     @property
     def _tails(self) -> "stats.rv_frozen":
@@ -113,14 +128,15 @@ def predict(
     vectors = _vectors(of, draws, generator)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
-    noise = _noise(fit, vectors, values, data.sigma)
-    lack, unknown = _lack(fit, vectors, data, values.shape[-1])
-    means, scales = values * (1.0 + lack), np.sqrt((values * unknown) ** 2 + noise**2)
+    sigma = _own_sigma(fit, values, data.sigma)
+    means, scales, softness = _readings(fit, vectors, values, data, sigma)
     student = fit.problem.noise.tails == "student"
     freedom = fit.problem.noise.degrees_of_freedom
     shape = (BESIDE, *means.shape)
     drawn = generator.standard_t(freedom, shape) if student else generator.standard_normal(shape)
     readings = (means + scales * drawn).reshape(-1, *means.shape[1:])
+    if softness is not None:
+        readings = softness * np.sinh(readings)
     return Prediction(
         wi=data.wi,
         wo=data.wo,
@@ -130,6 +146,7 @@ def predict(
         reading=_band(readings, levels),
         means=means,
         scales=scales,
+        softness=softness,
         degrees_of_freedom=freedom if student else math.inf,
     )
 
@@ -167,7 +184,7 @@ def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool
     if not keep.any():
         raise ValueError("scores: no reading is left to score")
     values, rank = used.values[keep], prediction.rank(used.values)[keep]
-    median = np.median(prediction.means, axis=0)[keep]
+    median = prediction.median[keep]
     size = np.maximum(np.abs(values), np.finfo(float).tiny)
     error, of_model = (np.abs(part - values) / size for part in (median, prediction.model.mean[keep]))
     return Scores(
@@ -200,16 +217,30 @@ def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) ->
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(jnp.asarray(positions)), float)
 
 
-def _noise(fit: Fit, vectors: Floats, values: Floats, sigma: Floats | None) -> Floats:
-    """Scale of the noise of new readings, (D, M, C)."""
-    model = fit.problem.model
-    own = np.sqrt(np.asarray(model.variance))
+def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
+    """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
+    own = np.sqrt(np.asarray(fit.problem.model.variance))
     if not own.any():
-        sigma = np.zeros(values.shape[1:])
-    elif sigma is None:
-        sigma = np.median(own / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0) * np.abs(values)
-    levels = [np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors)]
-    return np.sqrt(sigma**2 + (levels[0] * values) ** 2 + levels[1] ** 2)
+        return np.zeros(values.shape[1:])
+    if sigma is not None:
+        return sigma
+    relative = np.median(own / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0)
+    return relative * np.median(np.abs(values), axis=0)
+
+
+def _readings(
+    fit: Fit, vectors: Floats, values: Floats, data: Measurements, sigma: Floats
+) -> tuple[Floats, Floats, Floats | None]:
+    """Means, scales and softness of readings (see `Prediction`), where the model has these values, (D, M, C)."""
+    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
+    if fit.problem.model.process is None:
+        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None
+    lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
+    softness = soft(np.median(values, axis=0), np.hypot(sigma, np.median(floor)))
+    means = np.asarray(logarithm(values, softness)) + lack
+    corrected = softness * np.sinh(means)
+    noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
+    return means, np.hypot(unknown, noise), softness
 
 
 def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
@@ -218,15 +249,6 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
         return parts.relative, parts.floor
 
     return jax.vmap(one)(vectors)
-
-
-def _lack(fit: Fit, vectors: Floats, data: Measurements, channels: int) -> tuple[Floats, Floats]:
-    """What the model lacks, relative to its value: mean and standard deviation, (D, M, C)."""
-    if fit.problem.model.process is None:
-        nothing = np.zeros((len(vectors), len(data), channels))
-        return nothing, nothing
-    mean, sd = fit.problem.call(_lack_at, vectors, places(data.wi, data.wo))
-    return np.asarray(mean, float), np.asarray(sd, float)
 
 
 def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:

@@ -6,10 +6,10 @@ from fits.problem.parameters import Free, LogNormal
 from fits.problem.process import Correlation, Process
 from fits.problem.values import shown
 
-SHORTEST = 1.5
+SHORTEST = 1.0
 """Length of a correlation, in steps of the grid of nodes, at least."""
 
-LONGEST = 15.0
+LONGEST = 40.0
 """Of a length whose prior is not given, in degrees. What is alike farther than that is no error of a shape: it would
 take the place of the stack's level."""
 
@@ -19,7 +19,7 @@ AMPLITUDES = (1e-6, 1.0)
 
 @dataclass(frozen=True)
 class Correlated:
-    """Errors of the model that neighbouring readings share, relative to its value.
+    """Errors of the model that neighbouring readings share, of its logarithm.
 
     amplitude: their standard deviation, unitless, in [1e-6, 1]. half, difference: how far they reach, in degrees in
     [0.1, 360], in the angle of the half vector to the normal, and in that of light and viewer to the half vector.
@@ -57,7 +57,7 @@ def numbers_of(given: Correlated, process: Process, channels: int) -> Correlatio
     if own is None:
         own = Free(0.8, 0.0, 0.99) if channels > 1 else 0.0
     return Correlation(
-        amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 0.5)) if given.amplitude is None else given.amplitude,
+        amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 1.0)) if given.amplitude is None else given.amplitude,
         half=half if given.half is None else given.half,
         difference=difference if given.difference is None else given.difference,
         channels=own,
@@ -66,4 +66,4 @@ def numbers_of(given: Correlated, process: Process, channels: int) -> Correlatio
 
 def _length(low: float) -> Free:
     low, high = min(low, LONGEST), max(LONGEST, 1.4 * low)
-    return Free(max(10.0, low), low, high, LogNormal(10.0, 0.5))
+    return Free(max(15.0, low), low, high, LogNormal(15.0, 0.5))

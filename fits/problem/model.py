@@ -27,6 +27,7 @@ from fits.problem.likelihood import (
     tail_residual,
     total_sigma,
 )
+from fits.problem.logarithm import logarithm, size
 from fits.problem.parameters import Box, Template
 from fits.problem.process import Correlation, Process, Whitened
 from layerjax._shapes import require_single
@@ -72,8 +73,10 @@ class Model(eqx.Module):
         side: "reflection" if all directions lie above.
         known: what is known of the directions beforehand.
         process: errors that readings share, None where they share none.
+        softness: of their `logarithm`, (N, C), in 1/sr; None where they share none.
         objective, tails: see `Problem` and `Noise`.
         varying: whether sigma depends on the parameters.
+        moving: so many of them come first, on which predictions depend; the others are those of the noise.
     """
 
     template: Template
@@ -87,10 +90,12 @@ class Model(eqx.Module):
     transport: Transport
     known: lj.KnownDirections | None
     process: Process | None
+    softness: Array | None
     side: Side = eqx.field(static=True)
     objective: Objective = eqx.field(static=True)
     tails: Tails = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
+    moving: int = eqx.field(static=True)
 
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
@@ -117,37 +122,41 @@ class Model(eqx.Module):
             return -self._named(predicted)
         return (self.values - predicted) / self.sigma_at(vector, predicted)
 
-    def unshared_at(self, vector: Array, predicted: Array) -> Array:
-        """`standardised_at`, without the errors that readings share as far as the data tell them."""
+    def offsets_at(self, vector: Array, predicted: Array) -> Array:
+        """`standardised_at`; where readings share errors, of their `logarithm`, in units of the datum's noise."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
-        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
-        return -found.residuals
+        return -self._logarithmic(predicted, self._noise_at(vector, predicted))[0]
+
+    def unshared_at(self, vector: Array, predicted: Array) -> Array:
+        """`offsets_at`, without the errors that readings share as far as the data tell them."""
+        if self.process is None:
+            return self.standardised_at(vector, predicted)
+        return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `standardised_at` z, with S their covariance: 1 where readings share no errors."""
+        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 where readings share no errors."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
-        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
+        found = self.whitened_at(vector, predicted, self._noise_at(vector, predicted))
         return jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
 
-    def whitened_at(self, vector: Array, predicted: Array, sigma: Array, shared: Array | float = 1.0) -> Whitened:
+    def whitened_at(self, vector: Array, predicted: Array, noise: Array, shared: Array | float = 1.0) -> Whitened:
         """Residuals without what they share, with these parameters, what they predict and the scale of the noise.
 
         shared: what the amplitude of that is multiplied by.
         """
-        at = self._correlation(vector)
         assert self.process is not None
-        at = at._replace(amplitude=shared * at.amplitude)
-        return self.process.whitened((predicted - self.values) / sigma, predicted / sigma, at)
+        return self.process.whitened(*self._logarithmic(predicted, noise), self._correlation(vector, shared))
 
     def lack_at(self, vector: Array, places: Array) -> tuple[Array, Array]:
-        """What the model lacks at other `places` relative to its value, as far as the data say: mean and sd, (M, C)."""
+        """What the model's logarithm lacks at other `places`, as far as the data say: mean and sd, (M, C)."""
         predicted = self.predict(vector)
+        noise = self._noise_at(vector, predicted)
         at = self._correlation(vector)
-        found = self.whitened_at(vector, predicted, self.sigma_at(vector, predicted))
         assert self.process is not None
-        return self.process.elsewhere(found, places, at, self.values.shape[-1])
+        z, relative = self._logarithmic(predicted, noise)
+        return self.process.elsewhere(self.process.whitened(z, relative, at), relative, places, at)
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
@@ -162,7 +171,7 @@ class Model(eqx.Module):
 
     def cost_at(self, vector: Array, predicted: Array) -> Array:
         """Half the sum of squared residuals with these parameters and what they predict, (N, C)."""
-        return half_squares(self._residuals(vector, predicted, self.sigma_at(vector, predicted)))
+        return half_squares(self._residuals(vector, predicted, self._noise_at(vector, predicted)))
 
     def residuals(self, vector: Array) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
@@ -183,14 +192,15 @@ class Model(eqx.Module):
         first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
         and how much of the errors that readings share counts.
         """
-        predicted = self.predict(vector)
-        sigma = self.sigma_at(vector, predicted)
-        rows = self._information_rows(vector, predicted, sigma)
+        predicted = self.predict(vector) if self.moving == vector.size else _by_columns(vector, model=self)
+        sigma = self._noise_at(vector, predicted)
         shared: Array | float = 1.0
+        held = sigma
         if first_step is not None:
             fixed_sigma, shared = first_step
-            sigma = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma)
-        return self._residuals(vector, predicted, sigma, shared), (predicted, rows)
+            held = jnp.where(jnp.isfinite(fixed_sigma), fixed_sigma, sigma) if self.varying else sigma
+        rows = self._information_rows(vector, predicted, sigma, shared)
+        return self._residuals(vector, predicted, held, shared), (predicted, rows)
 
     def log_likelihood_per_datum(self, vector: Array) -> Array:
         """Normalised log-density of each datum, (N, C); where readings share errors, given all others."""
@@ -198,12 +208,13 @@ class Model(eqx.Module):
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         """`log_likelihood_per_datum`, (N, C), from the values (N, C) that the parameters predict."""
-        sigma = self.sigma_at(vector, predicted)
-        z = (self.values - predicted) / sigma
+        sigma = self._noise_at(vector, predicted)
         if self.process is None:
+            z = (self.values - predicted) / sigma
             return log_density(z, sigma, self.tails, self.degrees_of_freedom)
-        found = self.whitened_at(vector, predicted, sigma)
-        own, precision = self.process.given_others(found, predicted / sigma, self._correlation(vector))
+        z, relative = self._logarithmic(predicted, sigma)
+        at = self._correlation(vector)
+        own, precision = self.process.given_others(self.process.whitened(z, relative, at), relative, at)
         width = sigma / jnp.sqrt(precision)
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
@@ -215,7 +226,7 @@ class Model(eqx.Module):
         """Normalised log-likelihood of all data, from the values (N, C) that the parameters predict."""
         if self.process is None:
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
-        sigma = self.sigma_at(vector, predicted)
+        sigma = self._noise_at(vector, predicted)
         found = self.whitened_at(vector, predicted, sigma)
         squares = jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
         levels = jnp.sum(found.levels) + jnp.sum(jnp.log(sigma))
@@ -235,10 +246,19 @@ class Model(eqx.Module):
         assert self.objective != "likelihood"
         return named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:]))
 
-    def _correlation(self, vector: Array) -> Correlation:
+    def _noise_at(self, vector: Array, predicted: Array) -> Array:
+        """`sigma_at`; where readings share errors, of the datum, so that it does not depend on what is predicted."""
+        return self.sigma_at(vector, predicted if self.process is None else self.values)
+
+    def _logarithmic(self, predicted: Array, noise: Array) -> tuple[Array, Array]:
+        """Residuals of logarithms, and an error of 1 in a logarithm, in units of the noise, (N, C) each."""
+        relative = size(self.values, self.softness) / noise
+        return relative * (logarithm(predicted, self.softness) - logarithm(self.values, self.softness)), relative
+
+    def _correlation(self, vector: Array, shared: Array | float = 1.0) -> Correlation:
         at = self.build(vector).correlation
         assert at is not None
-        return at
+        return at._replace(amplitude=shared * at.amplitude)
 
     def _residuals(
         self, vector: Array, predicted: Array, sigma: Array, shared: Array | float = 1.0
@@ -254,20 +274,35 @@ class Model(eqx.Module):
             levels.append(level_residual(found.levels))
         return (data, self.box.prior_residuals(vector), *levels)
 
-    def _information_rows(self, vector: Array, predicted: Array, sigma: Array) -> Array:
+    def _information_rows(self, vector: Array, predicted: Array, sigma: Array, shared: Array | float) -> Array:
         if self.objective != "likelihood":
             return self._named(predicted).reshape(-1)
         of_mean, of_level = information_weights(self.tails, self.degrees_of_freedom)
-        of_data = predicted / jax.lax.stop_gradient(sigma)
-        levels = [jnp.log(sigma).reshape(-1)] if self.varying else []
+        levels = [jnp.sqrt(of_level) * jnp.log(sigma).reshape(-1)] if self.varying else []
         if self.process is None:
-            rows = of_data.reshape(-1)
+            rows = (predicted / jax.lax.stop_gradient(sigma)).reshape(-1)
         else:
-            at, relative = jax.lax.stop_gradient((self._correlation(vector), predicted / sigma))
-            found = self.process.whitened(of_data, relative, at)
+            at = self._correlation(vector, shared)
+            held, noise = jax.lax.stop_gradient((at, sigma))
+            z, relative = self._logarithmic(predicted, noise)
+            found = self.process.whitened(z, relative, held)
             rows = jnp.concatenate([found.residuals.reshape(-1), found.latent])
-            levels.append(self.whitened_at(vector, predicted, sigma).levels)
-        return jnp.concatenate([jnp.sqrt(of_mean) * rows, *(jnp.sqrt(of_level) * level for level in levels)])
+            levels.append(self.process.information_rows(relative, at))
+        return jnp.concatenate([jnp.sqrt(of_mean) * rows, *levels])
+
+
+@eqx.filter_custom_jvp
+def _by_columns(vector: Array, *, model: Model) -> Array:
+    """`Model.predict`, of which a Jacobian takes the columns of parameters that matter to it alone, each once."""
+    return model.predict(vector)
+
+
+@_by_columns.def_jvp
+def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[Array, Array]:
+    (vector,), (moved,) = primals, tangents
+    steps = jnp.eye(vector.size)[: model.moving]
+    value, columns = jax.vmap(lambda step: jax.jvp(model.predict, primals, (step,)), out_axes=(None, -1))(steps)
+    return value, columns @ moved[: model.moving]
 
 
 def half_squares(residuals: tuple[Array, ...]) -> Array:

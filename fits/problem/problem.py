@@ -21,7 +21,8 @@ import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
-from fits.problem.likelihood import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise, Objective
+from fits.problem.likelihood import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise, Objective, total_sigma
+from fits.problem.logarithm import size, softness
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.process import Process, make_process
@@ -179,9 +180,26 @@ class _Levels(NamedTuple):
         return np.sqrt(self.variance + _lowest(self.floor) ** 2)
 
     @property
+    def fitted(self) -> bool:
+        """Whether a level is."""
+        return isinstance(self.relative, Free) or isinstance(self.floor, Free)
+
+    @property
     def varying(self) -> bool:
-        """Whether sigma depends on the parameters."""
+        """Whether sigma depends on the parameters, or on what they predict."""
         return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
+
+    def softness(self, values: Floats) -> Floats:
+        """Of the logarithms of readings (N, C), see `fits.problem.logarithm`."""
+        return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
+
+    def gram(self, process: Process, values: Floats) -> Array | None:
+        """What readings (N, C) tell of a process that they share; None where it depends on parameters."""
+        if self.fitted:
+            return None
+        variance, relative, floor = (jnp.asarray(level) for level in self)
+        sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
+        return process.gram_of(size(values, self.softness(values)) / sigma)
 
 
 def _assemble(problem: Problem) -> _Assembled:
@@ -191,6 +209,8 @@ def _assemble(problem: Problem) -> _Assembled:
         raise ValueError("data: no sample is used; at least one must be")
     levels = _noise_levels(problem.noise, used)
     process = make_process(used.wi, used.wo) if problem.noise.correlated else None
+    if process is not None:
+        process = replace(process, gram=levels.gram(process, used.values))
     template, names, free = split(_numbers(problem, levels, process), _parameter_name)
     if not names:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
@@ -198,7 +218,7 @@ def _assemble(problem: Problem) -> _Assembled:
         _require_noise(levels)
     else:
         _refuse_likelihood_only(problem, levels, free)
-    model = _model(problem, used, levels, template, Box.of(free), process)
+    model = _model(problem, used, levels, template, Box.of(free), process, names)
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
     _require_same_channels(model, start, used)
     return _Assembled(names, start, low, high, model)
@@ -263,7 +283,13 @@ def _refuse_likelihood_only(problem: Problem, levels: _Levels, free: tuple[Free,
 
 
 def _model(
-    problem: Problem, used: Measurements, levels: _Levels, template: Template, box: Box, process: Process | None
+    problem: Problem,
+    used: Measurements,
+    levels: _Levels,
+    template: Template,
+    box: Box,
+    process: Process | None,
+    names: tuple[str, ...],
 ) -> Model:
     return Model(
         template=template,
@@ -277,10 +303,12 @@ def _model(
         transport=problem.transport,
         known=lj.known_directions(used.wi, used.wo) if _uses_known(problem.transport) else None,
         process=process,
+        softness=None if process is None else jnp.asarray(levels.softness(used.values)),
         side=_side(used.wi, used.wo),
         objective=problem.objective,
         tails=problem.noise.tails,
-        varying=levels.varying,
+        varying=levels.varying if process is None else levels.fitted,
+        moving=sum(not name.startswith("noise.") for name in names),
     )
 
 
@@ -305,6 +333,10 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 
 def _lowest(level: float | Free) -> float:
     return float(level.arrays()[1]) if isinstance(level, Free) else float(level)
+
+
+def _start(level: float | Free) -> float:
+    return float(level.arrays()[0]) if isinstance(level, Free) else float(level)
 
 
 def _unit(name: str) -> str:

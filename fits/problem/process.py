@@ -1,9 +1,11 @@
-"""What a model lacks, as a Gaussian process: errors relative to its value that are alike where directions are alike.
+"""What a model lacks, as a Gaussian process: errors of its logarithm that are alike where directions are alike.
 
-With model value f, datum d and noise sigma, d = f (1 + e) + sigma n. e has Matern kernels of the angles of half vector
-and difference (Rusinkiewicz 1998), folded so that light and viewer may change places: errors follow a lobe from one
-incidence to the next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Channels have one correlation. The
-process lives on nodes of a grid, a cubic between them, and costs a matrix of as many rows as nodes that readings touch.
+With model value f, datum d and noise n, g(d) = g(f) + e + n, where g is the logarithm and, below four standard
+deviations of the noise, a straight line (`logarithm`). e has Matern kernels of the angles of half vector and difference
+(Rusinkiewicz 1998), folded so that light and viewer may change places: errors follow a lobe from one incidence to the
+next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Channels have one correlation. The process lives on
+nodes of a grid, a cubic between them, and costs a matrix of as many rows as nodes that readings touch. Noise is that of
+the datum, so that the covariance does not depend on the model, and most of its derivatives vanish.
 
 The negative log-density of all readings is half a sum of squares again, up to a constant: with A from white numbers c
 to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
@@ -11,32 +13,24 @@ to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A 
     (z'(1 + A A')^-1 z + log det (1 + A A')) / 2 = min_c (|z - A c|^2 + |c|^2) / 2 + sum log diag C.
 """
 
-from itertools import product
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jax.scipy.linalg import solve_triangular
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from fits.problem.nodes import grid
 
-STEP, LEAST_STEP = 7.0, 0.1
-"""Of the grid of nodes, in degrees, where readings reach far, and at least."""
-
-STEPS = 10
-"""At least across readings that do not reach far."""
-
-MOST_NODES, COARSER = 300, 1.25
-"""Where more would be touched, the grid is made so much coarser until they are not."""
-
-TINY, FLAT = 1e-9, 1e-6
+Trio = tuple[Array, Array, Array]
 
 JITTER = 1e-8
 """On the diagonal of a kernel's matrix: what rounding leaves of its smallest eigenvalues."""
+
+LEAST = 1e-6
+"""Of the information about a number of the process: what is kept of its smallest eigenvalue."""
 
 
 class Correlation(NamedTuple):
@@ -48,162 +42,246 @@ class Correlation(NamedTuple):
     channels: Any
 
 
-class Whitened(NamedTuple):
-    """Residuals that are independent, of N readings in C channels, and R nodes.
+class Roots(NamedTuple):
+    """Of the covariance of channels, (C, C), of nodes in the half vector's angle, (H, H), and in the difference,
+    (D, D); that of all is their product."""
 
-    residuals: z - A c, (N, C). latent: c, (R C,). matrix: B, (R C, R C). levels: the logarithms of its root's diagonal,
-    (R C,), none below 0.
+    channels: Array
+    half: Array
+    difference: Array
+
+
+class Whitened(NamedTuple):
+    """Residuals that are independent, of N readings in C channels, with R = C H D white numbers.
+
+    residuals: z - A c, (N, C). latent: c, (R,). levels: the logarithms of the diagonal of B's root, (R,), none below 0.
     """
 
     residuals: Array
     latent: Array
-    matrix: Array
     levels: Array
 
 
 class Process(eqx.Module):
-    """A process on R nodes. weights: (N, R), from nodes to readings. nodes: (R, 4), their `places`. steps: (2,), of the
-    grid, in degrees.
+    """A process on a `Grid` of H x D nodes. gram: `gram_of` readings, (C, H D, H D), where their noise is known; else
+    None.
     """
 
-    weights: Array
-    nodes: Array
+    half: Array
+    difference: Array
+    half_weights: Array
+    difference_weights: Array
     steps: Array
+    gram: Array | None = None
 
     def rows_beside(self, channels: int) -> int:
         """Residuals beside those of the readings: of white numbers, and of levels."""
-        return 2 * channels * self.nodes.shape[0]
+        return 2 * channels * self.half.size * len(self.difference)
+
+    def gram_of(self, relative: Array) -> Array:
+        """What readings tell of nodes, (C, H D, H D); relative: an error of 1 in units of the noise, (N, C)."""
+        weights = self.half_weights[:, :, None] * self.difference_weights[:, None, :]
+        weights = weights.reshape(len(weights), -1)
+        return jnp.stack([weights.T @ (column[:, None] ** 2 * weights) for column in relative.T])
 
     def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
-        """What is left of residuals z (N, C) in units of the noise; relative: the model's value in the same."""
-        channels, nodes = self._roots(at, z.shape[-1])
-        square = jnp.stack([self.weights.T @ (column[:, None] ** 2 * self.weights) for column in relative.T])
-        square = nodes.T @ square @ nodes
-        square = jnp.einsum("cd,ce,cij->idje", channels, channels, square)
-        size = nodes.shape[0] * channels.shape[0]
-        matrix = square.reshape(size, size) + jnp.eye(size)
-        wanted = nodes.T @ (self.weights.T @ (relative * z)) @ channels
-        latent, levels = _solved(matrix, wanted.reshape(size))
-        errors = self.weights @ (nodes @ latent.reshape(wanted.shape)) @ channels.T
-        return Whitened(z - relative * errors, latent, matrix, levels)
+        """What is left of residuals z (N, C) in units of the noise; relative: as for `gram_of`."""
+        wanted = jnp.stack([self.half_weights.T @ (x[:, None] * self.difference_weights) for x in (relative * z).T])
+        numbers, nodes = _numbers(at, z.shape[-1]), (self.half, self.difference)
+        if self.gram is None:
+            found = _whitened(numbers, nodes, self.gram_of(relative), wanted)
+        else:
+            found = _whitened_by_known(numbers, nodes, self.gram, wanted)
+        errors, latent, levels = found
+        return Whitened(z - relative * self._at_readings(errors), latent, levels)
 
     def drawn(self, white: Array, at: Correlation) -> Array:
-        """Relative errors of the readings, (N, C), from standard normal numbers (R, C)."""
-        channels, nodes = self._roots(at, white.shape[1])
-        return self.weights @ (nodes @ white) @ channels.T
+        """Errors of the readings, (N, C), from standard normal numbers (C, H, D)."""
+        roots = _roots(_numbers(at, len(white)), (self.half, self.difference), len(white))
+        return at.amplitude * self._at_readings(_mixed(roots, white))
 
     def given_others(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
         """Of each reading its weighted residual and precision, (N, C): given all others it has mean residual /
         precision and variance 1 / precision, in units of the noise.
         """
-        channels, nodes = self._roots(at, relative.shape[-1])
-        mixed = jnp.einsum("nc,ni,cd->ncid", relative, self.weights @ nodes, channels)
-        solved = solve_triangular(jnp.linalg.cholesky(found.matrix), mixed.reshape(relative.size, -1).T, lower=True)
+        roots, root = self._factors(relative, at)
+        parts = roots.channels, self.half_weights @ roots.half, self.difference_weights @ roots.difference
+        rows = at.amplitude * jnp.einsum("nc,cx,ni,nj->ncxij", relative, *parts)
+        solved = solve_triangular(root, rows.reshape(relative.size, -1).T, lower=True)
         return found.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
 
-    def elsewhere(self, found: Whitened, at_places: Array, at: Correlation, channels: int) -> tuple[Array, Array]:
-        """Relative errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
-        between, nodes = self._roots(at, channels)
-        across = solve_triangular(nodes, _kernel(self.nodes, at_places, at), lower=True).T
-        mixed = jnp.einsum("mi,cd->mcid", across, between).reshape(len(across), channels, -1)
-        solved = solve_triangular(jnp.linalg.cholesky(found.matrix), mixed.reshape(-1, mixed.shape[-1]).T, lower=True)
-        told = jnp.sum(mixed**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(mixed.shape[:2])
-        variance = at.amplitude**2 - told
-        return -mixed @ found.latent, jnp.sqrt(jnp.maximum(variance, 0.0))
+    def elsewhere(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
+        """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
+        roots, root = self._factors(relative, at)
+        half = _half_kernel(self.half, at_places[:, 0], at.half)
+        difference = _difference_kernel(self.difference, at_places[:, 1:], at.difference)
+        parts = (solve_triangular(a, b, lower=True) for a, b in ((roots.half, half), (roots.difference, difference)))
+        rows = at.amplitude * jnp.einsum("cx,im,jm->mcxij", roots.channels, *parts)
+        rows = rows.reshape(*rows.shape[:2], -1)
+        solved = solve_triangular(root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
+        told = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
+        return -rows @ found.latent, jnp.sqrt(jnp.maximum(at.amplitude**2 - told, 0.0))
 
-    def _roots(self, at: Correlation, channels: int) -> tuple[Array, Array]:
-        """Roots of the kernel between channels, and between nodes, with the amplitude."""
-        one = jnp.eye(channels)
-        between = _kernel_root(at.channels + (1.0 - at.channels) * one) if channels > 1 else one
-        plain = at._replace(amplitude=1.0)
-        return between, at.amplitude * _kernel_root(_kernel(self.nodes, self.nodes, plain))
+    def information_rows(self, relative: Array, at: Correlation) -> Array:
+        """Rows whose Jacobian A has in A'A the Fisher information of the readings about the numbers of the process.
+
+        With M = 1 - B^-1 and E = R^-1 dK R'^-1, K = R R' the covariance of the nodes, it is tr(M E M E) / 2.
+        """
+        count, nodes = relative.shape[-1], (self.half, self.difference)
+        numbers = _numbers(at, count)
+        held = jax.lax.stop_gradient(numbers)
+        roots, root = self._factors(relative, Correlation(*held, *[0.0] * (4 - len(held))))
+        inverse = _inverse(root)
+        sizes = tuple(len(one) for one in roots)
+        seen = (jnp.eye(len(root)) - inverse.T @ inverse).reshape(len(root), *sizes)
+        moved = jax.jacfwd(lambda x: _kernels(x, nodes, count))(held)
+        tops = [_inverse(one) for one in roots]
+        inner = [jnp.einsum("ij,jkn,lk->nil", top, one, top) for top, one in zip(tops, moved, strict=True)]
+        parts = [2.0 / jnp.where(held[0] > 0.0, held[0], 1.0) * seen]
+        parts.append(jnp.einsum("rchd,hg->rcgd", seen, inner[1][1]))
+        parts.append(jnp.einsum("rchd,df->rchf", seen, inner[2][2]))
+        if count > 1:
+            parts.append(jnp.einsum("rchd,cx->rxhd", seen, inner[0][3]))
+        flat = jnp.stack([part.reshape(root.shape) for part in parts])
+        information = 0.5 * jnp.einsum("kij,lji->kl", flat, flat)
+        scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST))
+        scaled = information * scale[:, None] * scale + LEAST * jnp.eye(len(scale))
+        return jax.lax.stop_gradient(jnp.linalg.cholesky(scaled).T / scale) @ numbers
+
+    def _at_readings(self, errors: Array) -> Array:
+        """(N, C), of those on the nodes, (C, H, D)."""
+        each = [jnp.sum((self.half_weights @ one) * self.difference_weights, axis=-1) for one in errors]
+        return jnp.stack(each, axis=-1)
+
+    def _factors(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
+        """Roots of the covariances, and of B."""
+        count = relative.shape[-1]
+        gram = self.gram_of(relative) if self.gram is None else self.gram
+        numbers = _numbers(at, count)
+        roots = _roots(numbers, (self.half, self.difference), count)
+        return roots, jnp.linalg.cholesky(_matrix(numbers[0], roots, gram))
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike) -> Process:
     """The process of readings along these directions, (N, 3) each."""
-    where = places(wi, wo)
-    spans = np.array([np.ptp(where[:, 0]), max(np.ptp(where[:, 1]), np.ptp(where[:, 2]))])
-    steps = np.clip(spans / STEPS, LEAST_STEP, STEP)
-    while True:
-        weights, nodes = _touched(where, steps)
-        if len(nodes) <= MOST_NODES:
-            return Process(jnp.asarray(weights), jnp.asarray(nodes), jnp.asarray(steps))
-        steps = COARSER * steps
-
-
-def places(wi: ArrayLike, wo: ArrayLike) -> Floats:
-    """Where pairs of directions (N, 3) lie, (N, 4), in degrees: angle of half vector and normal, that of light and
-    viewer to it along the plane of both and across; and the side: 0 and 1 reflection above and below, 2 through.
-    """
-    wi, wo = np.asarray(wi, float), np.asarray(wo, float)
-    side = np.where(wi[:, 2] * wo[:, 2] <= 0.0, 2.0, np.where(wi[:, 2] > 0.0, 0.0, 1.0))
-    upright = np.array([1.0, 1.0, 0.0])
-    first, second = (w * upright + np.abs(w) * (1.0 - upright) for w in (wi, wo))
-    half = first + second
-    length = np.linalg.norm(half, axis=-1, keepdims=True)
-    half = np.where(length > TINY, half / np.maximum(length, TINY), [0.0, 0.0, 1.0])
-    tilt = np.degrees(np.arctan2(np.hypot(half[:, 0], half[:, 1]), half[:, 2]))
-    apart = np.degrees(2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(first - second, axis=-1), 0.0, 1.0))) / 2.0
-    normal = np.array([0.0, 0.0, 1.0]) - half[:, 2:] * half  # in the plane of normal and half vector
-    parts = [np.abs(np.sum(axis * (first - second), axis=-1)) for axis in (normal, np.cross(half, normal))]
-    size = np.hypot(*parts)
-    along, across = (
-        np.where(size > TINY, part / np.maximum(size, TINY), one) for part, one in zip(parts, (1.0, 0.0), strict=True)
-    )
-    return np.stack([tilt, apart * along, apart * across, side], axis=-1)
+    return Process(*map(jnp.asarray, grid(wi, wo)))
 
 
 def matern(distance: Any, length: Any) -> Array:
-    """Matern kernel of smoothness 3/2."""
-    x = jnp.sqrt(3.0) * distance / length
-    return (1.0 + x) * jnp.exp(-x)
+    """Matern kernel of smoothness 5/2."""
+    x = jnp.sqrt(5.0) * distance / length
+    return (1.0 + x + x**2 / 3.0) * jnp.exp(-x)
 
 
-def _kernel(one: Any, other: Any, at: Correlation) -> Array:
-    """Between places (M, 4) and (R, 4)."""
-    gaps = [jnp.asarray(one)[:, None, k] - jnp.asarray(other)[None, :, k] for k in range(4)]
-    apart = jnp.sqrt(gaps[1] ** 2 + gaps[2] ** 2)
-    alike = matern(jnp.abs(gaps[0]), at.half) * matern(apart, at.difference)
-    return at.amplitude**2 * jnp.where(gaps[3] == 0.0, alike, 0.0)
+def _half_kernel(one: Array, other: Array, length: Any) -> Array:
+    return matern(jnp.abs(one[:, None] - other), length)
 
 
-def _touched(where: Floats, steps: Floats) -> tuple[Floats, Floats]:
-    """Weights (N, R) from the nodes that readings touch, and these, (R, 4)."""
-    sizes = np.array([steps[0], steps[1], steps[1]])
-    flat = np.ptp(where[:, :3], axis=0) < FLAT
-    scaled = where[:, :3] / sizes
-    first = np.floor(scaled).astype(int)
-    part = scaled - first
-    entries: dict[tuple[int, ...], int] = {}
-    rows, columns, values = [], [], []
-    for offsets in product(*([0] if level else range(-1, 3) for level in flat)):
-        weight = np.ones(len(where))
-        key = np.where(flat, 0, first + np.array(offsets))
-        for axis in range(3):
-            if not flat[axis]:
-                weight = weight * _cubic(part[:, axis] - offsets[axis])
-        for row in np.flatnonzero(weight):
-            entry = (*map(int, key[row]), int(where[row, 3]))
-            rows.append(int(row))
-            columns.append(entries.setdefault(entry, len(entries)))
-            values.append(float(weight[row]))
-    weights = np.zeros((len(where), len(entries)))
-    np.add.at(weights, (rows, columns), values)
-    keys = np.array(list(entries), float)
-    nodes = np.where(flat, where[0, :3], keys[:, :3] * sizes)
-    return weights, np.concatenate([nodes, keys[:, 3:]], axis=-1)
+def _difference_kernel(one: Array, other: Array, length: Any) -> Array:
+    """Between (D, 3) and (M, 3): angles, and sides that have nothing in common."""
+    gaps = [one[:, None, k] - other[None, :, k] for k in range(3)]
+    return jnp.where(gaps[2] == 0.0, matern(jnp.hypot(gaps[0], gaps[1]), length), 0.0)
 
 
-def _cubic(x: Floats) -> Floats:
-    """Cubic convolution (Keys 1981): what a node counts at a distance of x steps."""
-    x = np.abs(x)
-    near = 1.5 * x**3 - 2.5 * x**2 + 1.0
-    far = -0.5 * x**3 + 2.5 * x**2 - 4.0 * x + 2.0
-    return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))
+def _numbers(at: Correlation, channels: int) -> Array:
+    """Those of a process that matter, (3,) or (4,)."""
+    return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:3])])
 
 
-def _kernel_root(matrix: Array) -> Array:
-    return _root(matrix + JITTER * jnp.eye(len(matrix)))
+def _kernels(numbers: Array, nodes: tuple[Array, Array], channels: int) -> tuple[Array, Array, Array]:
+    """Covariances, but for the amplitude: see `Roots`."""
+    between = numbers[3] + (1.0 - numbers[3]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
+    half, difference = nodes
+    plain = (between, _half_kernel(half, half, numbers[1]), _difference_kernel(difference, difference, numbers[2]))
+    first, second, third = (one + JITTER * jnp.eye(len(one)) for one in plain)
+    return first, second, third
+
+
+def _roots(numbers: Array, nodes: tuple[Array, Array], channels: int) -> Roots:
+    return Roots(*map(_root, _kernels(numbers, nodes, channels)))
+
+
+def _mixed(roots: Roots, x: Array) -> Array:
+    """R x, for x (C, H, D)."""
+    return jnp.einsum("cx,xhd->chd", roots.channels, roots.half @ x @ roots.difference.T)
+
+
+def _matrix(amplitude: Array, roots: Roots, gram: Array) -> Array:
+    """B, (R, R)."""
+    square = _square(roots, gram)
+    return amplitude**2 * square + jnp.eye(len(square))
+
+
+def _square(roots: Roots, gram: Array) -> Array:
+    """A'A at an amplitude of 1, (R, R)."""
+    channels, half, difference = roots
+    shape = (len(half), len(difference))
+    square = gram.reshape(-1, *shape, *shape)
+    square = jnp.einsum("chdgf,hi->cidgf", square, half)
+    square = jnp.einsum("cidgf,dj->cijgf", square, difference)
+    square = jnp.einsum("cijgf,gk->cijkf", square, half)
+    square = jnp.einsum("cijkf,fl->cijkl", square, difference)
+    if len(channels) > 1:
+        square = jnp.einsum("cx,cy,cijkl->xijykl", channels, channels, square)
+    size = len(channels) * shape[0] * shape[1]
+    return square.reshape(size, size)
+
+
+def _whitened(numbers: Array, nodes: tuple[Array, Array], gram: Array, wanted: Array) -> tuple[Array, Array, Array]:
+    """Errors on the nodes, (C, H, D), white numbers and levels, from what readings tell and want, (C, H, D)."""
+    roots = _roots(numbers, nodes, len(wanted))
+    latent, levels = _solved(_matrix(numbers[0], roots, gram), numbers[0] * _mixed_back(roots, wanted))
+    return numbers[0] * _mixed(roots, latent.reshape(wanted.shape)), latent, levels
+
+
+def _mixed_back(roots: Roots, x: Array) -> Array:
+    """R'x, (R,), for x (C, H, D)."""
+    return jnp.einsum("xc,xhd->chd", roots.channels, roots.half.T @ x @ roots.difference).reshape(-1)
+
+
+@jax.custom_jvp
+def _whitened_by_known(numbers: Array, nodes: tuple[Array, Array], gram: Array, wanted: Array) -> Trio:
+    """`_whitened` with nodes and gram that do not depend on parameters.
+
+    Of a Jacobian by many parameters, matrices of derivatives are made for the few numbers of the process alone.
+    """
+    return _whitened(numbers, nodes, gram, wanted)
+
+
+@_whitened_by_known.defjvp
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
+    numbers, nodes, gram, wanted = primals
+    moved, _, _, change = tangents
+    amplitude = numbers[0]
+
+    def parts(lengths: Array) -> tuple[Array, Array]:
+        roots = _roots(jnp.concatenate([numbers[:1], lengths]), nodes, len(wanted))
+        return _square(roots, gram), _mixed_back(roots, wanted)
+
+    def on_nodes(numbers: Array, latent: Array) -> Array:
+        roots = _roots(numbers, nodes, len(wanted))
+        return numbers[0] * _mixed(roots, latent.reshape(wanted.shape))
+
+    square, target = parts(numbers[1:])
+    squares, targets = jax.jacfwd(parts)(numbers[1:])
+    squares, targets = jnp.moveaxis(squares, -1, 0), targets.T
+    root = jnp.linalg.cholesky(amplitude**2 * square + jnp.eye(len(square)))
+    inverse = _inverse(root)
+    latent = amplitude * (inverse.T @ (inverse @ target))
+    pulled = [target - 2.0 * amplitude * (square @ latent)]
+    pulled += [amplitude * (one - amplitude * (by @ latent)) for one, by in zip(targets, squares, strict=True)]
+    latents = (inverse.T @ (inverse @ jnp.stack(pulled, axis=-1))).T
+    safe = jnp.where(amplitude > 0.0, amplitude, 1.0)
+    levels = [jnp.where(amplitude > 0.0, (1.0 - jnp.sum(inverse**2, axis=-1)) / safe, 0.0)]
+    levels += [0.5 * amplitude**2 * jnp.sum((inverse @ by) * inverse, axis=-1) for by in squares]
+    errors, by_numbers = jax.vmap(lambda *step: jax.jvp(on_nodes, (numbers, latent), step), out_axes=(None, 0))(
+        jnp.eye(len(numbers)), latents
+    )
+    roots = _roots(numbers, nodes, len(wanted))
+    own = amplitude * (inverse.T @ (inverse @ _mixed_back(roots, change)))
+    found = errors, latent, jnp.log(jnp.diagonal(root))
+    by_errors = jnp.tensordot(moved, by_numbers, 1) + on_nodes(numbers, own)
+    return found, (by_errors, moved @ latents + own, moved @ jnp.stack(levels))
 
 
 @jax.custom_jvp

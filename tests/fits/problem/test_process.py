@@ -15,9 +15,10 @@ from fits.inference.descent import here
 from fits.problem.correlated import Correlated
 from fits.problem.likelihood import Noise
 from fits.problem.model import Model
+from fits.problem.nodes import places
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.problem.process import Correlation, make_process, places
+from fits.problem.process import Correlation, Process, make_process
 from fits.problem.stack_file import read_problem, write_problem
 
 FREE = Free(0.4, 0.0, 1.0)
@@ -52,8 +53,8 @@ def problem(layout: str, channels: int = 1, **correlated) -> Problem:
 
 def matern(distance: np.ndarray, length: float) -> np.ndarray:
     """Rasmussen & Williams 2006, Eq. 4.17."""
-    x = np.sqrt(3.0) * distance / length
-    return (1.0 + x) * np.exp(-x)
+    x = np.sqrt(5.0) * distance / length
+    return (1.0 + x + x**2 / 3.0) * np.exp(-x)
 
 
 def folded(data: Measurements) -> np.ndarray:
@@ -85,20 +86,42 @@ def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
     return float(at.amplitude) ** 2 * alike
 
 
+def soft(of: Problem) -> np.ndarray:
+    """Four standard deviations of the additive noise, (N, C)."""
+    floor = 1e-4 * np.median(np.abs(of.data.values))
+    return 4.0 * np.hypot(of.data.sigma, floor)
+
+
+def on_nodes(process: Process) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (N, R) and places (R, 4) of all nodes."""
+    weights = np.einsum("nh,nd->nhd", process.half_weights, process.difference_weights)
+    half = np.repeat(np.asarray(process.half), len(process.difference))
+    difference = np.tile(np.asarray(process.difference), (process.half.size, 1))
+    return weights.reshape(len(weights), -1), np.concatenate([half[:, None], difference], axis=-1)
+
+
 def dense(of: Problem, vector: np.ndarray, nodes: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of all readings, (N C,) and (N C, N C): of the process on nodes, or everywhere."""
+    """Mean and covariance of all logarithms asinh(x / s), (N C,) and (N C, N C): of the process on nodes, or
+    everywhere."""
     model = of.model
     at, process = model.build(jnp.asarray(vector)).correlation, model.process
     assert process is not None
-    predicted, sigma = (np.asarray(part(jnp.asarray(vector))) for part in (model.predict, model.sigma))
+    predicted = np.asarray(model.predict(jnp.asarray(vector)))
     count, channels = predicted.shape
-    weights, grid = np.asarray(process.weights), np.asarray(process.nodes)
+    weights, grid = on_nodes(process)
     own = folded(of.data)
     shared = weights @ kernel(grid, grid, at) @ weights.T if nodes else kernel(own, own, at)
     colours = float(at.channels) + (1.0 - float(at.channels)) * np.eye(channels) if channels > 1 else np.ones((1, 1))
     full = np.einsum("nm,cd->ncmd", shared, colours).reshape(count * channels, -1)
-    flat = predicted.ravel()
-    return flat, flat[:, None] * full * flat + np.diag(sigma.ravel() ** 2)
+    values, s = of.data.values, soft(of)
+    noise = np.sqrt((s / 4.0) ** 2 + (0.01 * values) ** 2) / np.hypot(values, s)
+    return np.arcsinh(predicted / s).ravel(), full + np.diag(noise.ravel() ** 2)
+
+
+def logarithms(of: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Of the readings, and of their derivatives, (N C,)."""
+    values, s = of.data.values.ravel(), soft(of).ravel()
+    return np.arcsinh(values / s), -np.log(np.hypot(values, s))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
@@ -107,7 +130,8 @@ def test_likelihood_is_that_of_the_dense_matrix(layout: str, channels: int) -> N
     of = problem(layout, channels)
     for vector in (of.start, 0.3 * of.start + 0.7 * of.low, 0.5 * (of.low + of.high)):
         mean, covariance = dense(of, vector)
-        expected = stats.multivariate_normal(mean, covariance).logpdf(of.data.values.ravel())
+        where, slopes = logarithms(of)
+        expected = stats.multivariate_normal(mean, covariance).logpdf(where) + np.sum(slopes)
         # the kernels' jitter is 1e-8 of variances up to 1e3 times those of the noise
         assert float(of.log_likelihood(vector)) == pytest.approx(expected, abs=1e-3)
 
@@ -117,9 +141,10 @@ def test_each_reading_given_all_others(layout: str) -> None:
     of = problem(layout, 2)
     mean, covariance = dense(of, of.start)
     precision = np.linalg.inv(covariance)
-    own = precision @ (of.data.values.ravel() - mean)
+    where, slopes = logarithms(of)
+    own = precision @ (where - mean)
     width = 1.0 / np.sqrt(np.diagonal(precision))
-    expected = stats.norm.logpdf(own * width) - np.log(width)
+    expected = stats.norm.logpdf(own * width) - np.log(width) + slopes
     np.testing.assert_allclose(np.ravel(of.log_likelihood_per_datum(of.start)), expected, atol=1e-4)
 
 
@@ -165,9 +190,10 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
     values = np.ones((len(geometry), 1))
     new = Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), ("value",))
     mean, covariance = dense(of, of.start)
-    across = kernel(folded(new), np.asarray(process.nodes), at) @ np.asarray(process.weights).T * mean
+    weights, grid = on_nodes(process)
+    across = kernel(folded(new), grid, at) @ weights.T
     solved = np.linalg.solve(covariance, across.T).T
-    expected = solved @ (of.data.values.ravel() - mean)
+    expected = solved @ (logarithms(of)[0] - mean)
     variance = 0.2**2 - np.sum(solved * across, axis=-1)
     found, sd = of.call(Model.lack_at, of.start, places(new.wi, new.wo))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-5)
@@ -186,13 +212,51 @@ def test_half_squares_are_minus_the_log_posterior() -> None:
     np.testing.assert_allclose(np.add(halves, heights), halves[0] + heights[0], rtol=1e-10)
 
 
-def test_no_amplitude_is_plain_noise() -> None:
+def test_no_amplitude_leaves_readings_by_themselves() -> None:
     of = problem("two incidences", 2, amplitude=1e-6)
-    plain = Problem(of.stack, of.data, transport, Noise(relative=0.01))
-    sizes = np.abs(np.asarray(of.call(Model.standardised_at, of.start, of.predict(of.start)))) / 0.02
+    mean, covariance = dense(of, of.start)
+    (where, slopes), width = logarithms(of), np.sqrt(np.diagonal(covariance))
+    alone = np.sum(stats.norm.logpdf((where - mean) / width) - np.log(width) + slopes)
     # z'AA'z / 2, where all readings share one error
-    bound = 0.5 * (1e-6 * np.sum(sizes)) ** 2
-    assert float(of.log_likelihood(of.start)) == pytest.approx(float(plain.log_likelihood(plain.start)), abs=bound)
+    bound = 0.5 * (1e-6 * np.sum(np.abs(where - mean) / width**2)) ** 2
+    assert float(of.log_likelihood(of.start)) == pytest.approx(alone, abs=bound)
+
+
+def test_readings_below_their_noise_are_taken_as_they_are() -> None:
+    """Dark readings, of both signs: what is told of them is what Gaussian noise about the model tells."""
+    of = problem("one scan", amplitude=1e-6)
+    generator = np.random.default_rng(4)
+    values = 1e-3 * generator.standard_normal(of.data.values.shape)
+    dark = Measurements(of.data.wi, of.data.wo, values, np.full_like(values, 1e-3), of.data.mask, ("value",))
+    stack = {"a": Free(1e-4, 0.0, 1e-3), "colour": 1e-3}
+    noises = (Noise(correlated=Correlated(amplitude=1e-6)), Noise())
+    shared, plain = (Problem(stack, dark, transport, noise) for noise in noises)
+    levels = [[float(of.log_likelihood([a, *of.start[1:]])) for a in (1e-4, 1e-3)] for of in (shared, plain)]
+    # of a reading of x = d / s, s four sigma, residuals about 0 are sqrt(1 + x^2) asinh(x) / x = 1 + x^2 / 3 times
+    # those without the logarithm; the model is a tenth of sigma
+    np.testing.assert_allclose(levels[0], levels[1], atol=1.3 * np.sum((values / 1e-3) ** 4) / 48.0)
+    assert np.diff(levels[0]) == pytest.approx(np.diff(levels[1]), abs=0.1)
+
+
+def test_information_is_that_of_the_covariance() -> None:
+    """tr(S^-1 dS S^-1 dS) / 2 by finite differences of the dense covariance."""
+    of = problem("two planes", 2)
+    names = [name for name in of.names if name.startswith("noise")]
+    first = len(of.names) - len(names)
+    _, covariance = dense(of, of.start)
+    moved = []
+    for index in range(first, len(of.names)):
+        ends = []
+        for sign in (1.0, -1.0):
+            vector = of.start.copy()
+            vector[index] *= 1.0 + 1e-4 * sign
+            ends.append(dense(of, vector)[1])
+        moved.append(np.linalg.solve(covariance, (ends[0] - ends[1]) / (2e-4 * of.start[index])))
+    expected = 0.5 * np.array([[np.sum(one * other.T) for other in moved] for one in moved])
+    rows = np.asarray(of.call(lambda model, v: jax.jacfwd(lambda w: model.linear_parts(w)[1][1])(v), of.start))
+    found = (rows.T @ rows)[first:, first:]
+    scale = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-4)
 
 
 @pytest.mark.parametrize("end", ["low", "high", "start"])
@@ -234,8 +298,9 @@ def test_readings_all_over_the_hemisphere_are_carried() -> None:
     generator = np.random.default_rng(0)
     wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in generator.standard_normal((2, 500, 3)))
     process = make_process(np.abs(wi), np.abs(wo))
-    assert process.nodes.shape[0] <= 300
-    np.testing.assert_allclose(np.sum(process.weights, axis=-1), 1.0, atol=1e-12)
+    assert process.half.size * len(process.difference) <= 300
+    for weights in (process.half_weights, process.difference_weights):
+        np.testing.assert_allclose(np.sum(weights, axis=-1), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
