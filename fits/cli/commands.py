@@ -33,6 +33,7 @@ def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     use_jax()
     from fits.inference.nuts import require_blackjax
+    from fits.inference.optimise import again
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
@@ -69,7 +70,8 @@ def fit(arguments: Namespace) -> int:
             text = given.text if objective == given.objective else None
             results.write_fit(result, folder, text)
             write_report(folder, directory.resolve().name, result)
-        done.unlink(missing_ok=True)
+        for starts in (done, again(done)):
+            starts.unlink(missing_ok=True)
         progress("pictures and report", 1, 1)
     for table in (tables.parameter_table(result), *([tables.minima_table(result)] if len(result.minima) > 1 else [])):
         tables.print_table(table, sys.stdout)

@@ -33,6 +33,22 @@ class Minimum:
     stack: Any
 
 
+@dataclass(frozen=True)
+class Alone:
+    """The same stack fitted with noise that readings do not share: values and standard errors by name, how well.
+
+    alike: correlation of residuals of neighbours along the scans. pairs: of them.
+    """
+
+    values: dict[str, float]
+    errors: dict[str, float]
+    chi_square: float
+    degrees_of_freedom: int
+    log_likelihood: float
+    alike: float
+    pairs: int
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The best minimum of a `Problem` with P parameters, N used samples and C channels.
@@ -59,6 +75,8 @@ class Fit:
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
             from a coarser one, which is more than it. None for a transport without a resolution.
         resolution: of the transport, in words; None where it has none. `problem` holds it.
+        alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
+            that rule (see `Noise`); else None.
     """
 
     problem: Problem
@@ -79,6 +97,7 @@ class Fit:
     ended: Mapping[str, int] = field(default_factory=dict)
     numerical_error: float | None = None
     resolution: str | None = None
+    alone: Alone | None = None
 
     @property
     def values(self) -> dict[str, float]:

@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from fits.data.measurements import Measurements
 from fits.inference.descent import descend
-from fits.inference.fit_result import ENDED, Fit, Minimum
+from fits.inference.fit_result import ENDED, Alone, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import at_start, resolutions
+from fits.inference.shared_errors import alone, are_shared, left_open, points
 from fits.inference.starts import MOST_STEPS, End, Solver, run_starts, start_points
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.compiled import cores, in_shares
@@ -74,7 +75,8 @@ def fit(
             "bounded" (L-BFGS-B throughout).
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays; one of another problem is replaced.
+            done. It stays, as does one beside it for what is fitted again with shared errors (`again`); one of another
+            problem is replaced.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
@@ -105,17 +107,50 @@ def fit_problem(
         raise ValueError(f"starts is {starts}; it must be at least 1")
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    known, progress = resolutions(problem), progress or _silent
+    settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
+    progress = progress or _silent
+    found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings)
+    if not left_open(problem):
+        return found
+    without = alone(found)
+    if not are_shared(without):
+        return found
+    problem = replace(problem, noise=replace(problem.noise, correlated=True))
+    if checkpoint is not None:
+        checkpoint = again(checkpoint)
+
+    def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        progress(f"{stage} with shared errors", done, total, info)
+
+    return _found(problem, points(problem, found, starts, seed), solver, report, checkpoint, settings, without)
+
+
+def again(checkpoint: str | Path) -> Path:
+    """Where a fit that is made again, with shared errors, keeps its starts."""
+    return Path(f"{checkpoint}-shared")
+
+
+def _found(
+    problem: Problem,
+    places: Floats,
+    solver: Solver,
+    progress: Progress,
+    checkpoint: str | Path | None,
+    settings: dict[str, int | str],
+    without: Alone | None = None,
+) -> Fit:
+    """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
+    known = resolutions(problem)
     if known is not None and known.open:
         problem = replace(problem, transport=known.far)
-    ends = _ends(problem, start_points(problem, starts, seed), solver, progress, checkpoint)
+    ends = _ends(problem, places, solver, progress, checkpoint)
     best, accuracy = optimum(problem, ends, solver), None
     if known is not None:
         best, accuracy = refined(best, known, solver, progress)
-    return _fit_of(best, accuracy, {"starts": starts, "seed": seed, "solver": solver})
+    return _fit_of(best, accuracy, settings, without)
 
 
-def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str]) -> Fit:
+def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Alone | None) -> Fit:
     """The fit of an optimum, with what is to be said of it."""
     problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
@@ -140,6 +175,7 @@ def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | st
         ended=ended,
         numerical_error=None if accuracy is None else accuracy.error,
         resolution=None if accuracy is None else accuracy.resolution,
+        alone=without,
     )
     notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
     notes += [] if accuracy is None else [accuracy.words]

@@ -39,7 +39,9 @@ class Noise:
     tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
     then sigma.
     correlated: errors of the model that neighbouring readings share, beside those: `Correlated`, or True for one whose
-    numbers are all free; only with Gaussian tails.
+    numbers are all free; only with Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted
+    without; where residuals of neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is
+    fitted with them, and the fit tells of both (`Fit.alone`). A `Problem` by itself has none then.
     Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
@@ -50,7 +52,7 @@ class Noise:
     use_sigma: bool = True
     tails: Tails = "gaussian"
     degrees_of_freedom: float = 4.0
-    correlated: Correlated | bool = False
+    correlated: Correlated | bool | None = None
 
     def __post_init__(self) -> None:
         for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
@@ -67,7 +69,7 @@ class Noise:
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
         if self.correlated is True:
             object.__setattr__(self, "correlated", Correlated())
-        if not (self.correlated is False or isinstance(self.correlated, Correlated)):
+        if not (self.correlated in (False, None) or isinstance(self.correlated, Correlated)):
             raise ValueError(f"Noise.correlated is {shown(self.correlated)}; it must be true, false or Correlated")
         if self.correlated and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with correlated noise it must be gaussian")

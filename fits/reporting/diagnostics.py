@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.data.scans import incidences, scans
+from fits.data.neighbours import alike, neighbours
+from fits.data.scans import incidences
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -91,9 +92,8 @@ def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualS
         values = values[np.isfinite(values)]
         if values.size:
             groups.append(ResidualGroup(incidence.theta, values.size, float(values.mean()), _rms(values)))
-    first, second = _neighbours(data, residuals)
-    norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
-    lag_one = float(np.sum(first * second) / norm) if norm > 0.0 else float("nan")
+    first, second = neighbours(data, residuals)
+    lag_one = alike(first, second)
     return ResidualStructure(
         count=finite.size,
         mean=float(finite.mean()),
@@ -105,28 +105,6 @@ def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualS
         lag_one_sigma=lag_one * float(np.sqrt(first.size)),
         by_incidence=tuple(groups),
     )
-
-
-def autocorrelation(data: "Measurements", residuals: np.ndarray, longest: int = 20) -> np.ndarray:
-    """Correlation of residuals (N, C) that lie 1, 2, ... `longest` readings apart in one plane; NaN where none do."""
-    values = []
-    for lag in range(1, longest + 1):
-        first, second = _neighbours(data, residuals, lag)
-        norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
-        values.append(np.sum(first * second) / norm if norm > 0.0 else np.nan)
-    return np.array(values)
-
-
-def _neighbours(data: "Measurements", residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    # The mean is not subtracted: a bias over a stretch of angle is structure too.
-    pairs = []
-    for rows in scans(data):
-        track = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
-        if len(track) > lag:
-            pairs.append((track[:-lag].ravel(), track[lag:].ravel()))
-    if not pairs:
-        return np.empty(0), np.empty(0)
-    return np.concatenate([first for first, _ in pairs]), np.concatenate([second for _, second in pairs])
 
 
 def _rms(values: np.ndarray) -> float:

@@ -111,7 +111,11 @@ def page(
         _section(
             "The stack", _image(images, "stack", "Fitted stack, from top to bottom; not to scale."), _stack_text(fit)
         ),
-        _section("Values", tables.html_table(tables.parameter_table(fit))),
+        _section(
+            "Values",
+            tables.html_table(tables.parameter_table(fit)),
+            "" if fit.alone is None else tables.html_table(tables.alone_table(fit)),
+        ),
         _section(
             "Data and model",
             _image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),

@@ -106,6 +106,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "transport": transport_to_dict(transport),
         "resolution": fit.resolution,
         "numerical_error": fit.numerical_error,
+        "alone": None if fit.alone is None else asdict(fit.alone),
         "source": asdict(problem.data.source),
         "fixed_scale": None if scale is not None else problem.scale,
         "parameters": [
@@ -142,6 +143,7 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.problem.problem import Problem
     from fits.problem.stack_file import read_problem, transport_from_dict
     from fits.reporting.earlier import transport_meant
+    from fits.reporting.stored import stored_alone, stored_array, stored_number
 
     directory = Path(directory)
     content = _content(directory)
@@ -154,27 +156,34 @@ def load_fit(directory: str | Path) -> "Fit":
             transport = transport_from_dict(content["transport"])
         else:
             transport = transport_meant(given.stack, given.transport)
-        problem = Problem(given.stack, data, transport, given.noise, scale, given.objective)
+        noise, found_alone = given.noise, content.get("alone")
+        if found_alone is not None:
+            noise = replace(noise, correlated=True)
+        problem = Problem(given.stack, data, transport, noise, scale, given.objective)
         stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
         minima = tuple(
-            Minimum(values, _number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack)
+            Minimum(
+                values, stored_number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack
+            )
             for one in content["minima"]
-            for values in ({name: _number(value) for name, value in one["values"].items()},)
+            for values in ({name: stored_number(value) for name, value in one["values"].items()},)
         )
         return Fit(
             problem=problem,
-            vector=_array(stored["vector"], count),
-            errors=_array(stored["errors"], count),
-            covariance=_array(stored["covariance"], count, count),
-            cost=_number(stored["cost"]),
+            vector=stored_array(stored["vector"], count),
+            errors=stored_array(stored["errors"], count),
+            covariance=stored_array(stored["covariance"], count, count),
+            cost=stored_number(stored["cost"]),
             at_bound=tuple(stored["at_bound"]),
             converged=stored["converged"],
             status=stored["status"],
             iterations=stored["iterations"],
-            condition_number=_number(stored["condition_number"]),
+            condition_number=stored_number(stored["condition_number"]),
             unresolved=tuple(
                 Combination(
-                    _number(one["error"]), one["weights"], {name: _number(e) for name, e in one["alone"].items()}
+                    stored_number(one["error"]),
+                    one["weights"],
+                    {name: stored_number(e) for name, e in one["alone"].items()},
                 )
                 for one in content["unresolved"]
             ),
@@ -184,8 +193,9 @@ def load_fit(directory: str | Path) -> "Fit":
             without_influence=tuple(content.get("without_influence", ())),
             settings=content.get("settings", {}),
             ended=content.get("starts_ended", {}),
-            numerical_error=None if error is None else _number(error),
+            numerical_error=None if error is None else stored_number(error),
             resolution=content.get("resolution"),
+            alone=None if found_alone is None else stored_alone(found_alone),
         )
     except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
@@ -265,14 +275,6 @@ def _content(directory: Path) -> dict[str, Any]:
         if path.is_file() and text_checksum(path) != checksum:
             raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
     return content
-
-
-def _number(value: float | str) -> float:
-    return float(value)
-
-
-def _array(values: list[Any], *shape: int) -> np.ndarray:
-    return np.array(values, dtype=float).reshape(shape)
 
 
 def check_directory(directory: Path, force: bool) -> None:

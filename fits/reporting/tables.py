@@ -128,6 +128,19 @@ def parameter_table(fit: "Fit") -> Table:
     )
 
 
+def alone_table(fit: "Fit") -> Table:
+    """Values and errors of a fit beside those of the same stack with noise that readings do not share."""
+    assert fit.alone is not None
+    rows = []
+    for name, value in fit.alone.values.items():
+        pairs = (fit.values[name], fit.standard_errors[name]), (value, fit.alone.errors[name])
+        rows.append((name, *(word for pair in pairs for word in with_error(*pair)), fit.units[name]))
+    ratio = fit.alone.chi_square / max(fit.alone.degrees_of_freedom, 1)
+    note = f"Chi-square per degree of freedom is {fit.reduced_chi_square:.3g} with and {ratio:.3g} without."
+    columns = ("parameter", "with", "error", "without", "error", "unit")
+    return Table("With and without errors that readings share", columns, tuple(rows), note)
+
+
 def minima_table(fit: "Fit") -> Table:
     """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
     shown = fit.minima[:MOST_MINIMA]

@@ -123,7 +123,20 @@ def shared_errors(fit: "Fit") -> list[str]:
     return [
         f"Neighbouring readings share errors of the model of {100.0 * float(at.amplitude):.2g} % of its value, alike "
         f"over {reach}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
-        "bands of predictions, count them."
+        "bands of predictions, count them.",
+        *_without_them(fit),
+    ]
+
+
+def _without_them(fit: "Fit") -> list[str]:
+    """Why the fit counts what readings share, where it was left to the residuals."""
+    if fit.alone is None:
+        return []
+    ratio = fit.alone.chi_square / fit.alone.degrees_of_freedom if fit.alone.degrees_of_freedom > 0 else math.nan
+    return [
+        "They are counted since without them residuals of neighbours in angle are correlated by "
+        f"{fit.alone.alike:+.2f} ({fit.alone.pairs} pairs; chi-square per degree of freedom {ratio:.3g}); "
+        "correlated = false leaves them out."
     ]
 
 

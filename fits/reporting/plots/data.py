@@ -241,7 +241,8 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
     """
     from scipy import stats
 
-    from fits.reporting.diagnostics import autocorrelation, residual_structure
+    from fits.data.neighbours import autocorrelation
+    from fits.reporting.diagnostics import residual_structure
 
     structure = residual_structure(data, residuals)
     finite = residuals[np.isfinite(residuals)]
