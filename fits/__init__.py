@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
     from fits.inference.prediction import Prediction as Prediction
+    from fits.inference.prediction import Scores as Scores
     from fits.inference.prediction import predict as predict
+    from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
     from fits.problem.correlated import Correlated as Correlated
     from fits.problem.likelihood import Noise as Noise
@@ -58,6 +60,8 @@ _HOMES = {
     "Uniform": "problem.parameters",
     "Posterior": "inference.posterior",
     "Prediction": "inference.prediction",
+    "Scores": "inference.prediction",
+    "scores": "inference.prediction",
     "predict": "inference.prediction",
     "sample": "inference.sampling",
     "Problem": "problem.problem",

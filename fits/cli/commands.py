@@ -24,6 +24,7 @@ from fits.progress import show_progress
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
+    from fits.reporting.html import Foretold
     from layerjax import Stack
 
 DONE, DOUBTFUL = 0, 1
@@ -32,11 +33,13 @@ DONE, DOUBTFUL = 0, 1
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     use_jax()
+    from fits.data.formats.csv import write_csv
     from fits.inference.nuts import require_blackjax
     from fits.inference.optimise import again
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
+    from fits.reporting.stored import HELD_OUT
 
     directory = Path(arguments.out)
     results.check_directory(directory, arguments.force)
@@ -69,7 +72,9 @@ def fit(arguments: Namespace) -> int:
         with results.replacing(directory, arguments.force) as folder:
             text = given.text if objective == given.objective else None
             results.write_fit(result, folder, text)
-            write_report(folder, directory.resolve().name, result)
+            if unseen is not None:
+                write_csv(unseen, folder / HELD_OUT)
+            foretold = write_report(folder, directory.resolve().name, result)
         for starts in (done, again(done)):
             starts.unlink(missing_ok=True)
         progress("pictures and report", 1, 1)
@@ -77,8 +82,8 @@ def fit(arguments: Namespace) -> int:
         tables.print_table(table, sys.stdout)
     for sentence in (*verdicts.outcome(result), f"Report: {directory / results.REPORT}"):
         print(sentence)
-    if unseen is not None:
-        print_scores(result, unseen, "Readings that were held out")
+    if foretold is not None:
+        print_scores(foretold.prediction, foretold.readings, "Readings that were held out")
     if arguments.sample:
         return _sample(directory, arguments)
     return DONE if result.converged else DOUBTFUL
@@ -149,6 +154,7 @@ def report(arguments: Namespace) -> int:
     use_jax()
     from fits.reporting import results
     from fits.reporting.html import report as write_page
+    from fits.reporting.stored import held_out_of
 
     refuse_existing(arguments.out, arguments.force)
     directory = Path(arguments.directory)
@@ -162,7 +168,8 @@ def report(arguments: Namespace) -> int:
         if arguments.out is None:
             write_report(directory, name, result, posterior, others)
         else:
-            write_page(result, posterior, out, others=others, name=name, force=arguments.force)
+            unseen = held_out_of(directory)
+            write_page(result, posterior, out, others=others, name=name, unseen=unseen, force=arguments.force)
         progress("pictures and report", 1, 1)
     print(f"Report: {out}")
     return DONE
@@ -273,15 +280,19 @@ def write_report(
     result: "Fit",
     posterior: "Posterior | None" = None,
     others: "dict[str, Fit | Posterior] | None" = None,
-) -> None:
-    """The report of a result directory, and its pictures as files beside it."""
+) -> "Foretold | None":
+    """The report of a result directory, and its pictures as files beside it; what it says of readings held out."""
     from fits.reporting import results
-    from fits.reporting.html import draw, page
+    from fits.reporting.html import draw, foretell, page
+    from fits.reporting.stored import held_out_of
 
-    images = draw(result, posterior, others, name)
-    text = page(result, posterior, images, others, name)
+    unseen = held_out_of(folder)
+    foretold = None if unseen is None else foretell(result, posterior, unseen)
+    images = draw(result, posterior, others, name, foretold)
+    text = page(result, posterior, images, others, name, foretold)
     pictures = {f"{picture}.png": content for picture, content in images.items()}
     write_together(folder, {**pictures, results.REPORT: text.encode()})
+    return foretold
 
 
 def _measurements(arguments: Namespace) -> Measurements:

@@ -16,8 +16,7 @@ from fits.data.measurements import Measurements
 from fits.data.selection import select
 
 if TYPE_CHECKING:
-    from fits.inference.fit_result import Fit
-    from fits.inference.posterior import Posterior
+    from fits.inference.prediction import Prediction
 
 DONE = 0
 
@@ -42,12 +41,12 @@ def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Me
     return fitted, unseen
 
 
-def print_scores(result: "Fit | Posterior", readings: Measurements, title: str) -> None:
-    from fits.inference.prediction import predict as run_prediction
+def print_scores(prediction: "Prediction", readings: Measurements, title: str) -> None:
+    """How well readings were foretold."""
     from fits.reporting import tables
     from fits.reporting.predictions import scores_table
 
-    tables.print_table(scores_table(run_prediction(result, readings), readings, title), sys.stdout)
+    tables.print_table(scores_table(prediction, readings, title), sys.stdout)
 
 
 def predict(arguments: Namespace) -> int:
@@ -69,10 +68,12 @@ def predict(arguments: Namespace) -> int:
     if arguments.at is None:
         at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth)
     else:
-        at = readings = _predicted_readings(arguments)
-        print_scores(of, readings, f"Readings of {arguments.at}")
+        at = _predicted_readings(arguments)
+    found = run_prediction(of, at)
+    if isinstance(at, Measurements):
+        print_scores(found, at, f"Readings of {arguments.at}")
     if arguments.out is not None:
-        write_text(arguments.out, prediction_csv(run_prediction(of, at)), force=arguments.force)
+        write_text(arguments.out, prediction_csv(found), force=arguments.force)
         print(f"{arguments.out}: predictions in 1/sr")
     return DONE
 

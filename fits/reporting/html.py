@@ -5,7 +5,7 @@ import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fits._files import write_text
 from fits.data.measurements import Measurements
@@ -15,14 +15,25 @@ from fits.reporting.diagnostics import ResidualStructure, residual_label, residu
 from fits.reporting.plots import data as pictures
 from fits.reporting.plots import model as model_pictures
 from fits.reporting.plots import parameters as parameter_pictures
+from fits.reporting.plots.predictions import bands_picture
+from fits.reporting.predictions import scores_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
+    from fits.inference.prediction import Prediction
 
 Pictures = Mapping[str, bytes]
+
+
+class Foretold(NamedTuple):
+    """Readings that were not fitted, and the prediction of them."""
+
+    readings: Measurements
+    prediction: "Prediction"
+
 
 _PAGE = Template("""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>$title</title>
@@ -50,6 +61,7 @@ def report(
     *,
     others: "Mapping[str, Fit | Posterior] | None" = None,
     name: str = "this fit",
+    unseen: Measurements | None = None,
     force: bool = True,
 ) -> None:
     """Writes the report of a fit to `path`, whole or not at all.
@@ -60,13 +72,23 @@ def report(
         path: HTML file to write, pictures inside.
         others: further fits of the same data, or their posteriors, by name, to be compared with this one.
         name: what this fit is called beside `others`.
+        unseen: readings that were not fitted, to be shown with what was foretold of them.
         force: replace a file that is there.
 
     Raises:
         ValueError: `path` exists and `force` is False, or `others` cannot be compared with this fit.
     """
-    images = draw(fit, posterior, others, name)
-    write_text(path, page(fit, posterior, images, others, name), force=force)
+    foretold = None if unseen is None else foretell(fit, posterior, unseen)
+    images = draw(fit, posterior, others, name, foretold)
+    write_text(path, page(fit, posterior, images, others, name, foretold), force=force)
+
+
+def foretell(fit: "Fit", posterior: "Posterior | None", unseen: Measurements) -> Foretold:
+    """What the posterior, or the fit where there is none to report from, says of readings that were not fitted."""
+    from fits.inference.prediction import predict
+
+    of = posterior if posterior is not None and verdicts.reportable(posterior) else fit
+    return Foretold(unseen, predict(of, unseen))
 
 
 def draw(
@@ -74,6 +96,7 @@ def draw(
     posterior: "Posterior | None" = None,
     others: "Mapping[str, Fit | Posterior] | None" = None,
     name: str = "this fit",
+    foretold: Foretold | None = None,
 ) -> dict[str, bytes]:
     """Every picture that applies, as PNG by name."""
     data = fit.problem.data
@@ -89,6 +112,8 @@ def draw(
         figures["corner"] = parameter_pictures.corner_picture(estimates)
     if posterior is not None:
         figures["trace"] = parameter_pictures.trace_picture(posterior)
+    if foretold is not None:
+        figures["held_out"] = bands_picture(foretold.prediction, foretold.readings)
     if others:
         figures["comparison"] = model_pictures.curves_picture({name: fit, **_fits(others)})
     return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
@@ -100,6 +125,7 @@ def page(
     images: Pictures,
     others: "Mapping[str, Fit | Posterior] | None" = None,
     name: str = "this fit",
+    foretold: Foretold | None = None,
 ) -> str:
     """The HTML text of the report, with the pictures inside."""
     structure = residual_structure(fit.problem.data, standardised(fit))
@@ -125,6 +151,7 @@ def page(
                 "Seen from above, forward to the right, rings at 30°, 60° and 90°; the star is the light.",
             ),
         ),
+        "" if foretold is None else _held_out(foretold, images),
         _section(
             "How well the model explains the data",
             _sentences(verdicts.explains(fit, structure)),
@@ -182,6 +209,16 @@ def _fits(candidates: "Mapping[str, Fit | Posterior]") -> "dict[str, Fit]":
     from fits.inference.posterior import Posterior
 
     return {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}
+
+
+def _held_out(foretold: Foretold, images: Pictures) -> str:
+    return _section(
+        "Readings that were held out",
+        tables.html_table(scores_table(foretold.prediction, foretold.readings, "")),
+        _image(
+            images, "held_out", "Readings that the fit has not seen, in the plane of incidence, and what it foretold."
+        ),
+    )
 
 
 def _verdict(fit: "Fit", structure: ResidualStructure) -> str:

@@ -1,11 +1,24 @@
-"""Parts of a fit as they stand in its JSON file."""
+"""Parts of a fit as they stand in its directory."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fits.data.formats import read
+from fits.data.measurements import Measurements
+
 if TYPE_CHECKING:
     from fits.inference.fit_result import Alone
+
+HELD_OUT = "held_out.csv"
+"""Readings that were held out of a fit, as `write_csv` writes them."""
+
+
+def held_out_of(directory: str | Path) -> Measurements | None:
+    """The readings that the fit of a directory has not seen; None if none were kept."""
+    path = Path(directory) / HELD_OUT
+    return read(path, format="csv") if path.is_file() else None
 
 
 def stored_number(value: float | str) -> float:
