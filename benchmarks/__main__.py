@@ -4,7 +4,8 @@
 beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
 ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
 coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``unseen`` (how well
-stacks foretell readings of real coatings that were not fitted) and ``side-by-side``
+stacks foretell readings of real coatings that were not fitted), ``wrong-stacks`` (whether bands hold where a simulated
+material is fitted by another) and ``side-by-side``
 (which transport when: a page of docs from the results of error-vs-time)."""
 
 import argparse
@@ -16,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
-         "spongecake", "endf", "rough-diffuse", "unseen", "side-by-side")  # fmt: skip
+         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks",
+         "side-by-side")  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -73,7 +75,13 @@ def _parser() -> argparse.ArgumentParser:
     calibrated.add_argument(
         "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), default=(6, 6), help="of AddingDoubling"
     )
-    for command in (compared, calibrated, commands.choices["samplers"], commands.choices["unseen"]):
+    for command in (
+        compared,
+        calibrated,
+        commands.choices["samplers"],
+        commands.choices["unseen"],
+        commands.choices["wrong-stacks"],
+    ):
         command.add_argument(
             "--resume", action="store_true", help="keep what the directory holds, and add what it lacks"
         )
@@ -89,7 +97,7 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
         options["with_peers"] = not given.no_peers
     if given.benchmark == "spongecake":
         options["work"] = given.work
-    if given.benchmark in ("error-vs-time", "calibration", "samplers", "unseen"):
+    if given.benchmark in ("error-vs-time", "calibration", "samplers", "unseen", "wrong-stacks"):
         options["resume"] = given.resume
     if given.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
