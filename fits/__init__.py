@@ -13,10 +13,14 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
+    from fits.inference.averaging import average as average
     from fits.inference.compare import Comparison as Comparison
     from fits.inference.compare import compare as compare
     from fits.inference.fit_result import Fit as Fit
+    from fits.inference.foresight import Foresight as Foresight
     from fits.inference.identifiability import Combination as Combination
+    from fits.inference.marginal_likelihood import Evidence as Evidence
+    from fits.inference.marginal_likelihood import evidence as evidence
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
     from fits.inference.prediction import Prediction as Prediction
@@ -41,9 +45,13 @@ if TYPE_CHECKING:
     from fits.reporting.results import save_fit as save_fit
 
 _HOMES = {
+    "average": "inference.averaging",
     "Comparison": "inference.compare",
     "compare": "inference.compare",
+    "Evidence": "inference.marginal_likelihood",
+    "evidence": "inference.marginal_likelihood",
     "Fit": "inference.fit_result",
+    "Foresight": "inference.foresight",
     "read": "data.formats",
     "write_csv": "data.formats.csv",
     "Geometry": "data.geometry",

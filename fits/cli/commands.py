@@ -185,14 +185,15 @@ def compare(arguments: Namespace) -> int:
     from fits.reporting import tables
 
     candidates = _candidates([Path(directory) for directory in arguments.directories])
-    compared = run_compare(candidates)
+    with show_progress() as progress:
+        compared = run_compare(candidates, refit=arguments.refit, progress=progress)
     tables.print_table(tables.comparison_table(compared), sys.stdout)
     for sentence in compared.verdict:
         print(sentence)
     if arguments.out:
         from fits.reporting.html import comparison_page
 
-        write_text(arguments.out, comparison_page(candidates), force=arguments.force)
+        write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
     return DONE
 

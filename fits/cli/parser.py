@@ -174,6 +174,12 @@ def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("directories", nargs="+", metavar="DIR", help="two or more result directories")
     parser.add_argument("--out", metavar="HTML", help="write the comparison with its pictures to this file")
+    parser.add_argument(
+        "--refit",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="fit each again without each incidence, and rank by what they foretell of it (default); else by AIC",
+    )
     _add_force(parser, "overwrite the file")
 
 

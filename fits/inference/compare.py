@@ -3,13 +3,15 @@
 import math
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from fits.inference.fit_result import Fit
+from fits.inference.foresight import Foresight, foresights
 from fits.inference.posterior import Posterior
+from fits.progress import Progress
 
 LEANING, CLEAR = 2.0, 10.0
 """Differences in AIC and BIC below the first say nothing, above the second leave hardly any doubt (Burnham & Anderson
@@ -25,6 +27,7 @@ class Row:
     loo: expected log-density of a new datum summed over the data, by Pareto-smoothed leave-one-out, with its standard
     error; loo_behind: how far that falls behind the best, with the error of the difference; unreliable: number of data
     whose leave-one-out weight has a Pareto shape above 0.7. All five are NaN where posteriors were not given.
+    foresight: what it foretells of incidences that are left out, its weight and its evidence; None without `refit`.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Row:
     unreliable: float
     converged: bool
     at_bound: tuple[str, ...]
+    foresight: Foresight | None = None
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Comparison:
 
     Attributes:
         rows: best first.
-        sorted_by: "loo", "aic" or "chi_square".
+        sorted_by: "left_out", "loo", "aic" or "chi_square".
         verdict: a sentence for each fit behind the best, that says whether the data prefer the best to it.
         notes: what to mind in reading the rows.
     """
@@ -61,11 +65,16 @@ class Comparison:
     notes: tuple[str, ...]
 
 
-def compare(candidates: Mapping[str, Fit | Posterior]) -> Comparison:
+def compare(
+    candidates: Mapping[str, Fit | Posterior], *, refit: bool = False, progress: Progress | None = None
+) -> Comparison:
     """Compare fits of the same data under the same objective; leave-one-out enters if every candidate is a `Posterior`.
 
     Args:
         candidates: at least two fits or their posteriors, by name.
+        refit: fit each again without each incidence, and rank by what they foretell of it; this takes as many short
+            fits. Their stacking weights and their evidence come with it.
+        progress: called with (name and stage, done, total, note) meanwhile.
 
     Raises:
         ValueError: fewer than two candidates, different data, or different objectives.
@@ -85,13 +94,17 @@ def compare(candidates: Mapping[str, Fit | Posterior]) -> Comparison:
     posteriors = {name: entry for name, entry in candidates.items() if isinstance(entry, Posterior)}
     loo = _leave_one_out(posteriors) if len(posteriors) == len(candidates) else {}
     rows = [_row(name, fit, loo.get(name, {})) for name, fit in fits.items()]
-    if loo:
+    if refit:
+        foreseen = foresights(fits, progress)
+        rows = [replace(row, foresight=foreseen[row.name]) for row in rows]
+        rows.sort(key=lambda row: -foreseen[row.name].score)
+    elif loo:
         rows.sort(key=lambda row: -row.loo)
     elif first.is_posterior:
         rows.sort(key=lambda row: row.aic)
     else:
         rows.sort(key=lambda row: row.chi_square)
-    sorted_by = "loo" if loo else "aic" if first.is_posterior else "chi_square"
+    sorted_by = "left_out" if refit else "loo" if loo else "aic" if first.is_posterior else "chi_square"
     verdict = tuple(_preference(rows[0], row, sorted_by) for row in rows[1:])
     return Comparison(tuple(rows), sorted_by, verdict, tuple(_notes(fits, rows, len(posteriors))))
 
@@ -125,6 +138,11 @@ def _preference(best: Row, other: Row, sorted_by: str) -> str:
     """
     if sorted_by == "chi_square":
         return f"{best.name} comes closer than {other.name}; without a likelihood it cannot be said whether by chance."
+    if sorted_by == "left_out":
+        assert other.foresight is not None
+        ahead, error = other.foresight.behind, other.foresight.behind_error
+        differ = f"it foretells incidences that are left out with a log-density higher by {ahead:.1f} ± {error:.1f}"
+        return _in_words(best.name, other.name, 2.0 * (ahead - 2.0 * error), differ)
     excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
     counted = f" (the scatter that {best.name} leaves counted as noise)" if excess > 1.0 else ""
     if sorted_by == "loo":
@@ -137,9 +155,13 @@ def _preference(best: Row, other: Row, sorted_by: str) -> str:
         aic, bic = other.aic - best.aic + spared, other.bic - best.bic + spared
         lead = min(aic, bic)
         differ = f"AIC lower by {aic:.1f}, BIC by {bic:.1f}{counted}"
+    return _in_words(best.name, other.name, lead, differ)
+
+
+def _in_words(best: str, other: str, lead: float, differ: str) -> str:
     if lead < LEANING:
-        return f"The data do not tell {best.name} from {other.name}: {differ}."
-    return f"The data {'prefer' if lead > CLEAR else 'slightly prefer'} {best.name} to {other.name}: {differ}."
+        return f"The data do not tell {best} from {other}: {differ}."
+    return f"The data {'prefer' if lead > CLEAR else 'slightly prefer'} {best} to {other}: {differ}."
 
 
 def _leave_one_out(posteriors: Mapping[str, Posterior]) -> dict[str, dict[str, float]]:
@@ -185,6 +207,9 @@ def _notes(fits: Mapping[str, Fit], rows: list[Row], posteriors: int) -> list[st
         notes.append(f"leave-one-out is unreliable for single data of {', '.join(doubtful)}")
     if 0 < posteriors < len(fits):
         notes.append("leave-one-out is left out: not every candidate is a posterior")
+    unsure = [row.name for row in rows if row.foresight is not None and not row.foresight.evidence.reliable]
+    if unsure:
+        notes.append(f"the evidence is unreliable, its sampling misses a part of the posterior: {', '.join(unsure)}")
     if min(row.reduced_chi_square for row in rows) > 2.0:
         notes.append("no candidate explains the data within its noise: the criteria overstate differences")
     return notes

@@ -85,7 +85,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array) -> Desc
             jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]),
             jnp.arange(2.0),
         )
-    if model.varying:
+    if likelihood and model.varying:
         parts = model.build(model.box.from_unit(start))
         typical = jnp.mean(jnp.abs(model.values))  # a tenth of it keeps readings near 0 from outweighing all others
         held = total_sigma(jnp.abs(model.values) + 0.1 * typical, model.variance, parts.relative, parts.floor)

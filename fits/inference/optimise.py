@@ -19,7 +19,7 @@ from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import at_start, resolutions
 from fits.inference.shared_errors import alone, are_shared, left_open, points
-from fits.inference.starts import MOST_STEPS, End, Solver, run_starts, start_points
+from fits.inference.starts import MOST_STEPS, End, Solver, least_squares_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.compiled import cores, in_shares
 from fits.problem.likelihood import Noise, Objective
@@ -123,6 +123,12 @@ def fit_problem(
         progress(f"{stage} with shared errors", done, total, info)
 
     return _found(problem, points(problem, found, starts, seed), solver, report, checkpoint, settings, without)
+
+
+def refit(problem: Problem, vector: Floats) -> Fit:
+    """The fit of a problem whose optimum is near this vector (P,), at the resolution that the problem has."""
+    end = least_squares_end(problem, unit_of(problem, vector), fresh=False)
+    return _fit_of(optimum(problem, [end], "least_squares"), None, {"starts": 1}, None)
 
 
 def again(checkpoint: str | Path) -> Path:

@@ -53,7 +53,8 @@ class Prediction:
         reading: of a new reading: that with what the model lacks, and with noise.
         means, scales: of a reading with each of D vectors of parameters, (D, M, C), in 1/sr; given these it is
             Gaussian, or has Student-t tails. Where readings share errors, of its `logarithm`.
-        softness: of that, (M, C), in 1/sr; else None.
+        softness: of that, (M, C) or (D, M, C), in 1/sr; else None.
+        values: of the stack itself, with each vector, (D, M, C), in 1/sr.
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
     """
 
@@ -67,12 +68,14 @@ class Prediction:
     scales: Floats
     softness: Floats | None
     degrees_of_freedom: float
+    values: Floats
 
     def log_density(self, values: Floats) -> Floats:
         """Log-density of readings (M, C), each by itself."""
         density = self._tails.logpdf(self._offsets(values)) - np.log(self.scales)
-        slope = 0.0 if self.softness is None else np.log(np.asarray(size(values, self.softness)))
-        return logsumexp(density, axis=0) - math.log(len(density)) - slope
+        if self.softness is not None:
+            density = density - np.log(np.asarray(size(values, self.softness)))
+        return logsumexp(density, axis=0) - math.log(len(density))
 
     def rank(self, values: Floats) -> Floats:
         """Probability of a reading below each of these, (M, C)."""
@@ -85,8 +88,8 @@ class Prediction:
     @property
     def median(self) -> Floats:
         """Of a reading, (M, C), in 1/sr."""
-        middle = np.median(self.means, axis=0)
-        return middle if self.softness is None else self.softness * np.sinh(middle)
+        middle = self.means if self.softness is None else self.softness * np.sinh(self.means)
+        return np.median(middle, axis=0)
 
     @property
     def _tails(self) -> "stats.rv_frozen":
@@ -130,24 +133,42 @@ def predict(
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
     sigma = _own_sigma(fit, values, data.sigma)
     means, scales, softness = _readings(fit, vectors, values, data, sigma)
-    student = fit.problem.noise.tails == "student"
-    freedom = fit.problem.noise.degrees_of_freedom
-    shape = (BESIDE, *means.shape)
-    drawn = generator.standard_t(freedom, shape) if student else generator.standard_normal(shape)
-    readings = (means + scales * drawn).reshape(-1, *means.shape[1:])
+    noise = fit.problem.noise
+    freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
+    return banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
+
+
+def banded(
+    wi: Floats,
+    wo: Floats,
+    channels: tuple[str, ...],
+    levels: tuple[float, ...],
+    values: Floats,
+    means: Floats,
+    scales: Floats,
+    softness: Floats | None,
+    degrees_of_freedom: float,
+    seed: int,
+) -> Prediction:
+    """The prediction with these parts, and the bands that follow from them: `BESIDE` readings are drawn of each."""
+    generator, shape = np.random.default_rng(seed), (BESIDE, *means.shape)
+    gaussian = math.isinf(degrees_of_freedom)
+    drawn = generator.standard_normal(shape) if gaussian else generator.standard_t(degrees_of_freedom, shape)
+    readings = means + scales * drawn
     if softness is not None:
         readings = softness * np.sinh(readings)
     return Prediction(
-        wi=data.wi,
-        wo=data.wo,
-        channels=fit.problem.data.channels,
+        wi=wi,
+        wo=wo,
+        channels=channels,
         levels=levels,
         model=_band(values, levels),
-        reading=_band(readings, levels),
+        reading=_band(readings.reshape(-1, *means.shape[1:]), levels),
         means=means,
         scales=scales,
         softness=softness,
-        degrees_of_freedom=freedom if student else math.inf,
+        degrees_of_freedom=degrees_of_freedom,
+        values=values,
     )
 
 
@@ -219,12 +240,12 @@ def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) ->
 
 def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
     """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
-    own = np.sqrt(np.asarray(fit.problem.model.variance))
-    if not own.any():
+    used = fit.problem.data.used()
+    if used.sigma is None or not fit.problem.noise.use_sigma:
         return np.zeros(values.shape[1:])
     if sigma is not None:
         return sigma
-    relative = np.median(own / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0)
+    relative = np.median(used.sigma / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0)
     return relative * np.median(np.abs(values), axis=0)
 
 

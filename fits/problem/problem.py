@@ -21,8 +21,8 @@ import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
-from fits.problem.likelihood import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise, Objective, total_sigma
-from fits.problem.logarithm import size, softness
+from fits.problem.levels import Levels, noise_levels
+from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.process import Process, make_process
@@ -145,6 +145,12 @@ class Problem:
         """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
         return self.call(Model.log_posterior_unconstrained, u)
 
+    def with_model(self, model: Model) -> "Problem":
+        """The problem with other arrays in its model."""
+        other = replace(self)
+        vars(other)["_assembled"] = self._assembled._replace(model=model)
+        return other
+
     def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """`function(model, *arguments)`, compiled once for all problems of this structure."""
         arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
@@ -167,47 +173,12 @@ class _Assembled(NamedTuple):
     model: Model
 
 
-class _Levels(NamedTuple):
-    """Noise of the used samples: the measurement's own variance, (N, C) or (1,), and the levels of the noise model."""
-
-    variance: Floats
-    relative: float | Free
-    floor: float | Free
-
-    @property
-    def smallest(self) -> Floats:
-        """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
-        return np.sqrt(self.variance + _lowest(self.floor) ** 2)
-
-    @property
-    def fitted(self) -> bool:
-        """Whether a level is."""
-        return isinstance(self.relative, Free) or isinstance(self.floor, Free)
-
-    @property
-    def varying(self) -> bool:
-        """Whether sigma depends on the parameters, or on what they predict."""
-        return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
-
-    def softness(self, values: Floats) -> Floats:
-        """Of the logarithms of readings (N, C), see `fits.problem.logarithm`."""
-        return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
-
-    def gram(self, process: Process, values: Floats) -> Array | None:
-        """What readings (N, C) tell of a process that they share; None where it depends on parameters."""
-        if self.fitted:
-            return None
-        variance, relative, floor = (jnp.asarray(level) for level in self)
-        sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
-        return process.gram_of(size(values, self.softness(values)) / sigma)
-
-
 def _assemble(problem: Problem) -> _Assembled:
     _require_known(problem.objective, problem.scale)
     used = problem.data.used()
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
-    levels = _noise_levels(problem.noise, used)
+    levels = noise_levels(problem.noise, used)
     process = make_process(used.wi, used.wo) if problem.noise.correlated else None
     if process is not None:
         process = replace(process, gram=levels.gram(process, used.values))
@@ -232,19 +203,7 @@ def _require_known(objective: str, scale: Any) -> None:
         raise ValueError(f"scale is {scale!r}; it must be a finite number above 0, Free or None")
 
 
-def _noise_levels(noise: Noise, used: Measurements) -> _Levels:
-    """The levels that `Noise` leaves out, filled in as it says."""
-    sigma = used.sigma if noise.use_sigma else None
-    relative, floor = noise.relative, noise.floor
-    if relative is None:
-        relative = DEFAULT_RELATIVE if sigma is None and floor is None else 0.0
-    if floor is None:
-        alone = not is_free(relative) and relative == 0
-        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
-    return _Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
-
-
-def _numbers(problem: Problem, levels: _Levels, process: Process | None) -> tuple[Any, ...]:
+def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple[Any, ...]:
     """All that a parameter may stand for, in the order of `Parts`."""
     # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
     stack = with_known(problem.stack) if isinstance(problem.stack, lj.Stack) else problem.stack
@@ -265,12 +224,12 @@ def _parameter_name(path: str) -> str:
     return path
 
 
-def _require_noise(levels: _Levels) -> None:
+def _require_noise(levels: Levels) -> None:
     if not np.all(levels.smallest > 0):
         raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
 
 
-def _refuse_likelihood_only(problem: Problem, levels: _Levels, free: tuple[Free, ...]) -> None:
+def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, ...]) -> None:
     objective = problem.objective
     fitted = [name for name in ("relative", "floor") if is_free(getattr(levels, name))]
     if problem.noise.correlated:
@@ -285,7 +244,7 @@ def _refuse_likelihood_only(problem: Problem, levels: _Levels, free: tuple[Free,
 def _model(
     problem: Problem,
     used: Measurements,
-    levels: _Levels,
+    levels: Levels,
     template: Template,
     box: Box,
     process: Process | None,
@@ -329,14 +288,6 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
     shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
-
-
-def _lowest(level: float | Free) -> float:
-    return float(level.arrays()[1]) if isinstance(level, Free) else float(level)
-
-
-def _start(level: float | Free) -> float:
-    return float(level.arrays()[0]) if isinstance(level, Free) else float(level)
 
 
 def _unit(name: str) -> str:

@@ -21,6 +21,7 @@ from fits.reporting.predictions import scores_table
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from fits.inference.compare import Comparison
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
     from fits.inference.prediction import Prediction
@@ -169,29 +170,28 @@ def page(
     ]
     if others:
         own = fit if posterior is None or not verdicts.reportable(posterior) else posterior
-        sections.append(comparison_section({name: own, **others}, images))
+        from fits.inference.compare import compare
+
+        sections.append(comparison_section(compare({name: own, **others}), images))
     sections.append(_made_with())
     return _PAGE.substitute(title=html.escape(title), body="\n".join(sections))
 
 
-def comparison_page(candidates: "Mapping[str, Fit | Posterior]") -> str:
+def comparison_page(candidates: "Mapping[str, Fit | Posterior]", compared: "Comparison") -> str:
     """The HTML text of a comparison of fits of the same data, with its picture inside."""
     fits = _fits(candidates)
     figure = model_pictures.curves_picture(fits)
     images = {} if figure is None else {"comparison": pictures.as_png(figure)}
     title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
-    body = [f"<h1>{html.escape(title)}</h1>", comparison_section(candidates, images)]
+    body = [f"<h1>{html.escape(title)}</h1>", comparison_section(compared, images)]
     body += [
         _section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
     ]
     return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
 
 
-def comparison_section(candidates: "Mapping[str, Fit | Posterior]", images: Pictures) -> str:
+def comparison_section(compared: "Comparison", images: Pictures) -> str:
     """Which of several fits explains the data, as an HTML fragment."""
-    from fits.inference.compare import compare
-
-    compared = compare(candidates)
     return _section(
         "Comparison",
         _sentences(compared.verdict),

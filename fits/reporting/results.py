@@ -21,7 +21,6 @@ import numpy as np
 from fits._files import locked, read_json, text_checksum, write_json, write_text
 from fits.data.formats import read
 from fits.data.formats.csv import write_csv
-from fits.data.measurements import Source
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -140,26 +139,14 @@ def load_fit(directory: str | Path) -> "Fit":
     """
     from fits.inference.fit_result import Fit, Minimum
     from fits.inference.identifiability import Combination
-    from fits.problem.problem import Problem
-    from fits.problem.stack_file import read_problem, transport_from_dict
-    from fits.reporting.earlier import transport_meant
-    from fits.reporting.stored import stored_alone, stored_array, stored_number
+    from fits.problem.stack_file import read_problem
+    from fits.reporting.stored import stored_alone, stored_array, stored_number, stored_problem
 
     directory = Path(directory)
     content = _content(directory)
     given, data = read_problem(directory / PROBLEM), read(directory / DATA, format="csv")
     try:
-        source = content["source"] | {"notes": tuple(content["source"]["notes"])}
-        data = replace(data, source=Source(**source))
-        scale = given.scale if given.scale is not None else content["fixed_scale"]
-        if "transport" in content:  # with the resolution that the fit chose
-            transport = transport_from_dict(content["transport"])
-        else:
-            transport = transport_meant(given.stack, given.transport)
-        noise, found_alone = given.noise, content.get("alone")
-        if found_alone is not None:
-            noise = replace(noise, correlated=True)
-        problem = Problem(given.stack, data, transport, noise, scale, given.objective)
+        problem = stored_problem(content, given, data)
         stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
         minima = tuple(
             Minimum(
@@ -195,7 +182,7 @@ def load_fit(directory: str | Path) -> "Fit":
             ended=content.get("starts_ended", {}),
             numerical_error=None if error is None else stored_number(error),
             resolution=content.get("resolution"),
-            alone=None if found_alone is None else stored_alone(found_alone),
+            alone=stored_alone(content.get("alone")),
         )
     except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None

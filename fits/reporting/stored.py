@@ -1,15 +1,18 @@
 """Parts of a fit as they stand in its directory."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fits.data.formats import read
-from fits.data.measurements import Measurements
+from fits.data.measurements import Measurements, Source
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Alone
+    from fits.problem.problem import Problem
+    from fits.problem.stack_file import ProblemFile
 
 HELD_OUT = "held_out.csv"
 """Readings that were held out of a fit, as `write_csv` writes them."""
@@ -19,6 +22,22 @@ def held_out_of(directory: str | Path) -> Measurements | None:
     """The readings that the fit of a directory has not seen; None if none were kept."""
     path = Path(directory) / HELD_OUT
     return read(path, format="csv") if path.is_file() else None
+
+
+def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurements) -> "Problem":
+    """What was fitted to what: the stack file, with what the fit chose beside it."""
+    from fits.problem.problem import Problem
+    from fits.problem.stack_file import transport_from_dict
+    from fits.reporting.earlier import transport_meant
+
+    source = content["source"] | {"notes": tuple(content["source"]["notes"])}
+    if "transport" in content:  # with the resolution that the fit chose
+        transport = transport_from_dict(content["transport"])
+    else:
+        transport = transport_meant(given.stack, given.transport)
+    noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
+    scale = given.scale if given.scale is not None else content["fixed_scale"]
+    return Problem(given.stack, replace(data, source=Source(**source)), transport, noise, scale, given.objective)
 
 
 def stored_number(value: float | str) -> float:
@@ -31,9 +50,12 @@ def stored_array(values: list[Any], *shape: int) -> np.ndarray:
     return np.array(values, dtype=float).reshape(shape)
 
 
-def stored_alone(content: dict[str, Any]) -> "Alone":
+def stored_alone(content: dict[str, Any] | None) -> "Alone | None":
     """The fit without errors that readings share."""
     from fits.inference.fit_result import Alone
+
+    if content is None:
+        return None
 
     return Alone(
         values={name: stored_number(value) for name, value in content["values"].items()},

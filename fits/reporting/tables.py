@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fits.data.measurements import Measurements
     from fits.inference.compare import Comparison, Row
     from fits.inference.fit_result import Fit
+    from fits.inference.foresight import Foresight
     from fits.inference.posterior import Posterior
 
 MOST_MINIMA = 8
@@ -246,6 +247,14 @@ def data_table(data: "Measurements") -> Table:
     return Table("Angles, and BRDF in 1/sr", columns, tuple(_shortened(rows, 40)), keys=2)
 
 
+_ORDERS = {
+    "left_out": "the score of what is left out",
+    "loo": "leave-one-out",
+    "aic": "AIC",
+    "chi_square": "chi-square",
+}
+
+
 def comparison_table(comparison: "Comparison") -> Table:
     """One row per fit, the best first: how well it explains the data, with how many parameters, and how far behind."""
     compared = comparison.rows
@@ -264,14 +273,27 @@ def comparison_table(comparison: "Comparison") -> Table:
         ]
     if all(math.isfinite(row.loo) for row in compared):
         columns += [("LOO behind best", lambda row: f"{row.loo_behind:.1f} ± {row.loo_behind_error:.1f}")]
+    if compared[0].foresight is not None:
+        columns += [
+            ("left out: score", lambda row: f"{_seen(row).score:.1f}"),
+            ("behind best", lambda row: f"{_seen(row).behind:.1f} ± {_seen(row).behind_error:.1f}"),
+            ("weight", lambda row: f"{_seen(row).weight:.2f}"),
+            ("log evidence", lambda row: f"{_seen(row).evidence.log:.1f} ± {_seen(row).evidence.error:.1f}"),
+            ("probability", lambda row: f"{_seen(row).probability:.2g}"),
+        ]
     columns += [
         ("converged", lambda row: "yes" if row.converged else "NO"),
         ("at a bound", lambda row: ", ".join(row.at_bound)),
     ]
     rows = tuple(tuple(word(row) for _, word in columns) for row in compared)
-    order = {"loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}[comparison.sorted_by]
+    order = _ORDERS[comparison.sorted_by]
     note = " ".join(f"{line[0].upper()}{line[1:]}." for line in (f"sorted by {order}, best first", *comparison.notes))
     return Table("Comparison", tuple(head for head, _ in columns), rows, note)
+
+
+def _seen(row: "Row") -> "Foresight":
+    assert row.foresight is not None
+    return row.foresight
 
 
 def degrees(angle: float) -> str:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 import layerjax as lj
 from fits.data.geometry import direction, slices
 from fits.data.measurements import Measurements, Source
+from fits.data.neighbours import autocorrelation
 from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
 from fits.inference.fit_result import Fit
 from fits.inference.identifiability import Combination
@@ -18,7 +19,7 @@ from fits.inference.optimise import fit
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting import tables, verdicts
-from fits.reporting.diagnostics import autocorrelation, residual_structure, standardised
+from fits.reporting.diagnostics import residual_structure, standardised
 from fits.reporting.html import report
 from fits.reporting.plots import data as pictures
 from fits.reporting.plots import model as model_pictures

@@ -1,0 +1,64 @@
+"""Predictions of several stacks as one, each with its weight."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fits.data.geometry import Geometry
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.inference.posterior import Posterior
+from fits.inference.prediction import DRAWS, LEVELS, Prediction, banded, predict
+
+STRAIGHT = 1e6
+"""Softness of a prediction that is none of logarithms, in units of the largest value: asinh(x / s) is x / s there."""
+
+
+def average(
+    candidates: Mapping[str, Fit | Posterior],
+    weights: Mapping[str, float],
+    at: Geometry | Measurements,
+    *,
+    levels: tuple[float, ...] = LEVELS,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """What fits of the same data foretell together: a mixture of their predictions.
+
+    Args:
+        candidates: fits or posteriors, by name.
+        weights: by the same names, none below 0: those of stacking (`Foresight.weight`) foretell best, probabilities
+            of the stacks (`Foresight.probability`) average over them as Bayes does.
+        at, levels, seed: see `predict`.
+        draws: of all of them together, in proportion to the weights.
+
+    Raises:
+        ValueError: weights that are missing, negative or all 0; readings with tails that differ; or as `predict`.
+    """
+    total = float(sum(weights.get(name, np.nan) for name in candidates))
+    if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
+        raise ValueError(
+            f"weights is {dict(weights)}; it must give each of {', '.join(candidates)} a number of at least 0"
+        )
+    counts = {name: round(draws * weights[name] / total) for name in candidates}
+    parts = [
+        predict(candidates[name], at, levels=levels, draws=max(count, 2), seed=seed + number)
+        for number, (name, count) in enumerate(counts.items())
+        if count > 0
+    ]
+    first = parts[0]
+    if any(part.degrees_of_freedom != first.degrees_of_freedom for part in parts):
+        raise ValueError("average: the fits differ in the tails of their noise")
+    means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
+    values = np.concatenate([part.values for part in parts])
+    return banded(
+        first.wi, first.wo, first.channels, levels, values, means, scales, softness, first.degrees_of_freedom, seed
+    )
+
+
+def _logarithmic(part: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, scales and softness, (D, M, C) each, of the readings' `logarithm`."""
+    if part.softness is not None:
+        return part.means, part.scales, np.broadcast_to(part.softness, part.means.shape)
+    softness = np.full(part.means.shape, STRAIGHT * float(np.max(np.abs(part.means)) or 1.0))
+    return part.means / softness, part.scales / softness, softness

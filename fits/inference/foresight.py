@@ -1,0 +1,102 @@
+"""Which of several stacks foretells what it has not seen, with what weights they foretell it best together, and how
+probable each is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import log_softmax, logsumexp, softmax
+
+from fits.inference.fit_result import Fit
+from fits.inference.left_out import LeftOut, leave_out
+from fits.inference.marginal_likelihood import Evidence, evidence
+from fits.progress import Progress
+
+WIDEST = 30.0
+"""Of the logarithms of ratios of weights."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """What one of several stacks is worth to who wants to know what was not measured.
+
+    score: sum of log-densities of readings, each foretold by a fit without its incidence. behind: how far that falls
+    behind the best, and its standard error by the incidences. weight: of its predictions in the mixture that foretells
+    best (stacking, Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`. probability:
+    of this stack among those that are compared, all as probable beforehand.
+    """
+
+    score: float
+    behind: float
+    behind_error: float
+    weight: float
+    evidence: Evidence
+    probability: float
+
+
+def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
+    """Of fits of the same data, by name; each is fitted again without each incidence (see `leave_out`)."""
+    left = {name: leave_out(fit, progress=_named(name, progress)) for name, fit in candidates.items()}
+    return together(left, {name: evidence(fit) for name, fit in candidates.items()})
+
+
+def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> dict[str, Foresight]:
+    """What was left out of fits of the same data, and their evidence, side by side."""
+    names = list(left)
+    scores = np.array([left[name].score for name in names])
+    best = left[names[int(np.argmax(scores))]]
+    weights = stacking(np.stack([left[name].log_density.ravel() for name in names]))
+    probabilities = softmax(np.array([evidences[name].log for name in names]))
+    found = {}
+    for index, name in enumerate(names):
+        gaps = best.by_group - left[name].by_group
+        error = float(np.sqrt(gaps.size) * gaps.std(ddof=1))
+        found[name] = Foresight(
+            score=float(scores[index]),
+            behind=float(gaps.sum()),
+            behind_error=error,
+            weight=float(weights[index]),
+            evidence=evidences[name],
+            probability=float(probabilities[index]),
+        )
+    return found
+
+
+def stacking(log_density: Floats) -> Floats:
+    """Weights (K,) of K predictions whose mixture has the highest log-density over N readings; log_density: (K, N)."""
+    count = len(log_density)
+    if count == 1:
+        return np.ones(1)
+
+    def cost(free: Floats) -> float:
+        logs = log_softmax(np.append(free, 0.0))
+        return -float(np.mean(logsumexp(log_density + logs[:, None], axis=0)))
+
+    def slope(free: Floats) -> Floats:
+        weights = softmax(np.append(free, 0.0))
+        share = softmax(log_density + np.log(weights)[:, None], axis=0).mean(axis=1)
+        return (weights - share)[:-1]
+
+    found = minimize(
+        cost,
+        np.zeros(count - 1),
+        jac=slope,
+        method="L-BFGS-B",
+        bounds=[(-WIDEST, WIDEST)] * (count - 1),
+        options={"ftol": 1e-14, "gtol": 1e-9},
+    )
+    return softmax(np.append(found.x, 0.0))
+
+
+def _named(name: str, progress: Progress | None) -> Progress | None:
+    if progress is None:
+        return None
+
+    def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        progress(f"{name}: {stage}", done, total, info)
+
+    return report

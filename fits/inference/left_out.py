@@ -1,0 +1,97 @@
+"""What fits foretell of readings that are left out of them: one incidence after the other, or stretches of a scan.
+
+Readings of one incidence are alike, so that one of them, left out by itself, is told by its neighbours whatever the
+stack is. What a stack is worth shows where a whole incidence is missing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.data.measurements import Measurements
+from fits.data.scans import incidences, scans
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import refit
+from fits.inference.prediction import predict
+from fits.problem.left_out import without
+from fits.progress import Progress
+
+FEWEST_INCIDENCES = 3
+"""With fewer, stretches of the scans are left out: what is fitted at one incidence says little of another."""
+
+STRETCHES = 5
+"""Of each scan."""
+
+DRAWS = 128
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """How readings were foretold that were left out.
+
+    groups: what was left out together. rows: the rows of each among the used samples. log_density: of each reading by
+    the fit that had not seen its group, (N, C). converged: whether all of these fits did.
+    """
+
+    groups: tuple[str, ...]
+    rows: tuple[NDArray[np.int64], ...]
+    log_density: Floats
+    converged: bool
+
+    @property
+    def score(self) -> float:
+        """Sum of the log-densities: the higher, the better are new readings foretold."""
+        return float(np.sum(self.log_density))
+
+    @property
+    def by_group(self) -> Floats:
+        """The score of each group, (G,)."""
+        return np.array([np.sum(self.log_density[rows]) for rows in self.rows])
+
+
+def leave_out(fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress | None = None) -> LeftOut:
+    """Fit anew without each incidence, from the best values on, and foretell its readings.
+
+    With fewer than three incidences every scan is left out by fifths.
+
+    Args:
+        fit: of a likelihood.
+        draws, seed: see `predict`.
+        progress: called with ("left out", groups done, groups, name).
+
+    Raises:
+        ValueError: a fit of a named objective, or data of a single group.
+    """
+    if not fit.is_posterior:
+        raise ValueError(
+            f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
+        )
+    data = fit.problem.data.used()
+    groups = groups_of(data)
+    if len(groups) < 2:
+        raise ValueError("leave_out: the readings are all of one incidence, and too few to leave some of them out")
+    density, converged = np.empty(data.values.shape), True
+    for number, (name, rows) in enumerate(groups.items()):
+        if progress is not None:
+            progress("left out", number, len(groups), name)
+        chosen = np.zeros(len(data), bool)
+        chosen[rows] = True
+        found = refit(without(fit.problem, chosen), fit.vector)
+        density[rows] = predict(found, data, draws=draws, seed=seed).log_density(data.values)[rows]
+        converged &= found.converged
+    if progress is not None:
+        progress("left out", len(groups), len(groups), "")
+    return LeftOut(tuple(groups), tuple(groups.values()), density, converged)
+
+
+def groups_of(data: Measurements) -> dict[str, NDArray[np.int64]]:
+    """Rows that are left out together, by name."""
+    every = incidences(data)
+    if len(every) >= FEWEST_INCIDENCES:
+        return {one.label: one.rows for one in every}
+    pieces = [np.array_split(rows, STRETCHES) for rows in scans(data)]
+    stretches = [np.concatenate([piece[number] for piece in pieces]) for number in range(STRETCHES)] if pieces else []
+    return {f"stretch {number}": rows for number, rows in enumerate(stretches, 1) if rows.size}

@@ -1,0 +1,179 @@
+"""What is foretold of what is left out, evidence and weights, beside linear regression, where all of them are known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.inference.averaging import average
+from fits.inference.compare import compare
+from fits.inference.fit_result import Fit
+from fits.inference.foresight import stacking
+from fits.inference.left_out import groups_of, leave_out
+from fits.inference.marginal_likelihood import evidence
+from fits.inference.optimise import fit
+from fits.inference.prediction import predict
+from fits.problem.left_out import without
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free, Normal
+from fits.problem.problem import Problem
+from fits.reporting import tables
+from tests.helpers.models import line
+
+SIGMA = 0.05
+GEOMETRY = slices([10.0, 30.0, 50.0], np.arange(-75.0, 76.0, 10.0))
+STACK = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": Free(0.1, -4.0, 5.0, Normal(0.5, 0.4))}
+FLAT = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": 0.0}
+
+
+def readings(seed: int = 0) -> Measurements:
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+    values = exact + SIGMA * np.random.default_rng(seed).standard_normal(exact.shape)
+    sigma = np.full_like(values, SIGMA)
+    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, sigma, np.ones(len(values), bool), ("value",))
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    return fit(STACK, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Fit:
+    return fit(FLAT, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+
+
+def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the parameters, from these rows and the priors."""
+    data = readings()
+    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)[rows]
+    precision = columns.T @ columns / SIGMA**2 + np.diag(1.0 / np.array([0.5, 0.4]) ** 2)
+    pulled = columns.T @ data.values[rows, 0] / SIGMA**2 + np.array([1.0, 0.5]) / np.array([0.5, 0.4]) ** 2
+    return np.linalg.solve(precision, pulled), np.linalg.inv(precision)
+
+
+def test_rows_that_are_left_out_count_for_nothing(found: Fit) -> None:
+    rows = np.arange(len(readings())) % 3 == 0
+    left = without(found.problem, rows)
+    fewer = Problem(STACK, readings().where(~rows), line, Noise(correlated=False))
+    for vector in (found.vector, np.array([0.0, 2.0])):
+        gaps = [float(of.log_likelihood(vector) - of.log_likelihood([1.0, 0.5])) for of in (left, fewer)]
+        assert gaps[0] == pytest.approx(gaps[1], abs=1e-6)
+
+
+def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
+    rows = np.arange(len(readings())) % 3 == 0
+    noise = Noise(correlated=True)
+    whole, fewer = (Problem(STACK, data, line, noise) for data in (readings(), readings().where(~rows)))
+    # the grid of nodes follows from the directions: of both it has to be the same for the same numbers
+    np.testing.assert_allclose(whole.model.process.steps, fewer.model.process.steps)
+    left = without(whole, rows)
+    moved = whole.start * np.array([1.1, 0.7, 1.5, 0.8, 1.2])
+    gaps = [float(of.log_likelihood(moved) - of.log_likelihood(of.start)) for of in (left, fewer)]
+    assert gaps[0] == pytest.approx(gaps[1], abs=1e-3)
+
+
+def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
+    left, data = leave_out(found, draws=2000), readings()
+    assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")
+    assert left.converged
+    for rows in left.rows:
+        others = np.setdiff1d(np.arange(len(data)), rows)
+        mean, covariance = regression(others)
+        columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
+        # draws are of a Student-t with 6 degrees of freedom, whose variance is 1.5 times as large
+        width = np.sqrt(1.5 * np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
+        expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
+        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
+    assert left.score == pytest.approx(left.by_group.sum())
+
+
+def test_few_incidences_are_left_out_by_stretches() -> None:
+    data = readings()
+    one = data.where(np.abs(data.theta_i - 10.0) < 1.0).used()
+    groups = groups_of(one)
+    assert sorted(np.concatenate(list(groups.values()))) == list(range(len(one)))
+    assert len(groups) == 5
+    for rows in groups.values():
+        assert np.ptp(one.theta_o[rows] * np.sign(one.wo[rows, 0])) < 40.0
+
+
+@pytest.mark.parametrize("stack", ["line", "flat"])
+def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> None:
+    data = readings()
+    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)
+    prior = np.diag(np.array([0.5, 0.4]) ** 2)
+    mean = columns @ [1.0, 0.5]
+    if stack == "flat":
+        columns, prior, mean = columns[:, :1], prior[:1, :1], np.ones(len(data))
+    covariance = columns @ prior @ columns.T + SIGMA**2 * np.eye(len(data))
+    expected = stats.multivariate_normal(mean, covariance).logpdf(data.values[:, 0])
+    got = evidence(found if stack == "line" else flat, draws=4000)
+    assert got.reliable
+    assert got.error < 0.03
+    # bounds cut less than 1e-8 of the priors off
+    assert got.log == pytest.approx(expected, abs=5.0 * got.error)
+
+
+def test_weights_of_stacking_are_the_best() -> None:
+    generator = np.random.default_rng(0)
+    densities = generator.standard_normal((3, 200)) + np.array([[0.3], [0.2], [-5.0]])
+    weights = stacking(densities)
+
+    def score(w: np.ndarray) -> float:
+        return float(np.mean(logsumexp(densities + np.log(w)[:, None], axis=0)))
+
+    others = generator.dirichlet(np.ones(3), 2000)
+    assert score(weights) >= max(map(score, others)) - 1e-9
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(stacking(np.array([[0.0, 0.0], [-50.0, -50.0]])), [1.0, 0.0], atol=1e-6)
+
+
+def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
+    compared = compare({"flat": flat, "line": found}, refit=True)
+    assert compared.sorted_by == "left_out"
+    best, other = compared.rows
+    assert (best.name, other.name) == ("line", "flat")
+    assert best.foresight.behind == 0.0
+    assert other.foresight.behind == pytest.approx(best.foresight.score - other.foresight.score)
+    assert best.foresight.weight + other.foresight.weight == pytest.approx(1.0)
+    odds = np.exp(best.foresight.evidence.log - other.foresight.evidence.log)
+    assert best.foresight.probability / other.foresight.probability == pytest.approx(odds)
+    assert "foretells incidences that are left out" in compared.verdict[0]
+    table = tables.comparison_table(compared)
+    assert {"left out: score", "weight", "log evidence", "probability"} <= set(table.columns)
+
+
+def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
+    candidates, at = {"line": found, "flat": flat}, readings()
+    alone = average(candidates, {"line": 1.0, "flat": 0.0}, at, draws=1000)
+    one = predict(found, at, draws=1000)
+    np.testing.assert_allclose(alone.reading.mean, one.reading.mean, atol=0.01)
+    np.testing.assert_allclose(alone.log_density(at.values), one.log_density(at.values), atol=1e-6)
+    both = average(candidates, {"line": 3.0, "flat": 1.0}, at, draws=4000)
+    parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
+    np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [({"line": 1.0}, "it must give each of line, flat"), ({"line": -1.0, "flat": 2.0}, "a number of at least 0")],
+)
+def test_bad_weights_are_refused(found: Fit, flat: Fit, weights: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        average({"line": found, "flat": flat}, weights, GEOMETRY)
+
+
+def test_fits_that_say_nothing_of_readings_are_refused() -> None:
+    free = {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
+    named = fit(free, readings(), transport=line, objective="cube_root", starts=1)
+    with pytest.raises(ValueError, match="a fit of 'cube_root' has no noise model"):
+        leave_out(named)
+    with pytest.raises(ValueError, match="a fit of 'cube_root' has none"):
+        evidence(named)
+    data = readings()
+    few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
+    with pytest.raises(ValueError, match="too few to leave some of them out"):
+        leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))

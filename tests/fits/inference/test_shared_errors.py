@@ -1,0 +1,113 @@
+"""Whether a fit counts errors that readings share, where that is left to the residuals."""
+
+import numpy as np
+import pytest
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.correlated import Correlated
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from fits.reporting import tables, verdicts
+from fits.reporting.results import load_fit, save_fit
+from tests.helpers.models import line
+
+STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
+GEOMETRY = slices([10.0, 50.0], np.arange(-80.0, 81.0, 4.0))
+NOISE = Noise(relative=0.02, floor=1e-4)
+
+
+def readings(wave: float, seed: int = 0) -> Measurements:
+    """Of the line, times one plus a wave along the viewing angle, with noise of 2 %."""
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+    angle = np.arctan2(GEOMETRY.wo[:, :1], GEOMETRY.wo[:, 2:])
+    noise = 0.02 * np.random.default_rng(seed).standard_normal(exact.shape)
+    values = exact * (1.0 + wave * np.sin(8.0 * angle) + noise)
+    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(len(values), bool), ("value",))
+
+
+@pytest.fixture(scope="module")
+def wrong() -> Fit:
+    return fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2)
+
+
+def test_a_wrong_shape_is_fitted_with_them(wrong: Fit) -> None:
+    plain = fit(
+        STACK, readings(0.1), transport=line, noise=Noise(relative=0.02, floor=1e-4, correlated=False), starts=2
+    )
+    assert wrong.problem.noise.correlated == Correlated()
+    assert wrong.alone is not None
+    assert plain.alone is None
+    assert wrong.alone.values == pytest.approx(plain.values, rel=1e-6)
+    assert wrong.alone.chi_square == pytest.approx(plain.chi_square)
+    assert wrong.alone.alike > 0.8
+    assert wrong.log_likelihood > plain.log_likelihood + 20.0
+    assert 0.03 < wrong.values["noise.correlated.amplitude"] < 0.3
+    for name in plain.values:
+        assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
+
+
+def test_a_right_one_is_not() -> None:
+    found = fit(STACK, readings(0.0), transport=line, noise=NOISE, starts=2)
+    assert found.alone is None
+    assert not found.problem.noise.correlated
+    assert list(found.values) == ["['a']", "['b']"]
+
+
+@pytest.mark.parametrize("noise", [Noise(relative=0.02, floor=1e-4, tails="student"), NOISE])
+def test_where_they_cannot_be_counted_they_are_not(noise: Noise) -> None:
+    objective = "likelihood" if noise.tails == "student" else "cube_root"
+    noise = noise if objective == "likelihood" else Noise()
+    assert fit(STACK, readings(0.1), transport=line, noise=noise, starts=1, objective=objective).alone is None
+
+
+def test_both_are_told(wrong: Fit) -> None:
+    words = " ".join(verdicts.shared_errors(wrong))
+    assert "residuals of neighbours in angle are correlated by +0." in words
+    assert "correlated = false leaves them out" in words
+    table = tables.alone_table(wrong)
+    assert [row[0] for row in table.rows] == ["['a']", "['b']"]
+    assert len(table.rows[0]) == len(table.columns)
+
+
+def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit) -> None:
+    kept = tmp_path / "starts"
+    seen: list[tuple[str, int]] = []
+
+    def stop(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        seen.append((stage, done))
+        if stage.endswith("shared errors") and done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, progress=stop, checkpoint=kept)
+    again: list[tuple[str, int]] = []
+    found = fit(
+        STACK,
+        readings(0.1),
+        transport=line,
+        noise=NOISE,
+        starts=2,
+        progress=lambda stage, done, total=None, info="": again.append((stage, done)),
+        checkpoint=kept,
+    )
+    np.testing.assert_array_equal(found.vector, wrong.vector)
+    # what was done is told of at once, and only the rest is run
+    assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-shared"}
+
+
+def test_a_result_directory_keeps_it(tmp_path, coat_fit: Fit) -> None:
+    from dataclasses import replace
+
+    from fits.inference.shared_errors import alone
+
+    problem = replace(coat_fit.problem, noise=Noise(relative=0.03, correlated=True))
+    found = fit(problem.stack, problem.data, transport=problem.transport, noise=problem.noise, starts=1)
+    found = replace(found, alone=alone(coat_fit))
+    save_fit(found, tmp_path / "result")
+    again = load_fit(tmp_path / "result")
+    assert again.alone == found.alone
+    assert again.problem.noise == found.problem.noise
+    assert again.values == found.values
