@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fits.inference.fit_result import Fit as Fit
     from fits.inference.foresight import Foresight as Foresight
     from fits.inference.identifiability import Combination as Combination
+    from fits.inference.left_out import leave_out as leave_out
     from fits.inference.marginal_likelihood import Evidence as Evidence
     from fits.inference.marginal_likelihood import evidence as evidence
     from fits.inference.optimise import fit as fit
@@ -28,7 +29,12 @@ if TYPE_CHECKING:
     from fits.inference.prediction import predict as predict
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
+    from fits.inference.searching import Search as Search
+    from fits.inference.searching import search as search
     from fits.problem.correlated import Correlated as Correlated
+    from fits.problem.library import Library as Library
+    from fits.problem.library import default_library as default_library
+    from fits.problem.library import read_library as read_library
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -72,6 +78,12 @@ _HOMES = {
     "scores": "inference.prediction",
     "predict": "inference.prediction",
     "sample": "inference.sampling",
+    "Search": "inference.searching",
+    "search": "inference.searching",
+    "Library": "problem.library",
+    "default_library": "problem.library",
+    "read_library": "problem.library",
+    "leave_out": "inference.left_out",
     "Problem": "problem.problem",
     "report": "reporting.html",
     "load_fit": "reporting.results",

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import jax
+
 import fits
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, table, write
@@ -91,6 +93,7 @@ def study(
     for stack, coating, shared in wanted:
         if (stack, coating, shared) not in done:
             rows.append(run_row(stack, coating, shared))
+            jax.clear_caches()  # programs of sixty fits are more than a process may map into its memory
             report(f"{len(rows)}/{len(wanted)} {stack}, {coating}: {rows[-1].seconds:.0f} s")
             _save(rows, directory)
     return _save(rows, directory)

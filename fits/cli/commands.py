@@ -198,6 +198,13 @@ def compare(arguments: Namespace) -> int:
     return DONE
 
 
+def search(arguments: Namespace) -> int:
+    """Look for the stack behind the data among those that a library makes."""
+    from fits.cli.searches import search as run_search
+
+    return run_search(_measurements(arguments), arguments)
+
+
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
     from fits.reporting import tables

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from fits.cli.interrupts import raised_again
-from fits.cli.numbers import angle, count, degrees, level, seed
+from fits.cli.numbers import count, degrees, level, seed
+from fits.cli.options import add_force, add_format, add_reading, add_sampling, command
 
 OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
-QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = ("csv", "merl", "zemax", "fred")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -66,6 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_predict,
         _add_report,
         _add_compare,
+        _add_search,
         _add_info,
         _add_convert,
         _add_simulate,
@@ -76,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "fit",
         "fit a stack to measured data and write a result directory with a report",
@@ -98,31 +98,31 @@ def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
         choices=OBJECTIVES,
         help="what is minimised; all but the likelihood give no posterior (default: the stack file's, or likelihood)",
     )
-    _add_reading(parser)
+    add_reading(parser)
     _add_only(parser, "fit")
     parser.add_argument(
         "--hold-out", nargs="+", default=(), metavar="WHAT", help="leave these readings out, and score their prediction"
     )
     parser.add_argument("--sample", action="store_true", help="sample the posterior as well (see `layerjax sample`)")
-    _add_sampling(parser)
-    _add_force(parser, "replace DIR if it holds an earlier result")
+    add_sampling(parser)
+    add_force(parser, "replace DIR if it holds an earlier result")
 
 
 def _add_sample(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "sample",
         "sample the posterior of a fit; goes on where it stopped when it is run again",
         "layerjax sample result --walkers 32 --max-steps 50000",
     )
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
-    _add_sampling(parser)
+    add_sampling(parser)
     parser.add_argument("--seed", type=seed, metavar="S", help="seed (default: the chain's, or 0)")
-    _add_force(parser, "throw an earlier chain away and start again")
+    add_force(parser, "throw an earlier chain away and start again")
 
 
 def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "predict",
         "predict readings elsewhere from a saved result, or score readings",
@@ -134,10 +134,10 @@ def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
     )
     parser.add_argument("--at", metavar="FILE", help="in place of --incidence: readings, whose prediction is scored")
-    _add_format(parser)
+    add_format(parser)
     _add_only(parser, "predict")
     parser.add_argument("--out", metavar="CSV", help="file to write; its name ends in .csv")
-    _add_force(parser, "overwrite the file")
+    add_force(parser, "overwrite the file")
 
 
 def _add_only(parser: argparse.ArgumentParser, what: str) -> None:
@@ -151,7 +151,7 @@ def _add_only(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "report",
         "write the report and the pictures of a result directory again",
@@ -162,11 +162,11 @@ def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "--compare", nargs="+", default=(), metavar="DIR2", help="results for the same data to compare with"
     )
     parser.add_argument("--out", metavar="HTML", help="write the report to this file, and leave DIR as it is")
-    _add_force(parser, "overwrite the file of --out")
+    add_force(parser, "overwrite the file of --out")
 
 
 def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "compare",
         "compare fits of the same data: which stack explains it",
@@ -180,11 +180,40 @@ def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
         default=True,
         help="fit each again without each incidence, and rank by what they foretell of it (default); else by AIC",
     )
-    _add_force(parser, "overwrite the file")
+    add_force(parser, "overwrite the file")
+
+
+def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = command(
+        commands,
+        "search",
+        "look for the stack behind data: stacks grow layer by layer, and are ranked by what they foretell",
+        "layerjax search slices.csv --out stacks --noise 0.03 --calibration 0.1",
+    )
+    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
+    parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
+    parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
+    parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
+    parser.add_argument(
+        "--noise",
+        type=level,
+        metavar="REL",
+        help="relative noise beside the file's sigma (default: 0.05 without one)",
+    )
+    parser.add_argument(
+        "--calibration",
+        type=level,
+        default=0.0,
+        metavar="SD",
+        help="relative, of a common factor (default: it is exact)",
+    )
+    parser.add_argument("--starts", type=count, default=8, metavar="N", help="of each fit (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
+    add_reading(parser)
 
 
 def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "info",
         "say what is in a measurement file, and draw it",
@@ -194,12 +223,12 @@ def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument(
         "--out", metavar="PNG", help="picture to draw (default: FILE's name as .png, in the current directory)"
     )
-    _add_reading(parser)
-    _add_force(parser, "overwrite the picture")
+    add_reading(parser)
+    add_force(parser, "overwrite the picture")
 
 
 def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "convert",
         "write measurements as csv in this project's convention",
@@ -207,12 +236,12 @@ def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("data", metavar="IN", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
     parser.add_argument("out", metavar="OUT", help="file to write; its name ends in .csv")
-    _add_reading(parser)
-    _add_force(parser, "overwrite the file")
+    add_reading(parser)
+    add_force(parser, "overwrite the file")
 
 
 def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "simulate",
         "write what a goniometer would measure of a stack, with noise",
@@ -231,11 +260,11 @@ def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument("--noise", type=level, default=0.0, metavar="REL", help="relative noise (default: none)")
     parser.add_argument("--floor", type=level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
-    _add_force(parser, "overwrite the file")
+    add_force(parser, "overwrite the file")
 
 
 def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = _command(
+    parser = command(
         commands,
         "render",
         "draw a material: spheres, lobes and a map of its BSDF",
@@ -246,63 +275,7 @@ def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
     parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
-    _add_force(parser, "overwrite the file")
-
-
-def _command(
-    commands: "argparse._SubParsersAction[_Parser]", name: str, what: str, example: str
-) -> argparse.ArgumentParser:
-    return commands.add_parser(
-        name, help=what, description=f"{what[0].upper()}{what[1:]}.", epilog=f"example: {example}"
-    )
-
-
-def _add_reading(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("reading the data")
-    _add_format(group)
-    group.add_argument(
-        "--mask-retro", type=angle, metavar="DEG", help="leave out readings within DEG of retro-reflection"
-    )
-    group.add_argument(
-        "--mask-grazing", type=angle, metavar="DEG", help="leave out readings beyond DEG from the normal"
-    )
-
-
-def _add_format(parser: "argparse._ActionsContainer") -> None:
-    parser.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
-    parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
-
-
-def _add_sampling(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("sampling")
-    group.add_argument(
-        "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
-    )
-    group.add_argument(
-        "--walkers",
-        type=count,
-        metavar="N",
-        help="an even number (default: the chain's, or 32; 4 chains of nuts)",
-    )
-    group.add_argument(
-        "--ess",
-        type=count,
-        metavar="N",
-        help="go on until the worst parameter has N effective samples (default: until the chain is long enough)",
-    )
-    group.add_argument(
-        "--surrogate",
-        action=argparse.BooleanOptionalAction,
-        help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
-    )
-    group.add_argument("--max-steps", type=count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
-    group.add_argument(
-        "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"
-    )
-
-
-def _add_force(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("--force", action="store_true", help=what)
+    add_force(parser, "overwrite the file")
 
 
 class _Parser(argparse.ArgumentParser):

@@ -93,12 +93,14 @@ def fit_problem(
     solver: Solver = "least_squares",
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
+    refine: bool = True,
 ) -> Fit:
     """Find the best parameters of a problem that is already put together, as `fit` does.
 
     Args:
         problem: what is fitted to what.
         starts, seed, solver, progress, checkpoint: see `fit`.
+        refine: False: stay at the resolution of the starts, and do not ask for its error.
 
     Raises:
         ValueError: starts < 1; an unknown solver.
@@ -109,7 +111,7 @@ def fit_problem(
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or _silent
-    found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings)
+    found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
     if not left_open(problem):
         return found
     without = alone(found)
@@ -122,7 +124,8 @@ def fit_problem(
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         progress(f"{stage} with shared errors", done, total, info)
 
-    return _found(problem, points(problem, found, starts, seed), solver, report, checkpoint, settings, without)
+    places = points(problem, found, starts, seed)
+    return _found(problem, places, solver, report, checkpoint, settings, without, refine)
 
 
 def refit(problem: Problem, vector: Floats) -> Fit:
@@ -144,6 +147,7 @@ def _found(
     checkpoint: str | Path | None,
     settings: dict[str, int | str],
     without: Alone | None = None,
+    refine: bool = True,
 ) -> Fit:
     """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
     known = resolutions(problem)
@@ -151,7 +155,7 @@ def _found(
         problem = replace(problem, transport=known.far)
     ends = _ends(problem, places, solver, progress, checkpoint)
     best, accuracy = optimum(problem, ends, solver), None
-    if known is not None:
+    if known is not None and refine:
         best, accuracy = refined(best, known, solver, progress)
     return _fit_of(best, accuracy, settings, without)
 

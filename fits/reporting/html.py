@@ -135,46 +135,46 @@ def page(
         f"<h1>{html.escape(title)}</h1>",
         _verdict(fit, structure),
         _fitted(fit),
-        _section(
-            "The stack", _image(images, "stack", "Fitted stack, from top to bottom; not to scale."), _stack_text(fit)
+        section(
+            "The stack", image(images, "stack", "Fitted stack, from top to bottom; not to scale."), _stack_text(fit)
         ),
-        _section(
+        section(
             "Values",
             tables.html_table(tables.parameter_table(fit)),
             "" if fit.alone is None else tables.html_table(tables.alone_table(fit)),
         ),
-        _section(
+        section(
             "Data and model",
-            _image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),
-            _image(
+            image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),
+            image(
                 images,
                 "maps",
                 "Seen from above, forward to the right, rings at 30°, 60° and 90°; the star is the light.",
             ),
         ),
         "" if foretold is None else _held_out(foretold, images),
-        _section(
+        section(
             "How well the model explains the data",
-            _sentences(verdicts.explains(fit, structure)),
+            sentences(verdicts.explains(fit, structure)),
             tables.html_table(tables.incidence_table(structure)),
-            _image(images, "residuals", "What independent noise of the stated size would not show."),
+            image(images, "residuals", "What independent noise of the stated size would not show."),
         ),
-        _section(
+        section(
             "What the data cannot tell",
-            _sentences(verdicts.determines(fit)),
+            sentences(verdicts.determines(fit)),
             tables.html_table(tables.unresolved_table(fit)) if fit.unresolved else "",
-            _image(images, "correlation", "Correlation of the fitted parameters."),
+            image(images, "correlation", "Correlation of the fitted parameters."),
         ),
-        _section("Minima", _sentences(verdicts.minima(fit)), tables.html_table(tables.minima_table(fit))),
+        section("Minima", sentences(verdicts.minima(fit)), tables.html_table(tables.minima_table(fit))),
         _posterior(fit, posterior, images),
     ]
     if others:
         own = fit if posterior is None or not verdicts.reportable(posterior) else posterior
         from fits.inference.compare import compare
 
-        sections.append(comparison_section(compare({name: own, **others}), images))
+        sections.append(comparisonsection(compare({name: own, **others}), images))
     sections.append(_made_with())
-    return _PAGE.substitute(title=html.escape(title), body="\n".join(sections))
+    return document(title, sections)
 
 
 def comparison_page(candidates: "Mapping[str, Fit | Posterior]", compared: "Comparison") -> str:
@@ -183,21 +183,26 @@ def comparison_page(candidates: "Mapping[str, Fit | Posterior]", compared: "Comp
     figure = model_pictures.curves_picture(fits)
     images = {} if figure is None else {"comparison": pictures.as_png(figure)}
     title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
-    body = [f"<h1>{html.escape(title)}</h1>", comparison_section(compared, images)]
+    body = [f"<h1>{html.escape(title)}</h1>", comparisonsection(compared, images)]
     body += [
-        _section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
+        section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
     ]
-    return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
+    return document(title, body)
 
 
-def comparison_section(compared: "Comparison", images: Pictures) -> str:
+def comparisonsection(compared: "Comparison", images: Pictures) -> str:
     """Which of several fits explains the data, as an HTML fragment."""
-    return _section(
+    return section(
         "Comparison",
-        _sentences(compared.verdict),
+        sentences(compared.verdict),
         tables.html_table(tables.comparison_table(compared)),
-        _image(images, "comparison", "The fits beside the same data."),
+        image(images, "comparison", "The fits beside the same data."),
     )
+
+
+def document(title: str, body: Sequence[str]) -> str:
+    """A whole page from its sections."""
+    return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
 
 
 def source_name(data: Measurements) -> str:
@@ -212,18 +217,18 @@ def _fits(candidates: "Mapping[str, Fit | Posterior]") -> "dict[str, Fit]":
 
 
 def _held_out(foretold: Foretold, images: Pictures) -> str:
-    return _section(
+    return section(
         "Readings that were held out",
         tables.html_table(scores_table(foretold.prediction, foretold.readings, "")),
-        _image(
+        image(
             images, "held_out", "Readings that the fit has not seen, in the plane of incidence, and what it foretold."
         ),
     )
 
 
 def _verdict(fit: "Fit", structure: ResidualStructure) -> str:
-    sentences, fine = verdicts.in_short(fit, structure)
-    return f'<p class="verdict{" fine" if fine else ""}">{html.escape(" ".join(sentences))}</p>'
+    words, fine = verdicts.in_short(fit, structure)
+    return f'<p class="verdict{" fine" if fine else ""}">{html.escape(" ".join(words))}</p>'
 
 
 def _fitted(fit: "Fit") -> str:
@@ -244,7 +249,7 @@ def _fitted(fit: "Fit") -> str:
         *(("note", note) for note in data.source.notes),
         *((("attribution", data.source.attribution),) if data.source.attribution else ()),
     ]
-    return _section("What was fitted", tables.html_table(tables.Table("", ("", ""), tuple(rows))))
+    return section("What was fitted", tables.html_table(tables.Table("", ("", ""), tuple(rows))))
 
 
 def _stack_text(fit: "Fit") -> str:
@@ -258,14 +263,14 @@ def _stack_text(fit: "Fit") -> str:
 def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures) -> str:
     if posterior is None:
         if fit.is_posterior:
-            return _section("Posterior", "<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>")
-        return _section("Posterior", "<p>There is none: the objective is a named residual, not a likelihood.</p>")
-    return _section(
+            return section("Posterior", "<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>")
+        return section("Posterior", "<p>There is none: the objective is a named residual, not a likelihood.</p>")
+    return section(
         "Posterior",
-        _sentences(verdicts.sampled(posterior)),
+        sentences(verdicts.sampled(posterior)),
         tables.html_table(tables.posterior_table(posterior)) if verdicts.reportable(posterior) else "",
-        _image(images, "corner", "Samples of the posterior; orange: the best fit."),
-        _image(images, "trace", "Every walker; estimates use what is right of the orange line."),
+        image(images, "corner", "Samples of the posterior; orange: the best fit."),
+        image(images, "trace", "Every walker; estimates use what is right of the orange line."),
     )
 
 
@@ -276,15 +281,18 @@ def _made_with() -> str:
     return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
 
 
-def _section(head: str, *parts: str) -> str:
+def section(head: str, *parts: str) -> str:
+    """A part of a page under a heading; empty parts are left out."""
     return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
 
 
-def _sentences(sentences: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in sentences) + "</ul>"
+def sentences(words: Sequence[str]) -> str:
+    """A list of sentences."""
+    return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in words) + "</ul>"
 
 
-def _image(images: Pictures, name: str, caption: str) -> str:
+def image(images: Pictures, name: str, caption: str) -> str:
+    """A picture with its caption; nothing if there is none of this name."""
     if name not in images:
         return ""
     content = base64.b64encode(images[name]).decode("ascii")

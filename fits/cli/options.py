@@ -1,0 +1,68 @@
+"""Options that several commands have."""
+
+import argparse
+from typing import Any
+
+from fits.cli.numbers import angle, count
+
+QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
+FORMATS = ("csv", "merl", "zemax", "fred")
+
+
+def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:
+    """One of the commands: what it does, and an example."""
+    return commands.add_parser(
+        name, help=what, description=f"{what[0].upper()}{what[1:]}.", epilog=f"example: {example}"
+    )
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """How a measurement file is read."""
+    group = parser.add_argument_group("reading the data")
+    add_format(group)
+    group.add_argument(
+        "--mask-retro", type=angle, metavar="DEG", help="leave out readings within DEG of retro-reflection"
+    )
+    group.add_argument(
+        "--mask-grazing", type=angle, metavar="DEG", help="leave out readings beyond DEG from the normal"
+    )
+
+
+def add_format(parser: "argparse._ActionsContainer") -> None:
+    """What is in it."""
+    parser.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
+    parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
+
+
+def add_sampling(parser: argparse.ArgumentParser) -> None:
+    """How a posterior is sampled."""
+    group = parser.add_argument_group("sampling")
+    group.add_argument(
+        "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
+    )
+    group.add_argument(
+        "--walkers",
+        type=count,
+        metavar="N",
+        help="an even number (default: the chain's, or 32; 4 chains of nuts)",
+    )
+    group.add_argument(
+        "--ess",
+        type=count,
+        metavar="N",
+        help="go on until the worst parameter has N effective samples (default: until the chain is long enough)",
+    )
+    group.add_argument(
+        "--surrogate",
+        action=argparse.BooleanOptionalAction,
+        help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
+    )
+    group.add_argument("--max-steps", type=count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
+    group.add_argument(
+        "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"
+    )
+
+
+def add_force(parser: argparse.ArgumentParser, what: str) -> None:
+    """Leave to replace what is there."""
+    parser.add_argument("--force", action="store_true", help=what)

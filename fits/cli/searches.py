@@ -1,0 +1,54 @@
+"""The search for the stack behind data, on the command line."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+
+from fits._files import write_together
+from fits.cli.interrupts import hint
+from fits.cli.setting import use_jax
+from fits.data.measurements import Measurements
+from fits.progress import show_progress
+
+DONE = 0
+REPORT, PICTURE = "search.html", "search.png"
+
+
+def search(data: Measurements, arguments: Namespace) -> int:
+    """Fit stacks from a library, print which the data prefer, and write the report."""
+    use_jax()
+    from fits.inference.searching import search as run_search
+    from fits.problem.library import read_library
+    from fits.problem.likelihood import Noise
+    from fits.problem.parameters import Free, LogNormal
+    from fits.reporting import searches, tables
+    from fits.reporting.plots.data import as_png
+
+    directory = Path(arguments.out)
+    library = None if arguments.library is None else read_library(arguments.library)
+    level, sd = arguments.noise, arguments.calibration
+    # far enough for four standard deviations
+    scale = Free(1.0, float(np.exp(-4.0 * sd)), float(np.exp(4.0 * sd)), LogNormal(1.0, sd)) if sd > 0.0 else None
+    noise = Noise() if level is None else Noise(relative=level)
+    again = f"{directory} keeps what was fitted; the same command again goes on with it"
+    with show_progress() as progress, hint(again):
+        found = run_search(
+            data,
+            library,
+            layers=arguments.layers,
+            noise=noise,
+            scale=scale,
+            starts=arguments.starts,
+            seed=arguments.seed,
+            progress=progress,
+            directory=directory,
+        )
+    tables.print_table(searches.search_table(found), sys.stdout)
+    for sentence in searches.search_sentences(found):
+        print(sentence)
+    picture = as_png(searches.search_picture(found))
+    write_together(directory, {PICTURE: picture, REPORT: searches.search_page(found).encode()})
+    print(f"Report: {directory / REPORT}")
+    return DONE

@@ -1,0 +1,242 @@
+"""Which stack of layers is behind the data: stacks from a library grow and shrink by a layer, and are ranked by what
+they foretell.
+
+Every structure of a level is fitted with noise alone, at a coarse resolution: that is cheap, and tells by the Bayesian
+information criterion which of them are worth a closer look. These few are fitted as `fits.fit` does, with errors that
+readings share where residuals say so, and ranked by what they foretell of incidences that are left out (`leave_out`).
+The next level has a layer more, or less, than the best of all. It ends where that no longer foretells more than chance
+would.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from fits.data.measurements import Measurements
+from fits.inference.fit_result import Fit
+from fits.inference.foresight import Foresight, together
+from fits.inference.left_out import LeftOut, leave_out
+from fits.inference.marginal_likelihood import Evidence, evidence
+from fits.inference.optimise import fit, fit_problem
+from fits.inference.search_files import Kept
+from fits.problem.compiled import cores
+from fits.problem.correlated import Correlated
+from fits.problem.library import Library, Structure, default_library
+from fits.problem.likelihood import Noise
+from fits.problem.model import Transport
+from fits.problem.parameters import Free
+from fits.problem.problem import Problem
+from fits.progress import Progress
+
+STARTS = 8
+BEAM = 2
+"""So many of the best structures grow and shrink."""
+
+CLOSER = 3
+"""So many of a level are looked at closely, besides those that were before."""
+
+NONE_MORE = 2.0
+"""A structure is no better if it is not ahead by so many standard errors."""
+
+Run = Callable[[Structure, bool | Correlated | None], Fit]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A structure that was fitted. name: from top to bottom. bic: with noise alone, less that of the best. fit: closer,
+    if it was looked at, else with noise alone. foresight: None if it was not looked at closely."""
+
+    structure: Structure
+    parameters: int
+    bic: float
+    fit: Fit
+    foresight: Foresight | None
+
+    @property
+    def name(self) -> str:
+        """As words."""
+        return named(self.structure)
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Structures that were fitted, best first: by what they foretell, then by the information criterion.
+
+    alike: names of those that the data cannot tell from the best.
+    """
+
+    found: tuple[Found, ...]
+    alike: tuple[str, ...]
+
+    @property
+    def best(self) -> Found:
+        """What foretells best."""
+        return self.found[0]
+
+
+def named(structure: Structure) -> str:
+    """A structure as words."""
+    return " / ".join(structure)
+
+
+def search(
+    data: Measurements,
+    library: Library | None = None,
+    *,
+    layers: int = 3,
+    transport: Transport = "auto",
+    noise: Noise | None = None,
+    scale: float | Free | None = None,
+    starts: int = STARTS,
+    seed: int = 0,
+    progress: Progress | None = None,
+    directory: str | Path | None = None,
+) -> Search:
+    """Look for the stack behind the data among those that a library's layers and bases make.
+
+    Args:
+        data: only the samples that its mask leaves in are used.
+        library: `default_library` for the channels of the data, if None.
+        layers: at most so many over the base, in [0, 6].
+        transport, noise, scale: see `Problem`; "auto" carries all orders of scattering.
+        starts, seed: of each fit, see `fit`.
+        progress: called with (what is done, structures done, structures of this level, note).
+        directory: where each structure is kept as it is fitted: a search that was killed takes those for done. Of
+            another search it is refused.
+
+    Raises:
+        ValueError: layers out of range; another search's directory; or as `fit` and `leave_out`.
+    """
+    if not 0 <= layers <= 6:
+        raise ValueError(f"layers is {layers}; it must be in [0, 6]")
+    library = default_library(len(data.channels)) if library is None else library
+    noise = Noise() if noise is None else noise
+    kept = None if directory is None else Kept(directory, data, library, noise, scale, transport, starts, seed)
+    looked = _Looked(kept)
+
+    def run(structure: Structure, shared: bool | Correlated | None) -> Fit:
+        stored = kept.fit(structure, shared) if kept is not None else None
+        if stored is not None:
+            return stored
+        stack = library.stack(structure)
+        if shared is False:
+            alone = Problem(stack, data, transport, replace(noise, correlated=False), scale)
+            found = fit_problem(alone, starts=starts, seed=seed, refine=False)
+        else:
+            found = fit(stack, data, transport=transport, noise=noise, scale=scale, starts=starts, seed=seed)
+        if kept is not None:
+            kept.keep(structure, shared, found)
+        return found
+
+    level: list[Structure] = [(base,) for base in library.bases]
+    while level:
+        _screen(level, run, looked, progress)
+        closer = sorted(level, key=looked.bic)[:CLOSER]
+        before = looked.best()
+        for number, structure in enumerate(closer):
+            _report(progress, "closer look", number, len(closer), structure)
+            looked.look(structure, lambda one: run(one, noise.correlated))
+        jax.clear_caches()  # thousands of programs are more than a process may map into its memory
+        if before is not None and not looked.ahead(before):
+            break
+        level = _next(looked, library, layers)
+    _report(progress, "closer look", 1, 1, None)
+    return looked.result()
+
+
+def _screen(level: list[Structure], run: Run, looked: "_Looked", progress: Progress | None) -> None:
+    """Fit structures with noise alone, some at a time: to compile one keeps a single core busy."""
+    done = 0
+    _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])
+    with ThreadPoolExecutor(cores()) as pool:
+        for structure, found in zip(level, pool.map(lambda one: run(one, False), level), strict=True):
+            looked.plain[structure] = found
+            done += 1
+            _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
+    jax.clear_caches()
+
+
+def _next(looked: "_Looked", library: Library, layers: int) -> list[Structure]:
+    """Structures not fitted before, a layer more or less than the best."""
+    grown: list[Structure] = []
+    for structure in looked.ranked()[:BEAM]:
+        above, base = structure[:-1], structure[-1]
+        shrunk = [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
+        more = [
+            (*above[:place], layer, *above[place:], base)
+            for place in range(len(above) + 1)
+            for layer in library.layers
+            if len(above) < layers
+        ]
+        grown += [one for one in (*shrunk, *more) if all(a != b for a, b in pairwise(one))]
+    return [one for one in dict.fromkeys(grown) if one not in looked.plain]
+
+
+class _Looked:
+    """What was fitted so far, and what the closer looks found."""
+
+    def __init__(self, kept: Kept | None):
+        self.kept = kept
+        self.plain: dict[Structure, Fit] = {}
+        self.fits: dict[Structure, Fit] = {}
+        self.left: dict[Structure, LeftOut] = {}
+        self.evidences: dict[Structure, Evidence] = {}
+
+    def bic(self, structure: Structure) -> float:
+        fit = self.plain[structure]
+        return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
+
+    def look(self, structure: Structure, run: Callable[[Structure], Fit]) -> None:
+        found = self.fits[structure] = run(structure)
+        stored = self.kept.look(structure) if self.kept is not None else None
+        if stored is None:
+            stored = leave_out(found), evidence(found)
+            if self.kept is not None:
+                self.kept.keep_look(structure, *stored)
+        self.left[structure], self.evidences[structure] = stored
+
+    def ranked(self) -> list[Structure]:
+        return sorted(self.left, key=lambda one: -self.left[one].score)
+
+    def best(self) -> Structure | None:
+        return self.ranked()[0] if self.left else None
+
+    def ahead(self, before: Structure) -> bool:
+        """Whether the best is clearly better than what was it before."""
+        best = self.ranked()[0]
+        gaps = self.left[best].by_group - self.left[before].by_group
+        return best != before and gaps.sum() > NONE_MORE * np.sqrt(gaps.size) * gaps.std(ddof=1)
+
+    def result(self) -> Search:
+        ranked = self.ranked()
+        foresights = together(
+            {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
+        )
+        lowest = min(map(self.bic, self.plain))
+        rest = sorted((one for one in self.plain if one not in self.left), key=self.bic)
+        found = tuple(
+            Found(
+                structure=one,
+                parameters=len(self.fits.get(one, self.plain[one]).vector),
+                bic=self.bic(one) - lowest,
+                fit=self.fits.get(one, self.plain[one]),
+                foresight=foresights.get(named(one)),
+            )
+            for one in (*ranked, *rest)
+        )
+        alike = tuple(
+            name
+            for name, seen in foresights.items()
+            if name != found[0].name and seen.behind <= NONE_MORE * seen.behind_error
+        )
+        return Search(found, alike)
+
+
+def _report(progress: Progress | None, stage: str, done: int, total: int, structure: Structure | None) -> None:
+    if progress is not None:
+        progress(stage, done, total, "" if structure is None else named(structure))
