@@ -29,12 +29,7 @@ if TYPE_CHECKING:
     from fits.inference.prediction import predict as predict
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
-    from fits.inference.searching import Search as Search
-    from fits.inference.searching import search as search
     from fits.problem.correlated import Correlated as Correlated
-    from fits.problem.library import Library as Library
-    from fits.problem.library import default_library as default_library
-    from fits.problem.library import read_library as read_library
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -49,6 +44,11 @@ if TYPE_CHECKING:
     from fits.reporting.results import load_fit as load_fit
     from fits.reporting.results import load_posterior as load_posterior
     from fits.reporting.results import save_fit as save_fit
+    from fits.structures.library import Library as Library
+    from fits.structures.library import default_library as default_library
+    from fits.structures.library import read_library as read_library
+    from fits.structures.searching import Search as Search
+    from fits.structures.searching import search as search
 
 _HOMES = {
     "average": "inference.averaging",
@@ -78,11 +78,11 @@ _HOMES = {
     "scores": "inference.prediction",
     "predict": "inference.prediction",
     "sample": "inference.sampling",
-    "Search": "inference.searching",
-    "search": "inference.searching",
-    "Library": "problem.library",
-    "default_library": "problem.library",
-    "read_library": "problem.library",
+    "Search": "structures.searching",
+    "search": "structures.searching",
+    "Library": "structures.library",
+    "default_library": "structures.library",
+    "read_library": "structures.library",
     "leave_out": "inference.left_out",
     "Problem": "problem.problem",
     "report": "reporting.html",

@@ -55,6 +55,7 @@ PACKAGES = [
     "fits.problem",
     "fits.inference",
     "fits.reporting",
+    "fits.structures",
     "fits.cli",
     "fits",
     "benchmarks.suite",

@@ -19,12 +19,13 @@ REPORT, PICTURE = "search.html", "search.png"
 def search(data: Measurements, arguments: Namespace) -> int:
     """Fit stacks from a library, print which the data prefer, and write the report."""
     use_jax()
-    from fits.inference.searching import search as run_search
-    from fits.problem.library import read_library
     from fits.problem.likelihood import Noise
     from fits.problem.parameters import Free, LogNormal
-    from fits.reporting import searches, tables
+    from fits.reporting import tables
     from fits.reporting.plots.data import as_png
+    from fits.structures import telling
+    from fits.structures.library import read_library
+    from fits.structures.searching import search as run_search
 
     directory = Path(arguments.out)
     library = None if arguments.library is None else read_library(arguments.library)
@@ -45,10 +46,10 @@ def search(data: Measurements, arguments: Namespace) -> int:
             progress=progress,
             directory=directory,
         )
-    tables.print_table(searches.search_table(found), sys.stdout)
-    for sentence in searches.search_sentences(found):
+    tables.print_table(telling.search_table(found), sys.stdout)
+    for sentence in telling.search_sentences(found):
         print(sentence)
-    picture = as_png(searches.search_picture(found))
-    write_together(directory, {PICTURE: picture, REPORT: searches.search_page(found).encode()})
+    picture = as_png(telling.search_picture(found))
+    write_together(directory, {PICTURE: picture, REPORT: telling.search_page(found).encode()})
     print(f"Report: {directory / REPORT}")
     return DONE

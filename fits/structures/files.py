@@ -17,7 +17,8 @@ from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.inference.left_out import LeftOut
 from fits.inference.marginal_likelihood import Evidence
-from fits.problem.library import Structure
+from fits.reporting.results import load_fit, save_fit
+from fits.structures.library import Structure
 
 IDENTITY = "search.json"
 
@@ -44,15 +45,11 @@ class Kept:
 
     def fit(self, structure: Structure, shared: Any) -> Fit | None:
         """The fit of a structure, if it is there."""
-        from fits.reporting.results import load_fit
-
         path = self._place(structure, shared)
         return load_fit(path) if path.is_dir() else None
 
     def keep(self, structure: Structure, shared: Any, fit: Fit) -> None:
         """Write the fit of a structure."""
-        from fits.reporting.results import save_fit
-
         save_fit(fit, self._place(structure, shared))
 
     def look(self, structure: Structure) -> tuple[LeftOut, Evidence] | None:

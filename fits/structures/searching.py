@@ -22,16 +22,16 @@ from fits.inference.fit_result import Fit
 from fits.inference.foresight import Foresight, together
 from fits.inference.left_out import LeftOut, leave_out
 from fits.inference.marginal_likelihood import Evidence, evidence
-from fits.inference.optimise import fit, fit_problem
-from fits.inference.search_files import Kept
+from fits.inference.optimise import fit_problem
 from fits.problem.compiled import cores
 from fits.problem.correlated import Correlated
-from fits.problem.library import Library, Structure, default_library
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.progress import Progress
+from fits.structures.files import Kept
+from fits.structures.library import Library, Structure, default_library
 
 STARTS = 8
 BEAM = 2
@@ -42,8 +42,6 @@ CLOSER = 3
 
 NONE_MORE = 2.0
 """A structure is no better if it is not ahead by so many standard errors."""
-
-Run = Callable[[Structure, bool | Correlated | None], Fit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,22 +115,8 @@ def search(
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
     kept = None if directory is None else Kept(directory, data, library, noise, scale, transport, starts, seed)
+    run = _Fitting(data, library, transport, noise, scale, starts, seed, kept)
     looked = _Looked(kept)
-
-    def run(structure: Structure, shared: bool | Correlated | None) -> Fit:
-        stored = kept.fit(structure, shared) if kept is not None else None
-        if stored is not None:
-            return stored
-        stack = library.stack(structure)
-        if shared is False:
-            alone = Problem(stack, data, transport, replace(noise, correlated=False), scale)
-            found = fit_problem(alone, starts=starts, seed=seed, refine=False)
-        else:
-            found = fit(stack, data, transport=transport, noise=noise, scale=scale, starts=starts, seed=seed)
-        if kept is not None:
-            kept.keep(structure, shared, found)
-        return found
-
     level: list[Structure] = [(base,) for base in library.bases]
     while level:
         _screen(level, run, looked, progress)
@@ -149,7 +133,34 @@ def search(
     return looked.result()
 
 
-def _screen(level: list[Structure], run: Run, looked: "_Looked", progress: Progress | None) -> None:
+@dataclass(frozen=True)
+class _Fitting:
+    """Fits structures, or takes what was kept of them."""
+
+    data: Measurements
+    library: Library
+    transport: Transport
+    noise: Noise
+    scale: float | Free | None
+    starts: int
+    seed: int
+    kept: Kept | None
+
+    def __call__(self, structure: Structure, shared: bool | Correlated | None) -> Fit:
+        found = self.kept.fit(structure, shared) if self.kept is not None else None
+        if found is None:
+            found = self._fitted(structure, shared)
+            if self.kept is not None:
+                self.kept.keep(structure, shared, found)
+        return found
+
+    def _fitted(self, structure: Structure, shared: bool | Correlated | None) -> Fit:
+        noise = replace(self.noise, correlated=shared)
+        problem = Problem(self.library.stack(structure), self.data, self.transport, noise, self.scale)
+        return fit_problem(problem, starts=self.starts, seed=self.seed, refine=shared is not False)
+
+
+def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
     """Fit structures with noise alone, some at a time: to compile one keeps a single core busy."""
     done = 0
     _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])

@@ -13,7 +13,7 @@ from fits.reporting.plots.data import CYCLE, GREY, STYLE, as_png
 from fits.reporting.verdicts import listed
 
 if TYPE_CHECKING:
-    from fits.inference.searching import Found, Search
+    from fits.structures.searching import Found, Search
 
 SHOWN = 20
 """Rows of the table on the terminal."""

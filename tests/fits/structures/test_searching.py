@@ -1,0 +1,98 @@
+"""The search for the stack behind data, by transports that are known and cheap."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from fits.reporting.plots.data import as_png
+from fits.structures import telling
+from fits.structures.library import Library
+from fits.structures.searching import search
+
+LIBRARY = Library(
+    layers={"interface": lj.Interface(Free(1.5, 1.05, 2.5), Free(0.3, 0.05, 1.0))},
+    bases={
+        "diffuse": lj.Stack([], lj.Lambertian(Free(0.3, 0.0, 1.0))),
+        "metal": lj.Stack([], lj.Conductor(Free(1.5, 0.1, 5.0), Free(2.0, 0.1, 8.0), Free(0.3, 0.05, 1.0))),
+    },
+)
+TRUTH = lj.Stack([lj.Interface(1.4, 0.25)], lj.Lambertian(0.3))
+NOISE = Noise(relative=0.03, floor=1e-6)
+
+
+@pytest.fixture(scope="module")
+def data() -> fits.Measurements:
+    geometry = fits.slices([10.0, 40.0, 70.0], np.arange(-75.0, 76.0, 6.0))
+    return fits.simulate(TRUTH, geometry, lj.Statistical(), 0.03, 1e-6, seed=1)
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("search") / "stacks"
+
+
+@pytest.fixture(scope="module")
+def found(data: fits.Measurements, directory: Path) -> fits.Search:
+    return search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=NOISE, starts=2, directory=directory)
+
+
+def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
+    assert found.best.name == "interface / diffuse"
+    assert found.alike == ()
+    assert {one.name for one in found.found} == {"diffuse", "metal", "interface / diffuse", "interface / metal"}
+    assert found.best.bic == 0.0
+    assert found.best.foresight.probability > 0.999
+    assert not found.best.fit.problem.noise.correlated
+    values, errors = found.best.fit.values, found.best.fit.standard_errors
+    for name, truth in (("layers[0].ior", 1.4), ("layers[0].alpha", 0.25), ("base.albedo", 0.3)):
+        assert abs(values[name] - truth) < 4.0 * errors[name]
+
+
+def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
+    (directory / "interface+diffuse.npz").unlink()
+    begun: list[str] = []
+    again = search(
+        data,
+        LIBRARY,
+        layers=1,
+        transport=lj.Statistical(),
+        noise=NOISE,
+        starts=2,
+        directory=directory,
+        progress=lambda stage, done, total=None, info="": begun.append(info),
+    )
+    assert "interface / diffuse" in begun
+    assert [one.name for one in again.found] == [one.name for one in found.found]
+    for one, other in zip(again.found, found.found, strict=True):
+        np.testing.assert_allclose(one.fit.vector, other.fit.vector)
+    assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
+
+
+def test_another_search_is_refused(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
+    with pytest.raises(ValueError, match="holds a search of other data, or with another library or settings"):
+        search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=NOISE, starts=3, directory=directory)
+    with pytest.raises(ValueError, match="is not empty, and holds no search"):
+        search(data, LIBRARY, noise=NOISE, directory=directory.parent)
+
+
+def test_bad_requests_are_refused(data: fits.Measurements) -> None:
+    with pytest.raises(ValueError, match=r"layers is 9; it must be in \[0, 6\]"):
+        search(data, LIBRARY, layers=9)
+
+
+def test_it_is_told_in_words_and_pictures(found: fits.Search) -> None:
+    table = telling.search_table(found)
+    assert table.rows[0][0] == "interface / diffuse"
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    words = " ".join(telling.search_sentences(found))
+    assert "interface / diffuse foretells incidences that are left out best, of 4 structures" in words
+    assert "The data tell it from all others" in words
+    assert as_png(telling.search_picture(found)).startswith(b"\x89PNG")
+    page = telling.search_page(found)
+    assert "interface / metal" in page
+    assert "<h1>Stacks behind" in page
