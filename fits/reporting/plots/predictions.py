@@ -43,7 +43,8 @@ def bands_picture(prediction: "Prediction", readings: "Measurements") -> Figure 
                 value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
                 axes.set_title(incidence.label if channel == 0 else "")
             grid[-1, column].set_xlabel(ANGLE_LABEL)
-        grid[0, 0].legend(loc="upper right")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure
 
 
