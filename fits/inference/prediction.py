@@ -116,8 +116,8 @@ def predict(
     Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
 
     Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, or directions that the
-            transport cannot answer.
+        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels, or
+            directions that the transport cannot answer.
     """
     fit = of.fit if isinstance(of, Posterior) else of
     if not fit.is_posterior:
@@ -225,6 +225,11 @@ def _band(values: Floats, levels: tuple[float, ...]) -> Band:
 
 def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
     if isinstance(at, Measurements):
+        if len(at.channels) != len(fit.problem.data.channels):
+            raise ValueError(
+                f"predict: the readings have the channels {', '.join(at.channels)}, "
+                f"the fit {', '.join(fit.problem.data.channels)}"
+            )
         return at.used()
     count, channels = len(at), fit.problem.data.channels
     nothing = np.zeros((count, len(channels)))

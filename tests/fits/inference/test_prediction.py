@@ -114,6 +114,10 @@ def test_bad_requests_are_refused() -> None:
     named = fit(STACK, found.problem.data, transport=line, objective="cube_root", starts=1)
     with pytest.raises(ValueError, match=r"a fit of 'cube_root' has no noise model"):
         predict(named, found.problem.data)
+    data = found.problem.data
+    colours = Measurements(data.wi, data.wo, np.tile(data.values, 3), None, data.mask, ("r", "g", "b"))
+    with pytest.raises(ValueError, match=r"the readings have the channels r, g, b, the fit value"):
+        predict(found, colours)
     at = predict(found, slices([30.0]))
     with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
         scores(at, found.problem.data)
