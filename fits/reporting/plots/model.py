@@ -88,8 +88,8 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             )
             if index >= len(shown) - columns:
                 lower.set_xlabel(ANGLE_LABEL)
-            if index == 0:
-                upper.legend(loc="upper right")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 
 
