@@ -116,7 +116,7 @@ def test_bad_requests_are_refused() -> None:
         predict(named, found.problem.data)
     data = found.problem.data
     colours = Measurements(data.wi, data.wo, np.tile(data.values, 3), None, data.mask, ("r", "g", "b"))
-    with pytest.raises(ValueError, match=r"the readings have the channels r, g, b, the fit value"):
+    with pytest.raises(ValueError, match=r"the readings have the channels r, g, b, the fit c0"):
         predict(found, colours)
     at = predict(found, slices([30.0]))
     with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
