@@ -112,20 +112,41 @@ def fit_problem(
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or _silent
     found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
-    if not left_open(problem):
+    if not left_open(problem) or not are_shared(alone(found)):
         return found
-    without = alone(found)
-    if not are_shared(without):
-        return found
-    problem = replace(problem, noise=replace(problem.noise, correlated=True))
-    if checkpoint is not None:
-        checkpoint = again(checkpoint)
+    return fit_again(
+        problem,
+        found,
+        starts=starts,
+        seed=seed,
+        solver=solver,
+        progress=progress,
+        checkpoint=None if checkpoint is None else again(checkpoint),
+        refine=refine,
+    )
+
+
+def fit_again(
+    problem: Problem,
+    found: Fit,
+    *,
+    starts: int = 32,
+    seed: int = 0,
+    solver: Solver = "least_squares",
+    progress: Progress | None = None,
+    checkpoint: str | Path | None = None,
+    refine: bool = True,
+) -> Fit:
+    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
+    shared = replace(problem, noise=replace(problem.noise, correlated=True))
+    settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
+    progress = progress or _silent
 
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         progress(f"{stage} with shared errors", done, total, info)
 
-    places = points(problem, found, starts, seed)
-    return _found(problem, places, solver, report, checkpoint, settings, without, refine)
+    places = points(shared, found, starts, seed)
+    return _found(shared, places, solver, report, checkpoint, settings, alone(found), refine)
 
 
 def refit(problem: Problem, vector: Floats) -> Fit:

@@ -43,14 +43,14 @@ class Kept:
         self.directory.mkdir(parents=True, exist_ok=True)
         write_json(path, identity)
 
-    def fit(self, structure: Structure, shared: Any) -> Fit | None:
+    def fit(self, structure: Structure, closer: bool) -> Fit | None:
         """The fit of a structure, if it is there."""
-        path = self._place(structure, shared)
+        path = self._place(structure, closer)
         return load_fit(path) if path.is_dir() else None
 
-    def keep(self, structure: Structure, shared: Any, fit: Fit) -> None:
+    def keep(self, structure: Structure, closer: bool, fit: Fit) -> None:
         """Write the fit of a structure."""
-        save_fit(fit, self._place(structure, shared))
+        save_fit(fit, self._place(structure, closer))
 
     def look(self, structure: Structure) -> tuple[LeftOut, Evidence] | None:
         """What a closer look found, if it is there."""
@@ -76,8 +76,8 @@ class Kept:
         np.savez(content, log_density=left.log_density, **arrays)
         write_bytes(self.directory / f"{_slug(structure)}.npz", content.getvalue(), force=True)
 
-    def _place(self, structure: Structure, shared: Any) -> Path:
-        return self.directory / (_slug(structure) + ("" if shared is False else "+closer"))
+    def _place(self, structure: Structure, closer: bool) -> Path:
+        return self.directory / (_slug(structure) + ("+closer" if closer else ""))
 
 
 def _slug(structure: Structure) -> str:

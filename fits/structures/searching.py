@@ -8,7 +8,6 @@ The next level has a layer more, or less, than the best of all. It ends where th
 would.
 """
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -22,9 +21,9 @@ from fits.inference.fit_result import Fit
 from fits.inference.foresight import Foresight, together
 from fits.inference.left_out import LeftOut, leave_out
 from fits.inference.marginal_likelihood import Evidence, evidence
-from fits.inference.optimise import fit_problem
+from fits.inference.optimise import fit_again, fit_problem
+from fits.inference.shared_errors import alone, are_shared, left_open
 from fits.problem.compiled import cores
-from fits.problem.correlated import Correlated
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
@@ -124,7 +123,7 @@ def search(
         before = looked.best()
         for number, structure in enumerate(closer):
             _report(progress, "closer look", number, len(closer), structure)
-            looked.look(structure, lambda one: run(one, noise.correlated))
+            looked.look(structure, run)
         jax.clear_caches()  # thousands of programs are more than a process may map into its memory
         if before is not None and not looked.ahead(before):
             break
@@ -146,18 +145,23 @@ class _Fitting:
     seed: int
     kept: Kept | None
 
-    def __call__(self, structure: Structure, shared: bool | Correlated | None) -> Fit:
-        found = self.kept.fit(structure, shared) if self.kept is not None else None
+    def __call__(self, structure: Structure, plain: Fit | None = None) -> Fit:
+        """With noise alone at a coarse resolution; closer after that, with the fit that is `plain`."""
+        closer = plain is not None
+        found = self.kept.fit(structure, closer) if self.kept is not None else None
         if found is None:
-            found = self._fitted(structure, shared)
+            found = self._fitted(structure, plain)
             if self.kept is not None:
-                self.kept.keep(structure, shared, found)
+                self.kept.keep(structure, closer, found)
         return found
 
-    def _fitted(self, structure: Structure, shared: bool | Correlated | None) -> Fit:
-        noise = replace(self.noise, correlated=shared)
-        problem = Problem(self.library.stack(structure), self.data, self.transport, noise, self.scale)
-        return fit_problem(problem, starts=self.starts, seed=self.seed, refine=shared is not False)
+    def _fitted(self, structure: Structure, plain: Fit | None) -> Fit:
+        problem = Problem(self.library.stack(structure), self.data, self.transport, self.noise, self.scale)
+        if plain is not None and left_open(problem) and are_shared(alone(plain)):
+            return fit_again(problem, plain, starts=self.starts, seed=self.seed)
+        if plain is None or left_open(problem):
+            problem = replace(problem, noise=replace(self.noise, correlated=False))
+        return fit_problem(problem, starts=self.starts, seed=self.seed, refine=plain is not None)
 
 
 def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
@@ -165,7 +169,7 @@ def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: 
     done = 0
     _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])
     with ThreadPoolExecutor(cores()) as pool:
-        for structure, found in zip(level, pool.map(lambda one: run(one, False), level), strict=True):
+        for structure, found in zip(level, pool.map(run, level), strict=True):
             looked.plain[structure] = found
             done += 1
             _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
@@ -202,8 +206,8 @@ class _Looked:
         fit = self.plain[structure]
         return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
 
-    def look(self, structure: Structure, run: Callable[[Structure], Fit]) -> None:
-        found = self.fits[structure] = run(structure)
+    def look(self, structure: Structure, run: _Fitting) -> None:
+        found = self.fits[structure] = run(structure, self.plain[structure])
         stored = self.kept.look(structure) if self.kept is not None else None
         if stored is None:
             stored = leave_out(found), evidence(found)
