@@ -61,16 +61,14 @@ def search_picture(search: "Search") -> Figure:
             assert one.foresight is not None
             colour = CYCLE[number % len(CYCLE)] if number < NAMED else GREY
             error, behind = one.foresight.behind_error, one.foresight.behind
-            count = len(one.fit.alone.values) if one.fit.alone else one.parameters
-            left.errorbar(count, max(behind, 0.0), yerr=error, fmt="o", color=colour, markersize=5, label=_short(one))
+            left.errorbar(_own(one), max(behind, 0.0), yerr=error, fmt="o", color=colour, markersize=5, label=one.name)
         left.set_yscale("symlog", linthresh=10.0)
         left.invert_yaxis()
         left.set(xlabel="parameters of the stack", ylabel="score behind the best", title="Foretelling what is left out")
-        counts = [len(one.fit.alone.values) if one.fit.alone else one.parameters for one in search.found]
+        counts = [_own(one) for one in search.found]
         middle.plot(counts, [max(one.bic, 0.0) for one in search.found], "o", color=GREY, markersize=4)
         for number, one in enumerate(close[:NAMED]):
-            count = len(one.fit.alone.values) if one.fit.alone else one.parameters
-            middle.plot(count, max(one.bic, 0.0), "o", color=CYCLE[number % len(CYCLE)], markersize=6)
+            middle.plot(_own(one), max(one.bic, 0.0), "o", color=CYCLE[number % len(CYCLE)], markersize=6)
         middle.set_yscale("symlog", linthresh=10.0)
         middle.invert_yaxis()
         middle.set(xlabel="parameters of the stack", ylabel="BIC above the lowest", title="Fit with noise alone")
@@ -119,8 +117,9 @@ def _row(one: "Found") -> tuple[str, ...]:
         )
     alone = one.fit.alone
     ratio = alone.chi_square / max(alone.degrees_of_freedom, 1) if alone else one.fit.reduced_chi_square
-    return (one.name, str(len(alone.values) if alone else one.parameters), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
+    return (one.name, str(_own(one)), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
 
 
-def _short(one: "Found") -> str:
-    return one.name
+def _own(one: "Found") -> int:
+    """Parameters, without those of errors that readings share."""
+    return len(one.fit.alone.values) if one.fit.alone else one.parameters
