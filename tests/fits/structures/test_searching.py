@@ -14,6 +14,8 @@ from fits.structures import telling
 from fits.structures.library import Library
 from fits.structures.searching import search
 
+pytestmark = pytest.mark.slow
+
 LIBRARY = Library(
     layers={"interface": lj.Interface(Free(1.5, 1.05, 2.5), Free(0.3, 0.05, 1.0))},
     bases={
