@@ -7,15 +7,11 @@ of the approximation is the evidence, however good it is; how good is told by th
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
-from fits.problem.model import Model
 
 DRAWS = 1000
 UNRELIABLE = 0.7
@@ -48,9 +44,11 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
     import arviz
 
+    from fits.inference.ensemble import log_posteriors
+
     approximation = Approximation.of(fit)
     positions = approximation.draw(np.random.RandomState(seed), draws)
-    heights = np.asarray(fit.problem.call(_heights, positions), float)
+    heights = np.asarray(fit.problem.call(log_posteriors, positions), float)
     weights = heights - approximation.log_density(positions)
     weights = np.where(np.isfinite(weights), weights, -np.inf)
     total = float(logsumexp(weights))
@@ -60,7 +58,3 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     finite = np.maximum(weights - weights.max(), -700.0)
     _, shape = arviz.psislw(finite)
     return Evidence(total - float(np.log(draws)), float(np.std(relative) / np.sqrt(draws)), float(shape))
-
-
-def _heights(model: Model, positions: Array) -> Array:
-    return jax.lax.map(lambda u: model.log_posterior_unconstrained(u), jnp.asarray(positions))

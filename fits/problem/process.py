@@ -4,8 +4,8 @@ With model value f, datum d and noise n, g(d) = g(f) + e + n, where g is the log
 deviations of the noise, a straight line (`logarithm`). e has Matern kernels of the angles of half vector and difference
 (Rusinkiewicz 1998), folded so that light and viewer may change places: errors follow a lobe from one incidence to the
 next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Channels have one correlation. The process lives on
-nodes of a grid, a cubic between them, and costs a matrix of as many rows as nodes that readings touch. Noise is that of
-the datum, so that the covariance does not depend on the model, and most of its derivatives vanish.
+nodes that are the product of two grids, a cubic between them, and costs a matrix of as many rows. Noise is that of the
+datum, so that the covariance does not depend on the model, and most of its derivatives vanish.
 
 The negative log-density of all readings is half a sum of squares again, up to a constant: with A from white numbers c
 to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
@@ -227,7 +227,7 @@ def _square(roots: Roots, gram: Array) -> Array:
     return square.reshape(size, size)
 
 
-def _whitened(numbers: Array, nodes: tuple[Array, Array], gram: Array, wanted: Array) -> tuple[Array, Array, Array]:
+def _whitened(numbers: Array, nodes: tuple[Array, Array], gram: Array, wanted: Array) -> Trio:
     """Errors on the nodes, (C, H, D), white numbers and levels, from what readings tell and want, (C, H, D)."""
     roots = _roots(numbers, nodes, len(wanted))
     latent, levels = _solved(_matrix(numbers[0], roots, gram), numbers[0] * _mixed_back(roots, wanted))

@@ -8,6 +8,7 @@ The next level has a layer more, or less, than the best of all. It ends where th
 would.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from fits.inference.left_out import LeftOut, leave_out
 from fits.inference.marginal_likelihood import Evidence, evidence
 from fits.inference.optimise import fit_again, fit_problem
 from fits.inference.shared_errors import alone, are_shared, left_open
+from fits.problem.compiled import cores
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
@@ -163,11 +165,12 @@ class _Fitting:
 
 
 def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
-    """Fit structures with noise alone, one after the other: programs on several devices may not run side by side."""
+    """Fit structures with noise alone, some at a time: to compile one keeps a single core busy."""
     _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])
-    for done, structure in enumerate(level, 1):
-        looked.plain[structure] = run(structure)
-        _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
+    with ThreadPoolExecutor(cores()) as pool:
+        for done, (structure, found) in enumerate(zip(level, pool.map(run, level), strict=True), 1):
+            looked.plain[structure] = found
+            _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
     jax.clear_caches()
 
 
