@@ -15,16 +15,35 @@ class Progress(Protocol):
     def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None: ...
 
 
+class _Pace:
+    """Adds to a note how long its stage takes from here on, at the pace since the first call of the stage."""
+
+    def __init__(self) -> None:
+        self.first: dict[str, tuple[float, int]] = {}
+        self.last: dict[str, int] = {}
+
+    def noted(self, stage: str, done: int, total: int | None, info: str) -> str:
+        now = time.monotonic()
+        if done < self.last.get(stage, done + 1):  # it begins, or begins again
+            self.first[stage] = now, done
+        self.last[stage] = done
+        began, first = self.first[stage]
+        if total is None or not first < done < total:
+            return info
+        left = f"about {in_words((now - began) / (done - first) * (total - done))} left"
+        return f"{left}; {info}" if info else left
+
+
 class _Lines:
     """At most one line per `SECONDS_BETWEEN_LINES`, plus one when a stage begins and one when it is complete."""
 
     def __init__(self, stream: TextIO, name: str):
         self.stream, self.name = stream, name
-        self.stage, self.written = "", 0.0
+        self.stage, self.written, self.pace = "", 0.0, _Pace()
 
     def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None:
         now = time.monotonic()
-        complete = total is not None and done >= total
+        complete, info = total is not None and done >= total, self.pace.noted(stage, done, total, info)
         if stage == self.stage and not complete and now - self.written < SECONDS_BETWEEN_LINES:
             return
         self.stage, self.written = stage, now
@@ -54,10 +73,19 @@ def show_progress(stream: TextIO | None = None, name: str = "layerjax") -> Itera
     )
     with Bars(*columns, console=Console(file=stream), transient=True) as bars:
         tasks: dict[str, TaskID] = {}
+        pace = _Pace()
 
         def update(stage: str, done: int, total: int | None = None, info: str = "") -> None:
             if stage not in tasks:
                 tasks[stage] = bars.add_task(stage, total=total, info=info)
-            bars.update(tasks[stage], completed=done, total=total, info=info)
+            bars.update(tasks[stage], completed=done, total=total, info=pace.noted(stage, done, total, info))
 
         yield update
+
+
+def in_words(seconds: float) -> str:
+    """A time in whole hours, minutes or seconds, at least one."""
+    for length, unit in ((3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{max(seconds, 1.0):.0f} s"

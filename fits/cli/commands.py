@@ -39,6 +39,7 @@ def fit(arguments: Namespace) -> int:
     from fits.inference.optimise import fit as run_fit
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
+    from fits.reporting.diagnostics import residual_structure, standardised
     from fits.reporting.stored import HELD_OUT
 
     directory = Path(arguments.out)
@@ -78,9 +79,9 @@ def fit(arguments: Namespace) -> int:
         for starts in (done, again(done)):
             starts.unlink(missing_ok=True)
         progress("pictures and report", 1, 1)
-    for table in (tables.parameter_table(result), *([tables.minima_table(result)] if len(result.minima) > 1 else [])):
-        tables.print_table(table, sys.stdout)
-    for sentence in (*verdicts.outcome(result), f"Report: {directory / results.REPORT}"):
+    tables.print_table(tables.parameter_table(result), sys.stdout)
+    structure = residual_structure(result.problem.data, standardised(result))
+    for sentence in (*verdicts.outcome(result, structure), f"Report: {directory / results.REPORT}"):
         print(sentence)
     if foretold is not None:
         print_scores(foretold.prediction, foretold.readings, "Readings that were held out")

@@ -30,9 +30,12 @@ def cost_and_gradient(model: Model, s: Any) -> tuple[Any, Any]:
 
 
 def minimise_in_box(
-    value_and_gradient: Callable[[Any], tuple[Any, Any]], start: NDArray[np.float64]
+    value_and_gradient: Callable[[Any], tuple[Any, Any]], start: NDArray[np.float64], tolerance: float = TOLERANCE
 ) -> tuple[NDArray[np.float64], float, int, bool]:
-    """Minimise from `start` (P,) in the unit box: the point, its cost, the iterations, and whether it converged."""
+    """Minimise from `start` (P,) in the unit box: the point, its cost, the iterations, and whether it converged.
+
+    tolerance: it ends where a step gains less than this share of the cost, or where the gradient is smaller.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
         from jaxopt import ScipyBoundedMinimize
@@ -42,7 +45,7 @@ def minimise_in_box(
         method="l-bfgs-b",
         value_and_grad=True,
         jit=False,  # the function is compiled already, and for all problems of this structure
-        tol=TOLERANCE,
+        tol=tolerance,
         maxiter=MOST_STEPS,
     )
     inside = jnp.clip(jnp.asarray(start), 0.0, 1.0)

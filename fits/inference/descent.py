@@ -13,13 +13,20 @@ import optimistix as optx
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.inference.levenberg_marquardt import BoxLevenbergMarquardt
+from fits.inference.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
 from fits.problem.likelihood import total_sigma
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
 PROMISE = 1e-8
-"""A likelihood fit stops when a full step promises less than this in the log-posterior: 1e-4 standard errors."""
+"""A likelihood fit has converged when a full step promises less than this in the log-posterior: 1e-4 standard
+errors."""
+
+NEARBY = 1e-4
+"""Damping near a minimum: a step is all but a full one."""
+
+ROUGHLY = 1e-4
+"""A hundredth of a standard error: what tells minima apart, and is a third of the way."""
 
 Floats = NDArray[np.float64]
 
@@ -43,12 +50,17 @@ class Descent(NamedTuple):
     predicted: Any
 
 
-def descend(model: Model, start: Array, fresh: Array, most_steps: Array) -> Descent:
-    """Levenberg-Marquardt from `start` (P,) in the unit box. Not `fresh`: near a minimum, all levels free."""
+def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise: Array) -> Descent:
+    """Levenberg-Marquardt from `start` (P,) in the unit box. Not `fresh`: near a minimum, all levels free.
+
+    promise: a likelihood fit stops when a full step promises less than this in the log-posterior.
+    """
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
-    solver = BoxLevenbergMarquardt(atol=PROMISE if likelihood else 0.0)
+    solver = BoxLevenbergMarquardt()
     options = {"watch": lambda beside: beside[1], **({"logarithmic": model.logarithmic} if varying else {})}
+    options |= {"promise": promise} if likelihood else {}
+    options |= {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY)}
 
     def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
         return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
@@ -102,9 +114,9 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array) -> Desc
     )
 
 
-def descent(problem: Problem, start: Floats, fresh: bool, most_steps: int) -> Descent:
+def descent(problem: Problem, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
-    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps))
+    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(promise))
     return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.inference.chain import MemoryChain
+from fits.progress import in_words
 
 FIRST_CHECK = 100
 LONG_ENOUGH = 50.0
@@ -46,7 +47,7 @@ def autocorrelation_times(chain: MemoryChain, steps: int) -> Floats:
     kept = chain.chain[steps // BURN_IN : steps]
     with np.errstate(invalid="ignore"):  # a single step has no variance to divide by
         times = emcee.autocorr.integrated_time(kept, tol=0)
-    return np.where(np.isfinite(times), times, math.inf)
+    return np.where(np.isfinite(times) & (times > 0.0), times, math.inf)  # 0 of the first few steps
 
 
 def long_enough(chain: MemoryChain, ess: float | None = None) -> bool:
@@ -102,11 +103,4 @@ class Outlook:
             return words
         # where it is long enough already it waits for the next check, until its autocorrelation time is steady
         left = min(max(needed, next_check(step)), self.max_steps) - step
-        return f"{words}, about {_in_words(pace * left)} left"
-
-
-def _in_words(seconds: float) -> str:
-    for length, unit in ((3600.0, "h"), (60.0, "min")):
-        if seconds >= 2.0 * length:
-            return f"{seconds / length:.0f} {unit}"
-    return f"{max(seconds, 1.0):.0f} s"
+        return f"{words}, about {in_words(pace * left)} left"

@@ -49,9 +49,10 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
     Fisher information (J'J alone would overshoot up to twofold at every step).
 
-    It stops when a full Gauss-Newton step promises less than `atol + rtol cost`, when rounding ends all progress, or
-    after `options["most_steps"]`, which may be traced. A start whose residuals are not finite, or a stall away from a
-    minimum, gives `optx.RESULTS.nonlinear_divergence`.
+    It stops when a full Gauss-Newton step promises less than `options["promise"]` (default: `atol + rtol cost`), when
+    rounding ends all progress, or after `options["most_steps"]`; it begins with `options["damping"]`. All of these may
+    be traced. A start whose residuals are not finite, or a stall away from a minimum, gives
+    `optx.RESULTS.nonlinear_divergence`.
 
     The solution has the auxiliary output at the solution, and statistics have the "cost" and its "gradient" there; as
     "watched" the Jacobian, a leading axis for the P parameters, of the part of it that `options["watch"]` picks.
@@ -73,7 +74,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient=jnp.zeros_like(y),
             normal=jnp.eye(y.size, dtype=y.dtype),
             predicted=zero,
-            damping=zero + FIRST_DAMPING,
+            damping=zero + options.get("damping", FIRST_DAMPING),
             growth=zero + FIRST_GROWTH,
             beside=beside,
             watched=watched,
@@ -106,7 +107,8 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
         trial, predicted, promise = _projected_step(y, gradient, normal, damping, least)
 
-        converged = promise <= self.atol + jnp.maximum(self.rtol, 4 * epsilon) * cost
+        enough = options.get("promise", self.atol + self.rtol * cost)
+        converged = promise <= jnp.maximum(enough, 4 * epsilon * cost)
         lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
         stalled = lost & (promise > jnp.sqrt(epsilon) * cost)
         hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)

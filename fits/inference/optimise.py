@@ -12,14 +12,14 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.measurements import Measurements
-from fits.inference.descent import descend
+from fits.inference.descent import PROMISE, ROUGHLY, descend
 from fits.inference.fit_result import ENDED, Alone, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import at_start, resolutions
 from fits.inference.shared_errors import alone, are_shared, left_open, points
-from fits.inference.starts import MOST_STEPS, End, Solver, least_squares_end, run_starts, start_points, unit_of
+from fits.inference.starts import MOST_STEPS, End, Solver, rough_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.compiled import cores, in_shares
 from fits.problem.likelihood import Noise, Objective
@@ -100,7 +100,7 @@ def fit_problem(
     Args:
         problem: what is fitted to what.
         starts, seed, solver, progress, checkpoint: see `fit`.
-        refine: False: stay at the resolution of the starts, and do not ask for its error.
+        refine: False: stay at the resolution of the starts, do not ask for its error, and find the minimum roughly.
 
     Raises:
         ValueError: starts < 1; an unknown solver.
@@ -150,9 +150,10 @@ def fit_again(
 
 
 def refit(problem: Problem, vector: Floats) -> Fit:
-    """The fit of a problem whose optimum is near this vector (P,), at the resolution that the problem has."""
-    end = least_squares_end(problem, unit_of(problem, vector), fresh=False)
-    return _fit_of(optimum(problem, [end], "least_squares"), None, {"starts": 1}, None)
+    """The fit of a problem whose optimum is near this vector (P,), roughly, at the resolution that the problem has."""
+    end = rough_end(problem, unit_of(problem, vector), fresh=False)
+    best = optimum(problem, [end], "least_squares", check=False, promise=ROUGHLY)
+    return _fit_of(best, None, {"starts": 1}, None)
 
 
 def again(checkpoint: str | Path) -> Path:
@@ -175,7 +176,7 @@ def _found(
     if known is not None and known.open:
         problem = replace(problem, transport=known.far)
     ends = _ends(problem, places, solver, progress, checkpoint)
-    best, accuracy = optimum(problem, ends, solver), None
+    best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
     if known is not None and refine:
         best, accuracy = refined(best, known, solver, progress)
     return _fit_of(best, accuracy, settings, without)
@@ -258,7 +259,8 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
 def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)
-        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), jnp.asarray(MOST_STEPS)), starts)
+        most, promise = jnp.asarray(MOST_STEPS), jnp.asarray(PROMISE)
+        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, promise), starts)
         end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
         width = model.box.slope(end.vector)
         covariance = jnp.linalg.pinv(end.root.T @ end.root + jnp.diag(model.box.prior_slopes() ** 2), hermitian=True)

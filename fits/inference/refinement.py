@@ -12,7 +12,7 @@ import numpy as np
 import layerjax as lj
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.resolution import ENOUGH, Resolutions, Values
-from fits.inference.starts import End, Solver, bounded_end, least_squares_end, unit_of
+from fits.inference.starts import End, Solver, bounded_end, rough_end, unit_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -45,7 +45,8 @@ def refined(at: Optimum, known: Resolutions, solver: Solver, progress: Progress)
         if needed == own:
             return at, _accuracy(known, own, error, finest)
         problem, own = replace(at.problem, transport=needed), needed
-        again = optimum(problem, _fitted_again(at, problem, solver, known.in_words(needed), progress), solver)
+        ends = _fitted_again(at, problem, solver, known.in_words(needed), progress)
+        again = optimum(problem, ends, solver, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
 
 
@@ -86,7 +87,7 @@ def _accuracy(known: Resolutions, own: lj.AddingDoubling, error: float, finest: 
 
 def _fitted_again(at: Optimum, problem: Problem, solver: Solver, words: str, progress: Progress) -> list[End]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
-    solve = least_squares_end if solver == "least_squares" else bounded_end
+    solve = rough_end if solver == "least_squares" else bounded_end
     groups = _alike(at)
     before = [at.ends[group[0]] for group in groups]
     ends = [end._replace(cost=_cost(problem, end)) for end in before]

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from fits.inference.bounded import cost_and_gradient, minimise_in_box
-from fits.inference.descent import PROMISE, descent, here
+from fits.inference.bounded import TOLERANCE, cost_and_gradient, minimise_in_box
+from fits.inference.descent import PROMISE, ROUGHLY, descent, here
 from fits.inference.starts_file import End, Floats, Solver, StartsFile
 from fits.problem.compiled import cores
 from fits.problem.problem import Problem
@@ -21,6 +21,8 @@ MOST_STEPS = 200
 MOST_ROUNDS = 20
 WORTH = 1e-3
 """A start that ran out of steps goes on while a round of them gains this in the log-posterior."""
+STEP_WORTH = 1e-5
+"""The check by L-BFGS-B ends where a step of it gains less than this in the log-posterior."""
 WORTH_OF_COST = 1e-6
 """With a named objective such a start goes on while a round gains this share of the cost."""
 
@@ -35,8 +37,8 @@ def start_points(problem: Problem, starts: int, seed: int) -> Floats:
 def run_starts(
     problem: Problem, points: Floats, solver: Solver, progress: Progress, kept: StartsFile | None = None
 ) -> list[End]:
-    """Where each of the points (starts, P) in the unit box ends; those that a file has `kept` are not run again."""
-    solve = least_squares_end if solver == "least_squares" else bounded_end
+    """Where each of the points (starts, P) in the unit box ends, roughly; what a file has `kept` is not run again."""
+    solve = rough_end if solver == "least_squares" else bounded_end
     ends: dict[int, End] = {}
 
     def ended(index: int, end: End, new: bool = True) -> None:
@@ -61,13 +63,13 @@ def run_starts(
     return [ends[index] for index in range(len(points))]
 
 
-def least_squares_end(problem: Problem, point: Floats, fresh: bool = True) -> End:
+def least_squares_end(problem: Problem, point: Floats, fresh: bool = True, promise: float = PROMISE) -> End:
     """Levenberg-Marquardt from a point (P,) in the unit box. Not `fresh`: near a minimum, with sigma free at once."""
     steps = 0
     end = End(point, np.inf, 0, False, True)
     for _ in range(MOST_ROUNDS):
         before = end.cost
-        found = descent(problem, point, fresh, MOST_STEPS)
+        found = descent(problem, point, fresh, MOST_STEPS, promise)
         steps += int(found.steps)
         end = End(found.vector, float(found.cost), steps, bool(found.converged), bool(found.unfinished))
         worth = WORTH if problem.objective == "likelihood" else WORTH_OF_COST * end.cost
@@ -75,6 +77,11 @@ def least_squares_end(problem: Problem, point: Floats, fresh: bool = True) -> En
             break
         point, fresh = unit_of(problem, end.vector), False
     return end
+
+
+def rough_end(problem: Problem, point: Floats, fresh: bool = True) -> End:
+    """As `least_squares_end`, so near a minimum that it can be told from others."""
+    return least_squares_end(problem, point, fresh, ROUGHLY)
 
 
 def unit_of(problem: Problem, vector: Floats) -> Floats:
@@ -100,7 +107,8 @@ def polished(problem: Problem, end: End) -> tuple[End, bool]:
         found = here(problem, unit)
         return found.cost, found.gradient
 
-    point, _, _, settled = minimise_in_box(value_and_gradient, unit_of(problem, end.vector))
+    enough = STEP_WORTH / max(abs(end.cost), 1.0) if problem.objective == "likelihood" else TOLERANCE
+    point, _, _, settled = minimise_in_box(value_and_gradient, unit_of(problem, end.vector), enough)
     other = least_squares_end(problem, point, fresh=False)
     if other.cost < end.cost - max(PROMISE, 1e-9 * abs(end.cost)):
         return other._replace(converged=other.converged or settled, steps=end.steps + other.steps), True

@@ -160,17 +160,17 @@ def minima_table(fit: "Fit") -> Table:
 def unresolved_table(fit: "Fit") -> Table:
     """Combinations of parameters that the data do not resolve: how badly, and what they would know of each alone."""
     rows = []
-    for combination in fit.unresolved:
+    for place, combination in enumerate(fit.unresolved, 1):
         weights, alone = combination.weights, combination.alone
         size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
         mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
         known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
-        rows.append((size, "OPEN" if combination.open else "LOOSE", mixture, known))
+        rows.append((str(place), size, "OPEN" if combination.open else "LOOSE", mixture, known))
     note = (
         "In widths of the bounds, from the data alone; along what is OPEN only bounds and priors decide. The last "
         "column is the standard error that the data would give each parameter if all others were known."
     )
-    columns = ("error", "", "along", "each alone")
+    columns = ("no.", "error", "", "along", "each alone")
     return Table("Combinations that the data do not resolve", columns, tuple(rows), note if rows else "")
 
 

@@ -23,10 +23,10 @@ MISFIT_SIGMAS = 3.0  # chi-square this many of its own standard deviations away 
 
 
 def identifiability(fit: "Fit") -> dict[str, str]:
-    """For each parameter, in a few words, whether the data determines it."""
+    """For each parameter, in a few words, whether the data determines it; combinations count from 1, worst first."""
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
-    worst = {name: combination for combination in reversed(fit.unresolved) for name in combination.weights}
+    worst = {name: place for place in range(len(fit.unresolved), 0, -1) for name in fit.unresolved[place - 1].weights}
     words = {}
     for index, name in enumerate(names):
         width = float(fit.problem.high[index] - fit.problem.low[index])
@@ -37,9 +37,10 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
         elif name in worst:
-            others = [other for other in worst[name].weights if other != name]
-            kind = "OPEN" if worst[name].open else "LOOSE"
-            words[name] = f"{kind}: not separated from {listed(others)}" if others else f"{kind}: hardly seen"
+            combination = fit.unresolved[worst[name] - 1]
+            kind = "OPEN" if combination.open else "LOOSE"
+            others = len(combination.weights) > 1
+            words[name] = f"{kind}: combination {worst[name]}" if others else f"{kind}: hardly seen"
         elif not math.isfinite(error):
             words[name] = "not determined"
         elif error > 0.3 * width:
@@ -85,6 +86,7 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
 def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]:
     """The verdict in a few sentences, and whether it is without reservation."""
     sentences = [] if fit.converged else ["The fit did not converge: these are the best values seen, not a minimum."]
+    close = agreement(fit)
     if not fit.is_posterior:
         sentences.append("Fitted with a named residual, not a likelihood: the errors are only indicative.")
     elif _excess(fit) > MISFIT_SIGMAS:
@@ -108,8 +110,19 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
     if fit.alternatives:
         sentences.append("Another stack explains the data equally well.")
     if sentences:
-        return sentences, False
-    return ["The model explains the data to within its noise, and the data resolve every parameter."], True
+        return [*close, *sentences], False
+    return [*close, "The model explains the data to within its noise, and the data resolve every parameter."], True
+
+
+def agreement(fit: "Fit") -> list[str]:
+    """How close the model comes to the readings, whatever their noise; nothing, where none is above zero."""
+    values = fit.problem.data.used().values
+    lit = values > 0.0
+    if not lit.any():
+        return []
+    half, most = np.quantile(100.0 * np.abs(fit.predicted[lit] / values[lit] - 1.0), [0.5, 0.95])
+    count = f"{values.size:,} readings"
+    return [f"Half of the {count} are within {half:.2g} % of the model, 95 % of them within {most:.2g} %."]
 
 
 def shared_errors(fit: "Fit") -> list[str]:
@@ -140,15 +153,13 @@ def _without_them(fit: "Fit") -> list[str]:
     ]
 
 
-def outcome(fit: "Fit") -> list[str]:
-    """A few lines for the terminal: how good, how sure, how it ended, and what the data leave open."""
+def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
+    """A few lines for the terminal: the verdict, how good, how sure, and what the data leave open."""
+    lines, _ = in_short(fit, structure)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    sure = f"best minimum reached by {fit.minima[0].count} starts, alternatives as good: {len(fit.alternatives)}"
-    lines = [f"{good}; {sure}", f"Status: {fit.status}", *shared_errors(fit)]
-    if fit.unresolved:
-        first, more = fit.unresolved[0], len(fit.unresolved) - 1
-        lines.append(f"{_not_separated(first)}{f' ({more} more)' if more else ''}: see the table in the report.")
-    return lines
+    starts = f"{fit.minima[0].count} of {sum(fit.ended.values())} starts ended here"
+    accurate = f"; numerical error of the model: {numerical_error(fit)}" if fit.resolution else ""
+    return [*lines, f"{good}; {starts}, others as good: {len(fit.alternatives)}{accurate}"]
 
 
 def noise_in_words(problem: "Problem") -> str:

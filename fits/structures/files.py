@@ -1,30 +1,35 @@
 """A search in a directory: each structure as it is fitted, and what the closer looks found, so that it can go on.
 
-search.json    which search it is
-STRUCTURE/     a fit with noise alone, and STRUCTURE+closer/ one as it was looked at, as `save_fit` writes them
-STRUCTURE.npz  what was left out, and the evidence
+search.json     which search it is
+STRUCTURE/      a fit with noise alone, and STRUCTURE+closer/ one as it was looked at, as `save_fit` writes them
+STRUCTURE.json  what was left out, and the evidence
 """
 
 import hashlib
-import io
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 
-from fits._files import read_json, write_bytes, write_json
+from fits._files import locked, named, read_json, write_json
 from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.inference.left_out import LeftOut
 from fits.inference.marginal_likelihood import Evidence
 from fits.reporting.results import load_fit, save_fit
+from fits.reporting.stored import stored_array, stored_number
 from fits.structures.library import Structure
 
-IDENTITY = "search.json"
+IDENTITY, LOCK = "search.json", "search.lock"
 
 
 class Kept:
-    """What a directory holds of a search. Raises ValueError if it is another search's, or holds something else."""
+    """What a directory holds of a search: a context manager, while one process writes there.
+
+    Raises ValueError on entry if it is another search's, is in use, or holds something else.
+    """
 
     def __init__(self, directory: str | Path, data: Measurements, *settings: Any):
         self.directory = Path(directory)
@@ -32,16 +37,27 @@ class Kept:
         digest = hashlib.sha256(repr(settings).encode())
         for array in (used.wi, used.wo, used.values, np.zeros(0) if used.sigma is None else used.sigma):
             digest.update(np.ascontiguousarray(array, float).tobytes())
-        identity = {"layerjax_search": 1, "of": digest.hexdigest()}
+        self._of = digest.hexdigest()
+
+    def __enter__(self) -> Self:
         path = self.directory / IDENTITY
-        if path.is_file():
-            if read_json(path).get("of") != identity["of"]:
-                raise ValueError(f"{self.directory}: holds a search of other data, or with another library or settings")
-            return
-        if self.directory.exists() and any(self.directory.iterdir()):
+        if not path.is_file() and _holds_something(self.directory):
             raise ValueError(f"{self.directory}: is not empty, and holds no search")
-        self.directory.mkdir(parents=True, exist_ok=True)
-        write_json(path, identity)
+        with named(self.directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            stack.enter_context(locked(self.directory / LOCK, str(self.directory)))
+            if not path.is_file():
+                write_json(path, {"layerjax_search": 1, "of": self._of})
+            elif read_json(path).get("of") != self._of:
+                raise ValueError(f"{self.directory}: holds a search of other data, or with another library or settings")
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
 
     def fit(self, structure: Structure, closer: bool) -> Fit | None:
         """The fit of a structure, if it is there."""
@@ -53,31 +69,45 @@ class Kept:
         save_fit(fit, self._place(structure, closer))
 
     def look(self, structure: Structure) -> tuple[LeftOut, Evidence] | None:
-        """What a closer look found, if it is there."""
-        path = self.directory / f"{_slug(structure)}.npz"
+        """What a closer look found, if it is there. ValueError for a file that is damaged."""
+        path = self._look(structure)
         if not path.is_file():
             return None
-        with np.load(path, allow_pickle=False) as stored:
-            count = int(stored["count"])
+        content = read_json(path)
+        try:
+            groups = content["groups"]
             left = LeftOut(
-                groups=tuple(map(str, stored["groups"])),
-                rows=tuple(stored[f"rows{number}"] for number in range(count)),
-                log_density=stored["log_density"],
-                converged=bool(stored["converged"]),
+                groups=tuple(groups),
+                rows=tuple(np.array(rows, np.int64) for rows in groups.values()),
+                log_density=stored_array(content["log_density"], *content["shape"]),
+                converged=bool(content["converged"]),
             )
-            return left, Evidence(*map(float, stored["evidence"]))
+            return left, Evidence(*(stored_number(content["evidence"][part]) for part in ("log", "error", "shape")))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: damaged: {error!r}") from None
 
     def keep_look(self, structure: Structure, left: LeftOut, evidence: Evidence) -> None:
         """Write what a closer look found."""
-        content = io.BytesIO()
-        arrays: dict[str, Any] = {f"rows{number}": rows for number, rows in enumerate(left.rows)}
-        arrays["evidence"] = np.array([evidence.log, evidence.error, evidence.shape])
-        arrays |= {"groups": np.array(left.groups), "count": len(left.groups), "converged": left.converged}
-        np.savez(content, log_density=left.log_density, **arrays)
-        write_bytes(self.directory / f"{_slug(structure)}.npz", content.getvalue(), force=True)
+        content = {
+            "groups": dict(zip(left.groups, left.rows, strict=True)),
+            "shape": left.log_density.shape,
+            "log_density": left.log_density,
+            "converged": left.converged,
+            "evidence": {"log": evidence.log, "error": evidence.error, "shape": evidence.shape},
+        }
+        write_json(self._look(structure), content, force=True)
 
     def _place(self, structure: Structure, closer: bool) -> Path:
         return self.directory / (_slug(structure) + ("+closer" if closer else ""))
+
+    def _look(self, structure: Structure) -> Path:
+        return self.directory / f"{_slug(structure)}.json"
+
+
+def _holds_something(directory: Path) -> bool:
+    if not directory.is_dir():
+        return directory.exists()
+    return any(one.name != LOCK for one in directory.iterdir())
 
 
 def _slug(structure: Structure) -> str:

@@ -9,6 +9,7 @@ would.
 """
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -113,9 +114,17 @@ def search(
         raise ValueError(f"layers is {layers}; it must be in [0, 6]")
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
-    kept = None if directory is None else Kept(directory, data, library, noise, scale, transport, starts, seed)
-    run = _Fitting(data, library, transport, noise, scale, starts, seed, kept)
-    looked = _Looked(kept)
+    with ExitStack() as stack:
+        kept = None
+        if directory is not None:
+            kept = stack.enter_context(Kept(directory, data, library, noise, scale, transport, starts, seed))
+        run = _Fitting(data, library, transport, noise, scale, starts, seed, kept)
+        return _searched(run, _Looked(kept), layers, progress)
+
+
+def _searched(run: "_Fitting", looked: "_Looked", layers: int, progress: Progress | None) -> Search:
+    """Level by level, as long as a level foretells more than the one before."""
+    library = run.library
     level: list[Structure] = [(base,) for base in library.bases]
     while level:
         _screen(level, run, looked, progress)

@@ -29,13 +29,15 @@ class KnownDirections(eqx.Module):
     """The distinct cosines among the directions of a batch.
 
     above, below: |cosine|, (cosines,) each. of_wi, of_wo: for every direction the place of its cosine among those above
-    and then those below; the shapes of wi and wo without the last axis.
+    and then those below; the shapes of wi and wo without the last axis. all_above: whether it is known that none lies
+    below.
     """
 
     above: Array
     below: Array
     of_wi: Array
     of_wo: Array
+    all_above: bool = eqx.field(static=True, default=False)
 
 
 Known = Callable[[], KnownDirections | None]
@@ -61,7 +63,8 @@ def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
         return None
     split = cosines[0].size
     of_wi, of_wo = places[:split].reshape(cosines[0].shape), places[split:].reshape(cosines[1].shape)
-    return KnownDirections(*map(jnp.asarray, (*sides, of_wi, of_wo)))
+    above, below, i, o = map(jnp.asarray, (*sides, of_wi, of_wo))
+    return KnownDirections(above, below, i, o, all_above=bool(np.all(z > 0)))
 
 
 def own_cosines(wi: Array, wo: Array) -> KnownDirections:

@@ -18,7 +18,7 @@ from jax import Array
 from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
-from layerjax.surfaces import Conductor, Surface
+from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Scalars, element
@@ -29,7 +29,7 @@ from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_m
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
 from layerjax.transport.adding_doubling.straight import without_straight
-from layerjax.transport.known_directions import KnownDirections
+from layerjax.transport.known_directions import Known, KnownDirections
 
 MANY = 3
 """Interfaces of a kind from which on they share a program."""
@@ -167,13 +167,20 @@ def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     return base_layer(here, _relative(base, here.ior), plan.modes, plan.microfacets)
 
 
-def carries_asked(stack: Stack) -> bool:
-    """Whether directions that are asked for can stand in the place of the grid's outer ones."""
+def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:
+    """The stack with directions that can stand in the place of the grid's outer ones, if there are such.
+
+    What ends with a medium is closed where nothing is asked for below: light that leaves it there does not come back.
+    """
     if any(map(is_tilted, stack.layers)) or not stack.layers or not isinstance(stack.layers[0], Interface):
-        return False
-    if stack.base is not None:
-        return True
-    return len(stack.layers) > 1 and isinstance(stack.layers[-1], Interface)
+        return None
+    directions = known()
+    if directions is None:
+        return None
+    if stack.base is not None or (len(stack.layers) > 1 and isinstance(stack.layers[-1], Interface)):
+        return stack, directions
+    black = Lambertian(jnp.zeros((), directions.above.dtype))
+    return (Stack(stack.layers, black), directions) if directions.all_above else None
 
 
 def expanded(layer: Layer, azimuths: int | None) -> Layer:

@@ -27,7 +27,7 @@ from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, modes_for, rungs
-from layerjax.transport.adding_doubling.solve import Plan, carries_asked, make_plan, solve
+from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
@@ -122,8 +122,8 @@ class AddingDoubling(DeterministicTransport):
             refuse_vmf(stack, names, 'AddingDoubling(microfacets="multiple")')
 
     def chosen_for(self, stack: Stack, known: Known) -> "AddingDoubling":
-        followed = self.orders != "first" and carries_asked(stack)
-        directions = known() if followed else None
+        found = followed(stack, known) if self.orders != "first" else None
+        stack, directions = (stack, None) if found is None else found
         if self.tolerance is not None:
             if map_shape(stack):
                 raise ValueError(
@@ -141,12 +141,12 @@ class AddingDoubling(DeterministicTransport):
         return Solved(first, _solve(stack, first, self._plan(stack, None)), straight=straight(stack))
 
     def prepare_for(self, stack: Stack, known: Known) -> Solved:
-        if self.orders != "first" and carries_asked(stack):
-            directions = known()
-            if directions is not None:
-                found = _solve_between(stack, directions, self._plan(stack, directions))
-                return Solved(first_order(stack), None, found, straight(stack))
-        return self.prepare(stack)
+        found = followed(stack, known) if self.orders != "first" else None
+        if found is None:
+            return self.prepare(stack)
+        closed, directions = found
+        rest = _solve_between(closed, directions, self._plan(closed, directions))
+        return Solved(first_order(stack), None, rest, straight(closed))
 
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None

@@ -73,7 +73,7 @@ def test_index_extinction_and_absorption_are_said_to_be_inseparable(coat_fit: Fi
     assert combination.open
     for name, alone in combination.alone.items():
         assert alone < 0.05 * coat_fit.standard_errors[name], name
-    (sentence,) = (line for line in verdicts.outcome(coat_fit) if line.startswith("The data do not separate"))
+    (sentence,) = (line for line in verdicts.determines(coat_fit) if line.startswith("The data do not separate"))
     assert all(name in sentence for name in combination.weights)
 
 

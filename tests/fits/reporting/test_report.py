@@ -137,8 +137,13 @@ def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
     bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
     words = " ".join(verdicts.explains(bad, residual_structure(data, 3 * residuals)))
     assert "multiplies them by 3" in words
-    fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
-    assert fine[1]
+    sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
+    assert fine
+    values = data.used().values
+    errors = np.sort(np.abs(coat_fit.predicted / values - 1.0).ravel())
+    half, most = map(float, re.findall(r"([\d.e-]+) %", sentences[0])[::2])
+    assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
     assert not verdicts.in_short(bad, residual_structure(data, 3 * residuals))[1]
 
 
@@ -150,21 +155,23 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     assert "The data alone know 1 of 2 combinations of parameters to no better than" in words
     assert f"At a bound: {second}" in words
     (row,) = tables.unresolved_table(undecided).rows
-    assert row == ("0.3", "LOOSE", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
-    (line,) = (line for line in verdicts.outcome(undecided) if line.startswith("The data"))
-    assert line == f"The data do not separate {first} and {second}: see the table in the report."
+    assert row == ("1", "0.3", "LOOSE", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
+    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
+    (line,) = (line for line in verdicts.outcome(undecided, structure) if line.startswith("The data"))
+    assert line == f"The data do not separate {first} and {second}."
     several = Altered(coat_fit, unresolved=(together, together, together))
-    assert "(2 more): see the table" in verdicts.outcome(several)[-1]  # still one line
-    short, fine = verdicts.in_short(undecided, residual_structure(coat_fit.problem.data, standardised(coat_fit)))
+    (line,) = (line for line in verdicts.outcome(several, structure) if line.startswith("The data"))
+    assert line.endswith("(and more).")  # still one line
+    short, fine = verdicts.in_short(undecided, structure)
     assert f"The data do not separate {first} and {second}." in short
     assert not fine
-    assert verdicts.identifiability(undecided)[first] == f"LOOSE: not separated from {second}"
+    assert verdicts.identifiability(undecided)[first] == "LOOSE: combination 1"
     assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
     apart = Altered(coat_fit, correlation=np.eye(2))
     assert verdicts.identifiability(apart)[first] == "yes"
     unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
-    assert f"The data do not determine {first}:" in " ".join(verdicts.outcome(unseen))
-    assert tables.unresolved_table(unseen).rows[0][:2] == ("infinite", "OPEN")
+    assert f"The data do not determine {first}." in verdicts.outcome(unseen, structure)
+    assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "OPEN")
     assert verdicts.identifiability(unseen)[first] == "OPEN: hardly seen"
 
 

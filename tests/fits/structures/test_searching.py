@@ -7,10 +7,12 @@ import pytest
 
 import fits
 import layerjax as lj
+from fits._files import locked
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting.plots.data import as_png
 from fits.structures import telling
+from fits.structures.files import LOCK
 from fits.structures.library import Library
 from fits.structures.searching import search
 
@@ -56,7 +58,7 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
 
 
 def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
-    (directory / "interface+diffuse.npz").unlink()
+    (directory / "interface+diffuse.json").unlink()
     begun: list[str] = []
     again = search(
         data,
@@ -80,6 +82,22 @@ def test_another_search_is_refused(data: fits.Measurements, directory: Path, fou
         search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=NOISE, starts=3, directory=directory)
     with pytest.raises(ValueError, match="is not empty, and holds no search"):
         search(data, LIBRARY, noise=NOISE, directory=directory.parent)
+
+
+def test_what_is_damaged_or_in_use_is_named(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
+    def again() -> None:
+        search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=NOISE, starts=2, directory=directory)
+
+    with locked(directory / LOCK, "it"), pytest.raises(ValueError, match="is in use by another process"):
+        again()
+    for name in ("search.json", "metal.json"):
+        path = directory / name
+        whole = path.read_text()
+        for damaged in (whole[: len(whole) // 2], whole.replace("1", "2", 1)):
+            path.write_text(damaged)
+            with pytest.raises(ValueError, match=rf"{name}: .*(not valid JSON|damaged)"):
+                again()
+        path.write_text(whole)
 
 
 def test_bad_requests_are_refused(data: fits.Measurements) -> None:

@@ -38,6 +38,26 @@ def test_agrees_with_tables_of_a_finer_grid(name):
     np.testing.assert_array_less(np.abs(followed - tables), 4e-3 * (tables + 0.1 * tables.mean()))
 
 
+@pytest.mark.parametrize("medium", [lj.Medium(50.0, 0.5, lj.HenyeyGreenstein(0.2)), HAZE])
+def test_what_leaves_a_medium_below_does_not_come_back(medium):
+    """An open medium under an interface, seen from above alone, is followed too: against tables, which are not as
+    smooth (rays that pass the critical angle go from one panel of nodes to the next)."""
+    wi, wo = pairs(STACKS["paint"])
+
+    def stack(ior, alpha):
+        return lj.Stack([lj.Interface(ior, alpha), medium])
+
+    tables = np.asarray(lj.evaluate(lj.prepare(stack(1.3, 0.3), FINE), wi, wo))
+    followed = np.asarray(lj.evaluate(stack(1.3, 0.3), wi, wo, SOLVER))
+    np.testing.assert_array_less(np.abs(followed - tables), 4e-3 * (tables + 0.1 * tables.mean()))
+    run = jax.jit(jax.vmap(lambda x: lj.evaluate(stack(*x), wi, wo, SOLVER)[:, 0]))
+    t = np.linspace(-1.0, 1.0, 41)
+    for step in (np.array([0.02, 0.0]), np.array([0.0, 0.02])):
+        found = np.asarray(run(np.array([1.3, 0.3]) + t[:, None] * step))
+        rough = found - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, found, 5)).T
+        assert np.abs(rough / found).max() < 1e-6
+
+
 @pytest.mark.slow
 def test_agrees_with_the_walk_through_a_slab():
     """Where light that passes both interfaces straight is narrower than the grid: tables are off by 2 % there."""
