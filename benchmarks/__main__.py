@@ -5,8 +5,8 @@ beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe
 ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
 coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``unseen`` (how well
 stacks foretell readings of real coatings that were not fitted), ``wrong-stacks`` (whether bands hold where a simulated
-material is fitted by another) and ``side-by-side``
-(which transport when: a page of docs from the results of error-vs-time)."""
+material is fitted by another), ``structures`` (whether a search finds the stack behind simulated data) and
+``side-by-side`` (which transport when: a page of docs from the results of error-vs-time)."""
 
 import argparse
 import importlib
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
-         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks",
+         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "structures",
          "side-by-side")  # fmt: skip
 
 
@@ -75,12 +75,14 @@ def _parser() -> argparse.ArgumentParser:
     calibrated.add_argument(
         "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), default=(6, 6), help="of AddingDoubling"
     )
+    calibrated.add_argument("--errors", action="store_true", help="with errors of the model that readings share")
     for command in (
         compared,
         calibrated,
         commands.choices["samplers"],
         commands.choices["unseen"],
         commands.choices["wrong-stacks"],
+        commands.choices["structures"],
     ):
         command.add_argument(
             "--resume", action="store_true", help="keep what the directory holds, and add what it lacks"
@@ -97,7 +99,7 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
         options["with_peers"] = not given.no_peers
     if given.benchmark == "spongecake":
         options["work"] = given.work
-    if given.benchmark in ("error-vs-time", "calibration", "samplers", "unseen", "wrong-stacks"):
+    if given.benchmark in ("error-vs-time", "calibration", "samplers", "unseen", "wrong-stacks", "structures"):
         options["resume"] = given.resume
     if given.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
@@ -107,7 +109,11 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
         from layerjax import AddingDoubling
 
         nodes, modes = given.resolution
-        options |= {"transport": AddingDoubling(nodes=nodes, modes=modes), "repeats": given.repeats}
+        options |= {
+            "transport": AddingDoubling(nodes=nodes, modes=modes),
+            "repeats": given.repeats,
+            "errors": given.errors,
+        }
     return options
 
 

@@ -40,6 +40,9 @@ BEAM = 2
 CLOSER = 3
 """So many of a level are looked at closely, besides those that were before."""
 
+REMEMBERED = 16
+"""Structures whose programs are kept."""
+
 NONE_MORE = 2.0
 """A structure is no better if it is not ahead by so many standard errors."""
 
@@ -133,7 +136,6 @@ def _searched(run: "_Fitting", looked: "_Looked", layers: int, progress: Progres
         for number, structure in enumerate(closer):
             _report(progress, "closer look", number, len(closer), structure)
             looked.look(structure, run)
-        jax.clear_caches()  # thousands of programs are more than a process may map into its memory
         if before is not None and not looked.ahead(before):
             break
         level = _next(looked, library, layers)
@@ -180,7 +182,7 @@ def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: 
         for done, (structure, found) in enumerate(zip(level, pool.map(run, level), strict=True), 1):
             looked.plain[structure] = found
             _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
-    jax.clear_caches()
+    looked.clear(len(level))
 
 
 def _next(looked: "_Looked", library: Library, layers: int) -> list[Structure]:
@@ -208,6 +210,14 @@ class _Looked:
         self.fits: dict[Structure, Fit] = {}
         self.left: dict[Structure, LeftOut] = {}
         self.evidences: dict[Structure, Evidence] = {}
+        self.since = 0
+
+    def clear(self, count: int) -> None:
+        """Let go of programs after so many more structures: a process may not map thousands into its memory."""
+        self.since += count
+        if self.since > REMEMBERED:
+            jax.clear_caches()
+            self.since = 0
 
     def bic(self, structure: Structure) -> float:
         fit = self.plain[structure]

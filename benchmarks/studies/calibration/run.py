@@ -16,6 +16,7 @@ import fits
 import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, rounded, table, write
+from benchmarks.studies.calibration import shared
 from benchmarks.studies.calibration.ranks import DRAWS, LEAST_P, Row, judged, picture, ranks_of, spread_draws
 from benchmarks.suite import coated_haze
 from fits._files import write_bytes
@@ -26,7 +27,9 @@ Floats = NDArray[np.float64]
 NAME = "calibration"
 REPEATS, QUICK = 200, 20
 TRANSPORT = lj.AddingDoubling(nodes=6, modes=6)
-NOISE, FLOOR = 0.05, 1e-6
+NOISE, NOISE_BESIDE, FLOOR = 0.05, 0.02, 1e-6
+"""The second where readings share errors: these are of logarithms, in which noise is not quite normal."""
+
 STARTS, WALKERS, STEPS = 4, 12, 5000
 APART = 5.0
 """Autocorrelation times after which draws of one walker count as independent."""
@@ -39,7 +42,7 @@ FREE = {
 }
 """Priors that end more than four standard deviations inside their bounds: no posterior leans on one."""
 
-LABELS = {"ior": "index", "alpha": "roughness", "thickness": "thickness", "g": "asymmetry g"}
+LABELS = {"ior": "index", "alpha": "roughness", "thickness": "thickness", "g": "asymmetry g"} | shared.LABELS
 
 TEXT = """\
 # Calibration of posteriors
@@ -51,23 +54,26 @@ drawn from the prior, data simulated from each, and the rank of the truth among 
 
 Rough interface over haze (albedo 0.95) over a diffuse base (albedo 0.3), all orders of scattering, by
 `{transport}`. In-plane slices at incidence {incidence} degrees, {readings} readings, noise of
-{noise:.0%} of the exact value; the fit is told the level. The data are simulated by the solver that fits them, at its
-resolution: this judges the inference, [error-vs-time](error-vs-time.md) the solver. {starts} starts a fit, {walkers}
-walkers. Priors:
+{noise:.0%} of the exact value; the fit is told the level. {errors}
+The data are simulated by the solver that fits them, at its resolution: this judges the inference,
+[error-vs-time](error-vs-time.md) the solver. {starts} starts a fit, {walkers} walkers. Priors:
 
 {free}
 {rows}
 *chi-square* over {bins} equal bins, *KS* is the test of Kolmogorov and Smirnov; uniform: both p-values above {least:g}.
 *mean* is the mean rank less what it should be, in standard errors.
 
-![A histogram of ranks for each parameter, with the band that should hold 99 % of the bars](calibration.png)
+![A histogram of ranks for each parameter, with the band that should hold 99 % of the bars]({name}.png)
 
 {chains}"""
+
+ERRORS = """Readings share errors of their logarithm as well, drawn from a
+process whose numbers are drawn from their priors, by dense matrices; the fit finds these numbers. """
 
 
 @dataclass(frozen=True)
 class Repeat:
-    """One repeat, lists by parameter as in `FREE`.
+    """One repeat, lists by parameter as in `free_of`.
 
     truth, estimate: physical values, the estimate is that of the fit. apart: autocorrelation times between two draws of
     one walker. fit_converged, converged: of the fit and of the chain. moves: how the chain was moved.
@@ -94,8 +100,11 @@ def study(
     transport: lj.Transport = TRANSPORT,
     surrogate: bool = True,
     repeats: int | None = None,
+    errors: bool = False,
 ) -> tuple[str, tuple[Path, ...]]:
     """Run it, and write ``calibration.json``, ``.md`` and ``.png``; returns the markdown and the paths.
+
+    With `errors` the files are ``calibration-errors.json`` and so on.
 
     Args:
         quick: 20 repeats: a look, no result to quote.
@@ -103,44 +112,59 @@ def study(
         transport: carries the light in the data and in the fits.
         surrogate: of `fits.sample`; left to the clock, a rerun might not be the same.
         repeats: how many there are to be in all; 200 if None.
+        errors: whether readings share errors of the model.
 
     Raises:
         ValueError: repeats to resume that were run with other settings.
     """
     wanted = repeats or (QUICK if quick else REPEATS)
-    settings = settings_of(transport, surrogate)
-    done = _held(directory, settings) if resume else []
+    settings = settings_of(transport, surrogate, errors)
+    name = f"{NAME}-errors" if errors else NAME
+    done = _held(directory / f"{name}.json", settings) if resume else []
     surroundings = environment.describe()
     model = _simulator(transport)
     if len(done) < wanted:
         report(f"{len(done)} of {wanted} repeats are there; the first to come compiles all programs")
     for index in range(len(done), wanted):
-        done.append(run_repeat(index, transport, surrogate, model))
-        _save(done, settings, surroundings, directory)
+        done.append(run_repeat(index, transport, surrogate, model, errors))
+        _save(done, settings, surroundings, directory, name)
         typical = float(np.median([one.seconds for one in done]))
         report(
             f"repeat {index + 1}/{wanted}: {done[-1].steps} steps, {done[-1].seconds:.1f} s, "
             f"about {typical * (wanted - index - 1) / 60:.0f} min left"
         )
-    text, paths = _save(done, settings, surroundings, directory)
-    by_label = {label: _ranks(done, place) for place, label in enumerate(LABELS.values())}
-    write_bytes(directory / f"{NAME}.png", as_png(picture(by_label)), force=True)
-    return text, (*paths, directory / f"{NAME}.png")
+    text, paths = _save(done, settings, surroundings, directory, name)
+    by_label = {LABELS[one]: _ranks(done, place) for place, one in enumerate(free_of(errors))}
+    write_bytes(directory / f"{name}.png", as_png(picture(by_label)), force=True)
+    return text, (*paths, directory / f"{name}.png")
 
 
-def run_repeat(index: int, transport: lj.Transport, surrogate: bool, model: Callable[..., Any]) -> Repeat:
+def free_of(errors: bool) -> dict[str, fits.Free]:
+    """What is free, in the order of the problem's parameters."""
+    return FREE | shared.FREE if errors else FREE
+
+
+def run_repeat(
+    index: int, transport: lj.Transport, surrogate: bool, model: Callable[..., Any], errors: bool = False
+) -> Repeat:
     """A truth from the prior, its data, fit and posterior, and its ranks; all of them drawn with `index`."""
     began = time.perf_counter()
     generator = np.random.default_rng([2018, index])
-    truth = {name: drawn(free, generator) for name, free in FREE.items()}
+    truth = {name: drawn(free, generator) for name, free in free_of(errors).items()}
+    own = {name: truth[name] for name in FREE}
+    level = NOISE_BESIDE if errors else NOISE
     data = fits.simulate(
-        coated_haze.stack_of(coated_haze.PARAMETERS | truth), coated_haze.readings(), model, NOISE, FLOOR, seed=index
+        coated_haze.stack_of(coated_haze.PARAMETERS | own), coated_haze.readings(), model, level, FLOOR, seed=index
     )
+    if errors:
+        data = shared.with_errors(data, truth, generator)
     # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
-    noise = fits.Noise(relative=NOISE, floor=FLOOR, use_sigma=False)
+    correlated = fits.Correlated(**shared.FREE) if errors else False
+    noise = fits.Noise(relative=level, floor=FLOOR, use_sigma=False, correlated=correlated)
     stack = coated_haze.stack_of(coated_haze.PARAMETERS | FREE)
     fit = fits.fit(stack, data, transport=transport, noise=noise, starts=STARTS, seed=index)
-    posterior = fits.sample(fit, walkers=WALKERS, seed=index, surrogate=surrogate, max_steps=STEPS, allow_short=True)
+    walkers = max(WALKERS, 2 * len(truth) + 2)
+    posterior = fits.sample(fit, walkers=walkers, seed=index, surrogate=surrogate, max_steps=STEPS, allow_short=True)
     draws, apart = spread_draws(posterior)
     return Repeat(
         repeat=index,
@@ -173,16 +197,18 @@ def drawn(free: fits.Free, generator: np.random.Generator) -> float:
             return float(value)
 
 
-def settings_of(transport: lj.Transport, surrogate: bool) -> dict[str, Any]:
+def settings_of(transport: lj.Transport, surrogate: bool, errors: bool = False) -> dict[str, Any]:
     """What has to be the same for repeats to stand in one file, as it stands there."""
+    beside = {"errors": {name: repr(free) for name, free in shared.FREE.items()}} if errors else {}
     return rounded(
-        {
+        beside
+        | {
             "transport": repr(transport),
             "surrogate": surrogate,
             "free": {name: repr(free) for name, free in FREE.items()},
             "parameters": coated_haze.PARAMETERS,
             "incidence_degrees": coated_haze.INCIDENCE,
-            "noise": NOISE,
+            "noise": NOISE_BESIDE if errors else NOISE,
             "floor": FLOOR,
             "starts": STARTS,
             "walkers": WALKERS,
@@ -199,9 +225,8 @@ def _simulator(transport: lj.Transport) -> Callable[..., Any]:
     return jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, known=known))
 
 
-def _held(directory: Path, settings: Mapping[str, Any]) -> list[Repeat]:
-    """The repeats that the directory holds; ValueError if they were run with other settings."""
-    path = directory / f"{NAME}.json"
+def _held(path: Path, settings: Mapping[str, Any]) -> list[Repeat]:
+    """The repeats that a file holds; ValueError if they were run with other settings."""
     if not path.exists():
         return []
     content = json.loads(path.read_text())
@@ -211,23 +236,26 @@ def _held(directory: Path, settings: Mapping[str, Any]) -> list[Repeat]:
 
 
 def _save(
-    done: list[Repeat], settings: Mapping[str, Any], surroundings: Mapping[str, Any], directory: Path
+    done: list[Repeat], settings: Mapping[str, Any], surroundings: Mapping[str, Any], directory: Path, name: str = NAME
 ) -> tuple[str, tuple[Path, Path]]:
     """Write all repeats so far and what they say; returns the markdown and the paths."""
-    rows = [judged(label, _ranks(done, place)) for place, label in enumerate(LABELS.values())]
+    free = free_of("errors" in settings)
+    rows = [judged(LABELS[one], _ranks(done, place)) for place, one in enumerate(free)]
     text = TEXT.format(
         environment=environment_lines(surroundings),
         repeats=len(done),
         draws=DRAWS,
         transport=settings["transport"],
         free="".join(
-            f"- {LABELS[name]}: {free.prior!r} in [{free.low:g}, {free.high:g}]\n" for name, free in FREE.items()
+            f"- {LABELS[one]}: {value.prior!r} in [{value.low:g}, {value.high:g}]\n" for one, value in free.items()
         ),
+        name=name,
+        errors=ERRORS if "errors" in settings else "",
         incidence=", ".join(f"{angle:g}" for angle in coated_haze.INCIDENCE),
         readings=len(coated_haze.readings()),
-        noise=NOISE,
+        noise=settings["noise"],
         starts=STARTS,
-        walkers=WALKERS,
+        walkers=max(WALKERS, 2 * len(free) + 2),
         rows=_table(rows),
         bins=rows[0].bins,
         least=LEAST_P,
@@ -239,7 +267,7 @@ def _save(
         "parameters": [asdict(row) for row in rows],
         "repeats": [asdict(one) for one in done],
     }
-    return text, write(NAME, content, text, directory)
+    return text, write(name, content, text, directory)
 
 
 def _ranks(done: list[Repeat], place: int) -> NDArray[np.int64]:

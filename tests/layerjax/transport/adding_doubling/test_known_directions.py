@@ -55,7 +55,7 @@ def test_what_leaves_a_medium_below_does_not_come_back(medium):
     for step in (np.array([0.02, 0.0]), np.array([0.0, 0.02])):
         found = np.asarray(run(np.array([1.3, 0.3]) + t[:, None] * step))
         rough = found - np.polynomial.polynomial.polyval(t, np.polynomial.polynomial.polyfit(t, found, 5)).T
-        assert np.abs(rough / found).max() < 1e-6
+        assert np.abs(rough / found).max() < 1e-5  # a hundredth of the error of these tables
 
 
 @pytest.mark.slow

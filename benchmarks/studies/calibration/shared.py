@@ -1,0 +1,41 @@
+"""Errors of a model that readings share, drawn for the calibration: from the definition alone, by dense matrices."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fits
+from fits.data.measurements import Measurements
+
+FREE = {
+    "amplitude": fits.Free(0.05, 0.01, 0.3, fits.LogNormal(0.05, 0.5)),
+    "half": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
+    "difference": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
+}
+"""Of `fits.Correlated`, within what its nodes resolve."""
+
+LABELS = {"amplitude": "amplitude", "half": "reach, half vector", "difference": "reach, difference"}
+
+Floats = NDArray[np.float64]
+
+
+def with_errors(data: Measurements, numbers: dict[str, float], generator: np.random.Generator) -> Measurements:
+    """Readings in the plane of incidence, whose logarithms have errors that are drawn here."""
+    half = data.wi + data.wo
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    tilt, apart = (np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) for cosine in (half[:, 2], _dot(half, data.wi)))
+    covariance = _matern(tilt, numbers["half"]) * _matern(apart, numbers["difference"])
+    root = np.linalg.cholesky(covariance + 1e-10 * np.eye(len(tilt)))
+    errors = numbers["amplitude"] * root @ generator.standard_normal(len(tilt))
+    return replace(data, values=data.values * np.exp(errors)[:, None])
+
+
+def _dot(one: Floats, other: Floats) -> Floats:
+    return np.einsum("nk,nk->n", one, other)
+
+
+def _matern(angle: Floats, reach: float) -> Floats:
+    """Matern 5/2 (Rasmussen & Williams 2006, Eq. 4.17), (N, N)."""
+    x = np.sqrt(5.0) * np.abs(angle[:, None] - angle) / reach
+    return (1.0 + x + x * x / 3.0) * np.exp(-x)

@@ -1,0 +1,203 @@
+"""Whether a search finds the stack behind simulated data: where among all structures the true one is ranked."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+import fits
+import layerjax as lj
+from benchmarks.measuring import environment
+from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, table, write
+from benchmarks.suite import coated_haze
+from fits.data.measurements import Measurements
+from fits.structures.library import Library, Structure, default_library
+from fits.structures.searching import NONE_MORE, named
+
+NAME = "structures"
+REPEATS, QUICK = 40, 4
+TRUTH = lj.AddingDoubling(nodes=20, modes=20)
+NOISE = 0.02
+STARTS = 4
+FIRST, WANTED = 3, 36
+"""The true structure is asked to be among so many first in so many of all."""
+
+WHOLE = default_library()
+LIBRARY = Library(
+    {name: WHOLE.layers[name] for name in ("interface", "haze")},
+    {name: WHOLE.bases[name] for name in ("diffuse", "metal")},
+)
+
+MATERIALS = {
+    "ior": (1.3, 1.8),
+    "alpha": (0.1, 0.5),
+    "thickness": (0.2, 1.5),
+    "g": (0.0, 0.6),
+    "albedo": (0.2, 0.8),
+    "metal": (0.3, 2.0),
+    "k": (1.0, 6.0),
+}
+"""The numbers of layers and bases are drawn from these ranges, uniformly."""
+
+TRUTHS: tuple[Structure, ...] = tuple(
+    (*layers, base)
+    for layers in (
+        ("interface",),
+        ("haze",),
+        ("interface", "haze"),
+        ("haze", "interface"),
+        ("interface", "haze", "interface"),
+        ("haze", "interface", "haze"),
+    )
+    for base in LIBRARY.bases
+)
+
+TEXT = """\
+# Structures that a search finds
+
+{environment}
+{repeats} materials of one to three layers with numbers drawn at random, read at 10, 30, 50 and 70 degrees of incidence
+with noise of {noise:.0%} (all orders, `{truth}`). `fits.search` looks for the stack among those that an interface and
+haze over a diffuse base and a metal make, up to three layers, with all orders.
+
+{rows}
+*first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
+by more than {more:g} standard errors of the difference. *too complex*: how often such a one has more layers.
+
+The true structure is among the first three in {found} of {repeats} (asked for: {wanted} of {asked}); a more complex one
+is preferred by more than chance in {complex}.
+"""
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """One material: its structure, the place of that in the result (0: the first; None: not looked at), the best one,
+    how far the true one is behind it with the standard error, and how many structures were fitted."""
+
+    repeat: int
+    truth: str
+    place: int | None
+    best: str
+    behind: float | None
+    behind_error: float | None
+    fitted: int
+    seconds: float
+
+    @property
+    def layers(self) -> int:
+        """Of the true stack."""
+        return self.truth.count("/")
+
+    @property
+    def is_beaten(self) -> bool:
+        """Whether another structure is preferred by more than chance."""
+        if self.behind is None or self.behind_error is None:
+            return True
+        return self.behind > NONE_MORE * self.behind_error
+
+
+def study(
+    quick: bool = False,
+    report: Callable[[str], None] = lambda line: None,
+    directory: Path = DIRECTORY,
+    resume: bool = False,
+    repeats: int | None = None,
+) -> tuple[str, tuple[Path, ...]]:
+    """Run it, and write ``structures.json`` and ``.md``; returns the markdown and the paths.
+
+    Args:
+        quick: 4 materials: a look, no result to quote.
+        resume: keep the materials that the directory holds, and run those that it lacks.
+        repeats: how many there are to be in all; 40 if None.
+    """
+    wanted = repeats or (QUICK if quick else REPEATS)
+    path = directory / f"{NAME}.json"
+    done = [Repeat(**one) for one in json.loads(path.read_text())["repeats"]] if resume and path.exists() else []
+    for index in range(len(done), wanted):
+        done.append(run_repeat(index))
+        _save(done, directory)
+        report(f"material {index + 1}/{wanted}: {done[-1]}")
+    return _save(done, directory)
+
+
+def material(index: int) -> tuple[Structure, Measurements]:
+    """A structure, and readings of a stack with numbers that were drawn at random."""
+    structure = TRUTHS[index % len(TRUTHS)]
+    generator = np.random.default_rng([2026, index])
+
+    def number(name: str) -> float:
+        return float(generator.uniform(*MATERIALS[name]))
+
+    layers: list[lj.Interface | lj.Medium] = [
+        lj.Interface(number("ior"), number("alpha"))
+        if name == "interface"
+        else lj.Medium(number("thickness"), 1.0, lj.HenyeyGreenstein(number("g")))
+        for name in structure[:-1]
+    ]
+    diffuse = structure[-1] == "diffuse"
+    base = lj.Lambertian(number("albedo")) if diffuse else lj.Conductor(number("metal"), number("k"), number("alpha"))
+    data = fits.simulate(lj.Stack(layers, base), coated_haze.readings(), TRUTH, NOISE, 1e-6, seed=index)
+    return structure, Measurements(data.wi, data.wo, data.values, None, data.mask, data.channels, data.source)
+
+
+def run_repeat(index: int) -> Repeat:
+    """A search for the stack behind one material."""
+    began = time.perf_counter()
+    structure, data = material(index)
+    noise = fits.Noise(relative=NOISE, floor=1e-6)
+    found = fits.search(data, LIBRARY, layers=3, noise=noise, starts=STARTS, seed=index)
+    places = [place for place, one in enumerate(found.found) if one.structure == structure and one.foresight]
+    seen = found.found[places[0]].foresight if places else None
+    return Repeat(
+        repeat=index,
+        truth=named(structure),
+        place=places[0] if places else None,
+        best=found.best.name,
+        behind=None if seen is None else seen.behind,
+        behind_error=None if seen is None else seen.behind_error,
+        fitted=len(found.found),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
+    surroundings = environment.describe()
+    by_layers = {f"{count} layers": [one for one in done if one.layers == count] for count in (1, 2, 3)}
+    rows = [_row(kind, found) for kind, found in (by_layers | {"all": done}).items() if found]
+    heads = ("true stack", "materials", "first", "first three", "told apart", "too complex", "fitted", "time")
+    text = TEXT.format(
+        environment=environment_lines(surroundings),
+        repeats=len(done),
+        noise=NOISE,
+        truth=TRUTH,
+        rows=table(heads, rows),
+        more=NONE_MORE,
+        found=sum(_among_first(one) for one in done),
+        wanted=WANTED,
+        asked=REPEATS,
+        complex=sum(map(_too_complex, done)),
+    )
+    content = {"environment": surroundings, "repeats": [rounded(asdict(one)) for one in done]}
+    return text, write(NAME, content, text, directory)
+
+
+def _among_first(one: Repeat) -> bool:
+    return one.place is not None and one.place < FIRST
+
+
+def _too_complex(one: Repeat) -> bool:
+    return one.is_beaten and one.best.count("/") > one.layers
+
+
+def _row(kind: str, found: list[Repeat]) -> tuple[str, ...]:
+    counts = (
+        sum(one.place == 0 for one in found),
+        sum(map(_among_first, found)),
+        sum(one.is_beaten for one in found),
+        sum(map(_too_complex, found)),
+    )
+    fitted, seconds = (float(np.median([getattr(one, name) for one in found])) for name in ("fitted", "seconds"))
+    return kind, str(len(found)), *map(str, counts), f"{fitted:.0f}", f"{seconds:.0f} s"
