@@ -138,7 +138,7 @@ class Mixture:
         return float(np.mean(self.log_density(positions)))
 
     def log_density(self, positions: Floats) -> Floats:
-        """Log-density at unconstrained `positions` (count, P)."""
+        """Log-density at unconstrained `positions` (count, P); what is drawn outside the box counts in its integral."""
         units = expit(positions)
         stretch = np.sum(stats.logistic.logpdf(positions), axis=1)  # d box / d log-odds
         return logsumexp(self._log_parts(units), axis=0) + np.log(2.0) * np.sum(self.held) + stretch
@@ -150,6 +150,12 @@ class Mixture:
             more = self._draw(generator, count, shrink)
             drawn = np.concatenate([drawn, more[_inside(more)]])
         return logit(drawn[:count])
+
+    def draw_all(self, generator: np.random.RandomState, count: int) -> tuple[Floats, NDArray[np.bool_]]:
+        """(count, P) independent draws, and which of them, (count,), lie inside the box; the others mean nothing."""
+        drawn = self._draw(generator, count, 1.0)
+        inside = _inside(drawn)
+        return logit(np.where(inside[:, None], drawn, 0.5)), inside
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
         """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
