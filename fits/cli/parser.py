@@ -146,7 +146,7 @@ def _add_only(parser: argparse.ArgumentParser, what: str) -> None:
         nargs="+",
         default=(),
         metavar="WHAT",
-        help=f"{what} these readings alone: incidence=10,50  plane=0  angle=-60:60  share=0.2",
+        help=f"{what} these readings alone: incidence=10,50  plane=0  angle=-60:60  share=0.2  channel=red",
     )
 
 

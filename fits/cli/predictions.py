@@ -2,6 +2,7 @@
 
 import sys
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,14 +20,21 @@ if TYPE_CHECKING:
     from fits.inference.prediction import Prediction
 
 DONE = 0
+CHANNEL = "channel="
 
 
 def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Measurements | None]:
     """What is fitted, and what is held out; None if nothing is."""
+    data, only = _channels(data, arguments.only)
     keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
-    for words in arguments.only:
+    for words in only:
         keep &= select(data, words)
     for words in arguments.hold_out:
+        if words.startswith(CHANNEL):
+            raise ValueError(
+                f"--hold-out {words}: a fit says nothing of the colour of a channel that it has not seen; "
+                "--only channel=... fits some of the channels"
+            )
         held |= select(data, words)
     fitted = data.where(keep & ~held)
     if data.mask.any() and not fitted.mask.any():
@@ -39,6 +47,14 @@ def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Me
     if not unseen.mask.any():
         raise ValueError("--hold-out leaves nothing to score: what it holds out is masked, or not among --only")
     return fitted, unseen
+
+
+def _channels(data: Measurements, selections: Sequence[str]) -> tuple[Measurements, list[str]]:
+    """The channels that selections ask for, and the selections that are left."""
+    for words in selections:
+        if words.startswith(CHANNEL):
+            data = data.of_channels([name.strip() for name in words.removeprefix(CHANNEL).split(",")])
+    return data, [words for words in selections if not words.startswith(CHANNEL)]
 
 
 def print_scores(prediction: "Prediction", readings: Measurements, title: str) -> None:
@@ -80,7 +96,8 @@ def predict(arguments: Namespace) -> int:
 
 def _predicted_readings(arguments: Namespace) -> Measurements:
     data = read(arguments.at, format=arguments.format, quantity=arguments.quantity)
-    for words in arguments.only:
+    data, only = _channels(data, arguments.only)
+    for words in only:
         data = data.where(select(data, words))
     if not data.mask.any():
         raise ValueError(f"{arguments.at}: --only leaves nothing to predict")

@@ -131,6 +131,19 @@ class Measurements:
         changed = replace(self, mask=self.mask & keep)
         return changed if note is None else changed.noted(note)
 
+    def of_channels(self, names: Sequence[str]) -> "Measurements":
+        """These channels alone, in the order that they have here. ValueError for one that is not there."""
+        for name in names:
+            if name not in self.channels:
+                raise ValueError(f"channel {name} is not in the data; there are {', '.join(self.channels)}")
+        places = [place for place, name in enumerate(self.channels) if name in names]
+        return replace(
+            self,
+            values=self.values[:, places],
+            sigma=None if self.sigma is None else self.sigma[:, places],
+            channels=tuple(self.channels[place] for place in places),
+        )
+
     def without_retro(self, degrees: float) -> "Measurements":
         """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
 

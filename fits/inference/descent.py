@@ -57,10 +57,9 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
     """
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
-    solver = BoxLevenbergMarquardt()
-    options = {"watch": lambda beside: beside[1], **({"logarithmic": model.logarithmic} if varying else {})}
-    options |= {"promise": promise} if likelihood else {}
-    options |= {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY)}
+    solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
+    options = {"watch": lambda beside: beside[1], "damping": damping, **({"promise": promise} if likelihood else {})}
+    options |= {"logarithmic": model.logarithmic} if varying else {}
 
     def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
         return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)

@@ -76,7 +76,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
             break
         chances = np.exp(_evened(weights))
         chosen = generator.choice(draws, draws, p=chances / chances.sum())
-        approximation = Mixture.through(positions[chosen], np.random.default_rng(seed))
+        approximation = Mixture.through(positions[chosen], generator)
     return best
 
 

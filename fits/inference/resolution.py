@@ -162,10 +162,12 @@ class Values:
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,); for a named objective
-    the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and errors of the model
+    where readings share them; for a named objective the scatter of its residuals, one number."""
     if problem.objective == "likelihood":
-        return np.asarray(problem.call(Model.sigma_at, vector, predicted), float)
+        sigma = np.asarray(problem.call(Model.sigma_at, vector, predicted), float)
+        shared = problem.build(vector).correlation
+        return sigma if shared is None else np.hypot(sigma, float(shared.amplitude) * predicted)
     residuals = np.asarray(problem.call(Model.standardised_at, vector, predicted), float)
     data = np.asarray(problem.call(Model.standardised_at, vector, np.zeros_like(predicted)), float)
     scatter = np.sqrt(np.sum(residuals**2) / max(problem.count - len(vector), 1))

@@ -33,6 +33,18 @@ def test_angles_follow_the_conventions():
     np.testing.assert_allclose((data.wi + data.wo)[0], [0, 0, np.sqrt(3)], atol=1e-15)
 
 
+def test_channels_are_chosen_by_name():
+    values = np.arange(9.0).reshape(3, 3) + 1.0
+    data = _measurements(values=values, sigma=0.1 * values, channels=("red", "green", "blue"))
+    chosen = data.of_channels(["blue", "red"])
+    assert chosen.channels == ("red", "blue")
+    np.testing.assert_array_equal(chosen.values, values[:, [0, 2]])
+    np.testing.assert_array_equal(chosen.sigma, 0.1 * values[:, [0, 2]])
+    assert data.of_channels(["green"]).values.shape == (3, 1)
+    with pytest.raises(ValueError, match="channel uv is not in the data; there are red, green, blue"):
+        data.of_channels(["red", "uv"])
+
+
 def test_direction_against_hand_written_vectors():
     np.testing.assert_allclose(direction(90, 90), [0, 1, 0], atol=1e-15)
     np.testing.assert_allclose(direction(-45, 0), [-np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-15)
