@@ -19,7 +19,7 @@ from fits.structures.searching import NONE_MORE, named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4
-TRUTH = lj.AddingDoubling(nodes=20, modes=20)
+TRANSPORT = lj.Statistical()
 NOISE = 0.02
 STARTS = 4
 FIRST, WANTED = 3, 36
@@ -60,8 +60,9 @@ TEXT = """\
 
 {environment}
 {repeats} materials of one to three layers with numbers drawn at random, read at 10, 30, 50 and 70 degrees of incidence
-with noise of {noise:.0%} (all orders, `{truth}`). `fits.search` looks for the stack among those that an interface and
-haze over a diffuse base and a metal make, up to three layers, with all orders.
+with noise of {noise:.0%}. `fits.search` looks for the stack among those that an interface and haze over a diffuse base and
+a metal make, up to three layers. Data and fits are by `{transport}`, all orders of scattering by their moments: this
+judges the search, not how well a transport describes a material.
 
 {rows}
 *first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
@@ -139,7 +140,7 @@ def material(index: int) -> tuple[Structure, Measurements]:
     ]
     diffuse = structure[-1] == "diffuse"
     base = lj.Lambertian(number("albedo")) if diffuse else lj.Conductor(number("metal"), number("k"), number("alpha"))
-    data = fits.simulate(lj.Stack(layers, base), coated_haze.readings(), TRUTH, NOISE, 1e-6, seed=index)
+    data = fits.simulate(lj.Stack(layers, base), coated_haze.readings(), TRANSPORT, NOISE, 1e-6, seed=index)
     return structure, Measurements(data.wi, data.wo, data.values, None, data.mask, data.channels, data.source)
 
 
@@ -148,7 +149,7 @@ def run_repeat(index: int) -> Repeat:
     began = time.perf_counter()
     structure, data = material(index)
     noise = fits.Noise(relative=NOISE, floor=1e-6)
-    found = fits.search(data, LIBRARY, layers=3, noise=noise, starts=STARTS, seed=index)
+    found = fits.search(data, LIBRARY, layers=3, transport=TRANSPORT, noise=noise, starts=STARTS, seed=index)
     places = [place for place, one in enumerate(found.found) if one.structure == structure and one.foresight]
     seen = found.found[places[0]].foresight if places else None
     return Repeat(
@@ -172,7 +173,7 @@ def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
         environment=environment_lines(surroundings),
         repeats=len(done),
         noise=NOISE,
-        truth=TRUTH,
+        transport=TRANSPORT,
         rows=table(heads, rows),
         more=NONE_MORE,
         found=sum(_among_first(one) for one in done),
