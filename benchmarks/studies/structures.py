@@ -60,9 +60,9 @@ TEXT = """\
 
 {environment}
 {repeats} materials of one to three layers with numbers drawn at random, read at 10, 30, 50 and 70 degrees of incidence
-with noise of {noise:.0%}. `fits.search` looks for the stack among those that an interface and haze over a diffuse base and
-a metal make, up to three layers. Data and fits are by `{transport}`, all orders of scattering by their moments: this
-judges the search, not how well a transport describes a material.
+with noise of {noise:.0%}. `fits.search` looks for the stack among those that an interface and haze over a diffuse base
+and a metal make, up to three layers. Data and fits are by `{transport}`, all orders of scattering by their moments:
+this judges the search, not how well a transport describes a material.
 
 {rows}
 *first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
