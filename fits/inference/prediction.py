@@ -14,12 +14,15 @@ from scipy.special import logsumexp
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, Source
 from fits.inference.fit_result import Fit
-from fits.inference.laplace import Approximation
+from fits.inference.importance import weighted
 from fits.inference.posterior import Posterior
 from fits.problem.logarithm import logarithm, size
 from fits.problem.logarithm import softness as soft
 from fits.problem.model import Model
 from fits.problem.nodes import places
+
+LEAST_DRAWS = 400
+"""Of the approximation that draws of a posterior are chosen from."""
 
 DRAWS = 256
 """Vectors of parameters that a prediction is made with."""
@@ -107,7 +110,7 @@ def predict(
     """What the fitted stack is expected to reflect, and what would be read.
 
     Args:
-        of: a fit, whose parameters are drawn from the approximation of its posterior by a Student-t, or a posterior.
+        of: a posterior, or a fit, of whose posterior draws are made by weights (see `fits.inference.importance`).
         at: pairs of directions, above or below; of `Measurements` their used samples, with their own sigma.
         levels: of the quantiles, in (0, 1).
         draws: vectors of parameters, at least 2.
@@ -239,7 +242,8 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
 def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> Floats:
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws)
-    positions = Approximation.of(of).draw(np.random.RandomState(generator.integers(2**31)), draws)
+    random = np.random.RandomState(generator.integers(2**31))
+    positions = weighted(of, max(LEAST_DRAWS, 2 * draws), random).resampled(random, draws)
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(jnp.asarray(positions)), float)
 
 

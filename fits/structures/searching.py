@@ -4,8 +4,9 @@ they foretell.
 Every structure of a level is fitted with noise alone, at a coarse resolution: that is cheap, and tells by the Bayesian
 information criterion which of them are worth a closer look. These few are fitted as `fits.fit` does, with errors that
 readings share where residuals say so, and ranked by what they foretell of incidences that are left out (`leave_out`).
-The next level has a layer more, or less, than the best of all. It ends where that no longer foretells more than chance
-would.
+The next level has a layer more, or less, than the best of all. It ends where a level neither foretells more than chance
+would nor has a clearly lower criterion: errors that readings share let a stack that lacks a layer foretell about as well
+as it would with it, until all of its layers are there.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +36,10 @@ from fits.structures.library import Library, Structure, default_library
 
 STARTS = 8
 BEAM = 2
-"""So many of the best structures grow and shrink."""
+"""So many of the lowest criterion grow and shrink, and that which foretells best."""
+
+STRONG = 10.0
+"""A level that does not foretell more is gone on from where its criterion is lower by more than this."""
 
 CLOSER = 3
 """So many of a level are looked at closely, besides those that were before."""
@@ -126,17 +130,17 @@ def search(
 
 
 def _searched(run: "_Fitting", looked: "_Looked", layers: int, progress: Progress | None) -> Search:
-    """Level by level, as long as a level foretells more than the one before."""
+    """Level by level, as long as a level foretells more than those before, or fits better by more than it costs."""
     library = run.library
     level: list[Structure] = [(base,) for base in library.bases]
     while level:
+        before, lowest = looked.best(), looked.lowest()
         _screen(level, run, looked, progress)
         closer = sorted(level, key=looked.bic)[:CLOSER]
-        before = looked.best()
         for number, structure in enumerate(closer):
             _report(progress, "closer look", number, len(closer), structure)
             looked.look(structure, run)
-        if before is not None and not looked.ahead(before):
+        if before is not None and not looked.ahead(before) and not looked.lowest() < lowest - STRONG:
             break
         level = _next(looked, library, layers)
     _report(progress, "closer look", 1, 1, None)
@@ -186,9 +190,10 @@ def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: 
 
 
 def _next(looked: "_Looked", library: Library, layers: int) -> list[Structure]:
-    """Structures not fitted before, a layer more or less than the best."""
+    """Structures not fitted before, a layer more or less than what foretells best and what fits best."""
     grown: list[Structure] = []
-    for structure in looked.ranked()[:BEAM]:
+    best = looked.ranked()[:1] + sorted(looked.plain, key=looked.bic)[:BEAM]
+    for structure in dict.fromkeys(best):
         above, base = structure[:-1], structure[-1]
         shrunk = [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
         more = [
@@ -223,6 +228,10 @@ class _Looked:
         fit = self.plain[structure]
         return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
 
+    def lowest(self) -> float:
+        """The lowest criterion so far."""
+        return min(map(self.bic, self.plain), default=np.inf)
+
     def look(self, structure: Structure, run: _Fitting) -> None:
         found = self.fits[structure] = run(structure, self.plain[structure])
         stored = self.kept.look(structure) if self.kept is not None else None
@@ -249,7 +258,7 @@ class _Looked:
         foresights = together(
             {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
         )
-        lowest = min(map(self.bic, self.plain))
+        lowest = self.lowest()
         rest = sorted((one for one in self.plain if one not in self.left), key=self.bic)
         found = tuple(
             Found(

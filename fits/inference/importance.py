@@ -1,0 +1,100 @@
+"""Draws that are weighted so that they stand for the posterior of a fit, without a chain.
+
+They come from an approximation of the posterior, that of the fit, along its ridge where there is one. How well they
+stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25,
+72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from in its place
+(Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907).
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from fits.inference.fit_result import Fit
+from fits.inference.laplace import Approximation
+
+if TYPE_CHECKING:
+    from fits.inference.mixture import Mixture
+
+GOOD, ROUNDS = 0.5, 4
+"""The Pareto shape below which the variance of weights is finite, and how many approximations are tried for it."""
+
+FEWEST = 50
+"""Draws that a mixture is fitted to are worth at least so many of the posterior; else weights are made more even."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Weighted:
+    """Draws of an approximation, unconstrained, (D, P), and the logarithms of posterior / approximation there, (D,);
+    shape: of the Pareto tail of the weights: above 0.7 a part of the posterior may be missing."""
+
+    positions: Floats
+    log_weights: Floats
+    shape: float
+
+    def resampled(self, generator: np.random.RandomState, count: int) -> Floats:
+        """(count, P) draws of the posterior, unconstrained: the more even the weights, the fewer occur twice."""
+        return self.positions[_chosen(self.log_weights, generator, count)]
+
+
+def weighted(fit: Fit, draws: int, generator: np.random.RandomState) -> Weighted:
+    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS`."""
+    from fits.inference.mixture import Mixture
+
+    approximation: Approximation | Mixture = Mixture.of(fit) or Approximation.of(fit)
+    best = None
+    for _ in range(ROUNDS):
+        found = _drawn(fit, approximation, draws, generator)
+        if best is None or found.shape < best.shape:
+            best = found
+        if best.shape < GOOD or not np.isfinite(found.shape):
+            break
+        chosen = _chosen(_evened(found.log_weights), generator, draws)
+        approximation = Mixture.through(found.positions[chosen], generator)
+    assert best is not None
+    return best
+
+
+def _drawn(
+    fit: Fit, approximation: "Approximation | Mixture", draws: int, generator: np.random.RandomState
+) -> Weighted:
+    import arviz
+
+    from fits.inference.ensemble import log_posteriors
+
+    if isinstance(approximation, Approximation):
+        positions, inside = approximation.draw(generator, draws), np.ones(draws, bool)
+    else:
+        positions, inside = approximation.draw_all(generator, draws)
+    heights = np.asarray(fit.problem.call(log_posteriors, positions), float)
+    weights = heights - approximation.log_density(positions)
+    weights = np.where(inside & np.isfinite(weights), weights, -np.inf)
+    if not np.isfinite(weights).any():
+        return Weighted(positions, weights, np.inf)
+    _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
+    return Weighted(positions, weights, float(shape))
+
+
+def _chosen(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:
+    if not np.isfinite(log_weights).any():
+        return generator.randint(len(log_weights), size=count)
+    chances = np.exp(log_weights - logsumexp(log_weights))
+    return generator.choice(len(log_weights), count, p=chances / chances.sum())
+
+
+def _evened(log_weights: Floats) -> Floats:
+    """Logarithms of weights raised to the highest power up to 1 with which they are worth `FEWEST` draws."""
+    finite = np.isfinite(log_weights)
+    least = min(FEWEST, 0.5 * finite.sum())
+    scaled = log_weights
+    for power in 0.8 ** np.arange(40):
+        scaled = np.where(finite, power * np.where(finite, log_weights, 0.0), -np.inf)
+        share = np.exp(scaled - logsumexp(scaled))
+        if 1.0 / np.sum(share**2) >= least:
+            break
+    return scaled
