@@ -1,6 +1,6 @@
 """Draws that are weighted so that they stand for the posterior of a fit, without a chain.
 
-They come from an approximation of the posterior, that of the fit, along its ridge where there is one. How well they
+They come from an approximation of the posterior, that of the fit, or along its ridge where there is one. How well they
 stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25,
 72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from in its place
 (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907).
@@ -42,11 +42,15 @@ class Weighted:
         return self.positions[_chosen(self.log_weights, generator, count)]
 
 
-def weighted(fit: Fit, draws: int, generator: np.random.RandomState) -> Weighted:
-    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS`."""
+def weighted(fit: Fit, draws: int, generator: np.random.RandomState, *, along_ridge: bool = False) -> Weighted:
+    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS`.
+
+    along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians.
+    """
     from fits.inference.mixture import Mixture
 
-    approximation: Approximation | Mixture = Mixture.of(fit) or Approximation.of(fit)
+    mixture = Mixture.of(fit) if along_ridge else None
+    approximation: Approximation | Mixture = mixture or Approximation.of(fit)
     best = None
     for _ in range(ROUNDS):
         found = _drawn(fit, approximation, draws, generator)

@@ -46,7 +46,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """
     if not fit.is_posterior:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
-    found = weighted(fit, draws, np.random.RandomState(seed))
+    found = weighted(fit, draws, np.random.RandomState(seed), along_ridge=True)
     total = float(logsumexp(found.log_weights))
     if not np.isfinite(total):
         return Evidence(-np.inf, np.inf, np.inf)

@@ -4,9 +4,9 @@ they foretell.
 Every structure of a level is fitted with noise alone, at a coarse resolution: that is cheap, and tells by the Bayesian
 information criterion which of them are worth a closer look. These few are fitted as `fits.fit` does, with errors that
 readings share where residuals say so, and ranked by what they foretell of incidences that are left out (`leave_out`).
-The next level has a layer more, or less, than the best of all. It ends where a level neither foretells more than chance
-would nor has a clearly lower criterion: errors that readings share let a stack that lacks a layer foretell about as well
-as it would with it, until all of its layers are there.
+The next level has a layer more, or less, than the best of all. It ends where a level neither foretells more than
+chance would nor has a clearly lower criterion: with errors that readings share, a stack that lacks two layers may
+foretell as well as one that lacks one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
