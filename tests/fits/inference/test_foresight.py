@@ -83,8 +83,7 @@ def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
         others = np.setdiff1d(np.arange(len(data)), rows)
         mean, covariance = regression(others)
         columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
-        # draws are of a Student-t with 6 degrees of freedom, whose variance is 1.5 times as large
-        width = np.sqrt(1.5 * np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
+        width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
         expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
     assert left.score == pytest.approx(left.by_group.sum())
