@@ -51,10 +51,8 @@ class Descent(NamedTuple):
 
 
 def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise: Array) -> Descent:
-    """Levenberg-Marquardt from `start` (P,) in the unit box. Not `fresh`: near a minimum, all levels free.
-
-    promise: a likelihood fit stops when a full step promises less than this in the log-posterior.
-    """
+    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step promises less than `promise` in the
+    log-posterior. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
     solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
