@@ -94,7 +94,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
             f"The model does not explain the data to within its noise (chi-square per degree of freedom "
             f"{fit.reduced_chi_square:.3g}): the quoted errors are too small."
         )
-    elif structure.lag_one_sigma > MISFIT_SIGMAS:
+    elif structure.lag_one_sigma > MISFIT_SIGMAS and not fit.problem.noise.correlated:
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
