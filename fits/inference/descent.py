@@ -26,7 +26,7 @@ NEARBY = 1e-4
 """Damping near a minimum: a step is all but a full one."""
 
 ROUGHLY = 1e-4
-"""A hundredth of a standard error: what tells minima apart, and is a third of the way."""
+"""A hundredth of a standard error: tells minima apart, after about a third of the steps where these gain least."""
 
 Floats = NDArray[np.float64]
 

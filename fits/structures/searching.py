@@ -10,7 +10,7 @@ foretell as well as one that lacks one.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -121,10 +121,8 @@ def search(
         raise ValueError(f"layers is {layers}; it must be in [0, 6]")
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
-    with ExitStack() as stack:
-        kept = None
-        if directory is not None:
-            kept = stack.enter_context(Kept(directory, data, library, noise, scale, transport, starts, seed))
+    settings = (library, noise, scale, transport, starts, seed)
+    with nullcontext() if directory is None else Kept(directory, data, *settings) as kept:
         run = _Fitting(data, library, transport, noise, scale, starts, seed, kept)
         return _searched(run, _Looked(kept), layers, progress)
 

@@ -52,7 +52,7 @@ def test_bands_of_a_line_are_those_of_regression() -> None:
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
     # 4,000 draws, of some 5,000 that are worth it: 1.5 % of a standard deviation, at 4 standard errors
     np.testing.assert_allclose(at.model.sd[:, 0], expected, rtol=0.06)
-    np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(1.5 * expected**2 + 0.05**2), rtol=0.05)
+    np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
     np.testing.assert_allclose(at.model.mean, found.predicted, atol=0.1 * expected.max())
     wide = at.reading.quantiles[-1] - at.reading.quantiles[0]
     np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(1.2 * expected, 0.05), rtol=0.08)
