@@ -12,6 +12,7 @@ FLAGS = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split
 if tuple(map(int, metadata.version("jaxlib").split(".")[:2])) < (0, 11):
     FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of two workers wait for each other busily
 
 import jax  # noqa: E402 (the flags must be set before)
 

@@ -15,7 +15,7 @@ from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, 
 from benchmarks.suite import coated_haze
 from fits.data.measurements import Measurements
 from fits.structures.library import Library, Structure, default_library
-from fits.structures.searching import NONE_MORE, named
+from fits.structures.searching import named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4
@@ -66,7 +66,7 @@ this judges the search, not how well a transport describes a material.
 
 {rows}
 *first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
-by more than {more:g} standard errors of the difference. *too complex*: how often such a one has more layers.
+by more than chance (see `Foresight.surely_behind`). *too complex*: how often such a one has more layers.
 
 The true structure is among the first three in {found} of {repeats} (asked for: {wanted} of {asked}); a more complex one
 is preferred by more than chance in {complex}.
@@ -76,14 +76,14 @@ is preferred by more than chance in {complex}.
 @dataclass(frozen=True)
 class Repeat:
     """One material: its structure, the place of that in the result (0: the first; None: not looked at), the best one,
-    how far the true one is behind it with the standard error, and how many structures were fitted."""
+    how far the true one is behind it, the same beyond chance, and how many structures were fitted."""
 
     repeat: int
     truth: str
     place: int | None
     best: str
     behind: float | None
-    behind_error: float | None
+    surely_behind: float | None
     fitted: int
     seconds: float
 
@@ -95,9 +95,7 @@ class Repeat:
     @property
     def is_beaten(self) -> bool:
         """Whether another structure is preferred by more than chance."""
-        if self.behind is None or self.behind_error is None:
-            return True
-        return self.behind > NONE_MORE * self.behind_error
+        return self.surely_behind is None or self.surely_behind > 0.0
 
 
 def study(
@@ -158,7 +156,7 @@ def run_repeat(index: int) -> Repeat:
         place=places[0] if places else None,
         best=found.best.name,
         behind=None if seen is None else seen.behind,
-        behind_error=None if seen is None else seen.behind_error,
+        surely_behind=None if seen is None else seen.surely_behind,
         fitted=len(found.found),
         seconds=time.perf_counter() - began,
     )
@@ -175,7 +173,6 @@ def _save(done: list[Repeat], directory: Path) -> tuple[str, tuple[Path, Path]]:
         noise=NOISE,
         transport=TRANSPORT,
         rows=table(heads, rows),
-        more=NONE_MORE,
         found=sum(_among_first(one) for one in done),
         wanted=WANTED,
         asked=REPEATS,

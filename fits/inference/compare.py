@@ -142,7 +142,7 @@ def _preference(best: Row, other: Row, sorted_by: str) -> str:
         assert other.foresight is not None
         ahead, error = other.foresight.behind, other.foresight.behind_error
         differ = f"it foretells incidences that are left out with a log-density higher by {ahead:.1f} ± {error:.1f}"
-        return _in_words(best.name, other.name, 2.0 * (ahead - 2.0 * error), differ)
+        return _in_words(best.name, other.name, 2.0 * other.foresight.surely_behind, differ)
     excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
     counted = f" (the scatter that {best.name} leaves counted as noise)" if excess > 1.0 else ""
     if sorted_by == "loo":

@@ -17,6 +17,13 @@ from fits.progress import Progress
 WIDEST = 30.0
 """Of the logarithms of ratios of weights."""
 
+BY_CHANCE = 2.0
+"""Standard errors by which a stack may be ahead of one that is as good."""
+
+EVERYWHERE = 1.0
+"""A stack that falls behind by more than this a reading, in every group of readings, does so not by chance: few groups
+say little of the error of their sum where one of them differs much more than another."""
+
 Floats = NDArray[np.float64]
 
 
@@ -25,7 +32,8 @@ class Foresight:
     """What one of several stacks is worth to who wants to know what was not measured.
 
     score: sum of log-densities of readings, each foretold by a fit without its incidence. behind: how far that falls
-    behind the best, and its standard error by the incidences. weight: of its predictions in the mixture that foretells
+    behind the best, and its standard error by the incidences. at_least: the same a reading, of the incidence where it
+    falls behind least. weight: of its predictions in the mixture that foretells
     best (stacking, Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`. probability:
     of this stack among those that are compared, all as probable beforehand.
     """
@@ -33,9 +41,15 @@ class Foresight:
     score: float
     behind: float
     behind_error: float
+    at_least: float
     weight: float
     evidence: Evidence
     probability: float
+
+    @property
+    def surely_behind(self) -> float:
+        """How far the score falls behind the best beyond chance; below 0 the data do not tell the two apart."""
+        return self.behind if self.at_least > EVERYWHERE else self.behind - BY_CHANCE * self.behind_error
 
 
 def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
@@ -54,11 +68,11 @@ def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> 
     found = {}
     for index, name in enumerate(names):
         gaps = best.by_group - left[name].by_group
-        error = float(np.sqrt(gaps.size) * gaps.std(ddof=1))
         found[name] = Foresight(
             score=float(scores[index]),
             behind=float(gaps.sum()),
-            behind_error=error,
+            behind_error=float(np.sqrt(gaps.size) * gaps.std(ddof=1)),
+            at_least=float(np.min(gaps / best.sizes)),
             weight=float(weights[index]),
             evidence=evidences[name],
             probability=float(probabilities[index]),

@@ -51,6 +51,11 @@ class LeftOut:
         """The score of each group, (G,)."""
         return np.array([np.sum(self.log_density[rows]) for rows in self.rows])
 
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """Readings of each group, (G,)."""
+        return np.array([self.log_density[rows].size for rows in self.rows])
+
 
 def leave_out(fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress | None = None) -> LeftOut:
     """Fit anew without each incidence, from the best values on, and foretell its readings.

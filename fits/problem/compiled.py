@@ -1,16 +1,18 @@
 """One compiled program for every model of the same structure and shape: numbers are traced, the rest is its key."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache, partial
+from threading import Lock
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 
 class Static:
@@ -29,13 +31,45 @@ class Static:
 
 
 def run(function: Callable[..., Any], split_model: tuple[Any, Static], *arguments: Any) -> Any:
-    """`function(model, *arguments)` compiled; see `Problem.call`."""
-    return _run(function, split_model[1], split_model[0], *arguments)
+    """`function(model, *arguments)` compiled, and done; see `Problem.call`."""
+    with one_thread():
+        return jax.block_until_ready(_run(function, split_model[1], split_model[0], *arguments))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _run(function: Callable[..., Any], static: Static, arrays: Any, *arguments: Any) -> Any:
     return function(eqx.combine(arrays, static.tree), *arguments)
+
+
+class _Limit:
+    """How many calls run now, and what gives their libraries back the threads that they had before the first."""
+
+    lock = Lock()
+    calls = 0
+    limited: Any = None
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """LAPACK by one thread: those of a small matrix wait for each other busily, a hundredfold beside other work."""
+    with _Limit.lock:
+        _Limit.calls += 1
+        if _Limit.calls == 1:
+            _Limit.limited = _libraries().limit(limits=1)
+    try:
+        yield
+    finally:
+        with _Limit.lock:
+            _Limit.calls -= 1
+            if not _Limit.calls:
+                _Limit.limited.restore_original_limits()
+
+
+@cache
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401 (what JAX's matrices are solved by, loaded by now)
+
+    return ThreadpoolController().select(user_api="blas")
 
 
 def cores() -> int:

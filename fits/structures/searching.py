@@ -47,9 +47,6 @@ CLOSER = 3
 REMEMBERED = 16
 """Structures whose programs are kept."""
 
-NONE_MORE = 2.0
-"""A structure is no better if it is not ahead by so many standard errors."""
-
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -247,15 +244,17 @@ class _Looked:
 
     def ahead(self, before: Structure) -> bool:
         """Whether the best is clearly better than what was it before."""
-        best = self.ranked()[0]
-        gaps = self.left[best].by_group - self.left[before].by_group
-        return best != before and gaps.sum() > NONE_MORE * np.sqrt(gaps.size) * gaps.std(ddof=1)
+        return self.ranked()[0] != before and self.foresights()[named(before)].surely_behind > 0.0
+
+    def foresights(self) -> dict[str, Foresight]:
+        ranked = self.ranked()
+        return together(
+            {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
+        )
 
     def result(self) -> Search:
         ranked = self.ranked()
-        foresights = together(
-            {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
-        )
+        foresights = self.foresights()
         lowest = self.lowest()
         rest = sorted((one for one in self.plain if one not in self.left), key=self.bic)
         found = tuple(
@@ -268,11 +267,7 @@ class _Looked:
             )
             for one in (*ranked, *rest)
         )
-        alike = tuple(
-            name
-            for name, seen in foresights.items()
-            if name != found[0].name and seen.behind <= NONE_MORE * seen.behind_error
-        )
+        alike = tuple(name for name, seen in foresights.items() if name != found[0].name and seen.surely_behind <= 0.0)
         return Search(found, alike)
 
 

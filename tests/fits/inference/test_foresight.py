@@ -10,9 +10,9 @@ from fits.data.measurements import Measurements
 from fits.inference.averaging import average
 from fits.inference.compare import compare
 from fits.inference.fit_result import Fit
-from fits.inference.foresight import stacking
-from fits.inference.left_out import groups_of, leave_out
-from fits.inference.marginal_likelihood import evidence
+from fits.inference.foresight import stacking, together
+from fits.inference.left_out import LeftOut, groups_of, leave_out
+from fits.inference.marginal_likelihood import Evidence, evidence
 from fits.inference.optimise import fit
 from fits.inference.prediction import predict
 from fits.problem.left_out import without
@@ -176,3 +176,23 @@ def test_fits_that_say_nothing_of_readings_are_refused() -> None:
     few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
     with pytest.raises(ValueError, match="too few to leave some of them out"):
         leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+
+
+@pytest.mark.parametrize(
+    ("gaps", "told"),
+    [
+        ((30.0, 200.0, 900.0), True),  # 1130 +- 780, but worse everywhere
+        ((2.0, 200.0, 900.0), False),
+        ((5.0, 6.0, 7.0), True),  # 18 +- 1.7
+        ((-1.0, 0.5, 2.0), False),
+    ],
+)
+def test_what_is_worse_everywhere_is_told_apart(gaps: tuple[float, ...], told: bool) -> None:
+    """Three groups of ten readings, over which a gap is spread evenly."""
+    rows = tuple(np.split(np.arange(30), 3))
+    best = LeftOut(("1", "2", "3"), rows, np.zeros((30, 1)), True)
+    other = LeftOut(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
+    known = Evidence(0.0, 0.1, 0.1)
+    seen = together({"best": best, "other": other}, {"best": known, "other": known})["other"]
+    assert (seen.surely_behind > 0.0) == told
+    assert seen.at_least == pytest.approx(min(gaps) / 10.0)

@@ -16,8 +16,6 @@ from fits.structures.files import LOCK
 from fits.structures.library import Library
 from fits.structures.searching import search
 
-pytestmark = pytest.mark.slow
-
 LIBRARY = Library(
     layers={"interface": lj.Interface(Free(1.5, 1.05, 2.5), Free(0.3, 0.05, 1.0))},
     bases={
@@ -26,7 +24,7 @@ LIBRARY = Library(
     },
 )
 TRUTH = lj.Stack([lj.Interface(1.4, 0.25)], lj.Lambertian(0.3))
-NOISE = Noise(relative=0.03, floor=1e-6)
+NOISE = Noise(relative=0.03, floor=1e-6, correlated=False)
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +49,19 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
     assert {one.name for one in found.found} == {"diffuse", "metal", "interface / diffuse", "interface / metal"}
     assert found.best.bic == 0.0
     assert found.best.foresight.probability > 0.999
-    assert not found.best.fit.problem.noise.correlated
     values, errors = found.best.fit.values, found.best.fit.standard_errors
     for name, truth in (("layers[0].ior", 1.4), ("layers[0].alpha", 0.25), ("base.albedo", 0.3)):
         assert abs(values[name] - truth) < 4.0 * errors[name]
+
+
+@pytest.mark.slow
+def test_a_lack_of_the_others_is_shared(data: fits.Measurements, found: fits.Search) -> None:
+    by_rule = Noise(relative=0.03, floor=1e-6)
+    again = search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=by_rule, starts=2)
+    noise = {one.name: one.fit.problem.noise.correlated for one in again.found}
+    assert not noise["interface / diffuse"]
+    assert all(noise[name] for name in ("diffuse", "metal", "interface / metal"))
+    assert again.best.name == found.best.name
 
 
 def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
