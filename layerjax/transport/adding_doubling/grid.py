@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, safe_sqrt
+from layerjax._numerics import at_least, at_most, horner, safe_sqrt
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.interpolate import cubic
 
@@ -36,6 +36,13 @@ MERGED = 0.5
 
 UNROLLED = 8
 """Polynomials of up to so many degrees are written out, of more a loop."""
+
+NEAR = 0.3
+"""Of a panel, what may be around its edge at most."""
+
+ROUNDED_ROOT = (367 / 928, 151 / 232, 23 / 464, -31 / 232, 35 / 928)
+"""Coefficients of r^0 ... r^4 of what stands for the root of r on (-1, 1): with its value and two derivatives at 1,
+level at -1, and with its mean where directions beyond 0 count by a smooth step."""
 
 TABLE_DENSITY = 2
 """Points of the table of a panel for each of its nodes."""
@@ -132,24 +139,69 @@ def _merged(edges: Array, apart: Array) -> Array:
     return jnp.stack(merged)
 
 
-def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array) -> tuple[Array, Array]:
-    """Interpolation weights of directions on the nodes of their panel, and 1 for that panel and 0 for the others.
+def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> Array:
+    """Interpolation weights of directions on all nodes, shape ``cosine.shape + (grid.size,)``, which sum to 1.
 
-    Shapes ``cosine.shape + (grid.nodes,)`` and ``cosine.shape + (panels,)``: the products of the two sum to 1.
     Polynomials of the panel's coordinate. Summed against a distribution of directions they *deposit* it on the nodes,
-    with its total and its moments kept.
+    with its total and its moments kept. Around the edge between two panels both have a share, so that the weights of
+    a direction that moves from one to the other change smoothly.
 
     Args:
         ior: index of the region in which the directions are.
         cosine: their |cos theta|.
         sine2: their sin(theta)^2.
+        blur: half the width in s^2 of what is around an edge, of the order of the distance between directions.
     """
-    panel = _panel(grid, ior * ior * sine2)
-    low, high = grid.bounds(panel, ior * ior)
-    chosen = (panel[..., None] == grid.panels[:, 0]) & (high > low)[..., None]
-    x2, _ = _coordinate(ior, cosine, sine2, low, high)
-    x = safe_sqrt(jnp.where(jnp.any(chosen, axis=-1), x2, 0.25))
-    return lagrange(x, grid.nodes), chosen.astype(x.dtype)
+    own = ior * ior
+    squared = own * sine2
+    reached = [jnp.ones_like(squared)]
+    placed = []
+    below = jnp.zeros_like(own)
+    for k in range(grid.edges.shape[0]):
+        low, high = grid.bounds(np.asarray(k), own)
+        width = jnp.where(high > low, high - low, 1.0)
+        above = _around(grid, own, k, blur)
+        x2 = ((high - own) + own * cosine * cosine) / width
+        x = _coordinate_between(x2, (squared - low) / width, below / width, above / width)
+        reached.append(_step(squared - grid.edges[k], above, grid.edges[k] < own - grid.apart))
+        share = jnp.where(high > low, reached[-2] - reached[-1], 0.0)
+        placed.append(share[..., None] * lagrange(x, grid.nodes))
+        below = above
+    return jnp.concatenate(placed, axis=-1)
+
+
+def _around(grid: Grid, own: Array, k: int, blur: Array) -> Array:
+    """Half the width of what is around the upper edge of a panel; 0 where there is none in the region."""
+    if k + 1 == grid.edges.shape[0]:
+        return jnp.zeros_like(own)
+    edge, after = grid.edges[k], jnp.where(grid.edges[k + 1] < own, grid.edges[k + 1], own)
+    before = grid.edges[k - 1] if k else jnp.zeros_like(edge)
+    return jnp.where(
+        edge < own - grid.apart, at_most(at_most(blur, NEAR * (edge - before)), NEAR * (after - edge)), 0.0
+    )
+
+
+def _step(beyond: Array, around: Array, inner: Array) -> Array:
+    """How much of a direction lies beyond an edge: 0 to 1 over what is around it."""
+    wide = around > 0
+    t = jnp.clip(0.5 * (beyond / jnp.where(wide, around, 1.0) + 1.0), 0.0, 1.0)
+    smooth = t * t * t * (10.0 + t * (6.0 * t - 15.0))
+    return jnp.where(inner, jnp.where(wide, smooth, beyond >= 0), 0.0)
+
+
+def _coordinate_between(x2: Array, rest2: Array, below: Array, above: Array) -> Array:
+    """x of a panel; at its two ends what is smooth in s^2, and the same in the mean, over these widths.
+
+    At the lower end, x = 1, it rests there; at the upper one x is a root, and is rounded off.
+    """
+    wide, t = below > 0, rest2 / jnp.where(below > 0, below, 1.0)
+    near = wide & (t < 1.0)
+    t = jnp.where(near, at_least(t, -1.0), 0.0)
+    x2 = jnp.where(near, 1.0 - below * (1.0 + t) ** 3 * (3.0 - t) / 16.0, x2)
+    wide, r = above > 0, x2 / jnp.where(above > 0, above, 1.0)
+    near = wide & (r < 1.0)
+    rounded = jnp.sqrt(jnp.where(wide, above, 1.0)) * horner(ROUNDED_ROOT, jnp.where(near, at_least(r, -1.0), 0.0))
+    return jnp.where(near, rounded, safe_sqrt(jnp.where(near, 1.0, at_most(at_least(x2, 0.0), 1.0))))
 
 
 def _panel(grid: Grid, squared: Array) -> Array:

@@ -45,6 +45,10 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
+BLUR = 0.25
+"""Of alpha / (1 + 2 alpha), half the width in s^2 over which rays move from one panel to another: as far apart as they
+are next to each other, or a few times that."""
+
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
 
@@ -101,8 +105,10 @@ def _operators(
     """
     outside, down, lost_outside = facet_energies(near, far, normals)
     inside, up, lost_inside = facet_energies(far, near, normals)
-    unresolved = 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
-    through = _deposit(grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes)
+    unresolved = _unresolved(grid, normals)
+    through = _deposit(
+        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, normals)
+    )
     through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
     outer = None
@@ -139,10 +145,20 @@ def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes:
         rays = refracted_rays(asked, ratio, normals, points)
     else:
         rays = refracted_densely(grid, asked, inner, normals, modes)
-    through = _deposit(grid, *rays, inner, asked, modes)
+    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(asked.weight), inner)
     return [Parts(operator) for operator in (None, through, back, _face(inner, inside, 1.0 / ratio, normals, modes))]
+
+
+def _unresolved(grid: Grid, normals: Normals) -> Array:
+    return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
+
+
+def _blur(grid: Grid, normals: Normals) -> Array:
+    """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there."""
+    alpha = jnp.asarray(normals.alpha)
+    return BLUR * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:
@@ -161,7 +177,7 @@ def _adjoint(flux: Array, leaving: Array, far: Region) -> Array:
     return leaving[:, None] * jnp.swapaxes(kernel, -1, -2)
 
 
-def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int) -> Array:
+def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, modes: int, blur: Array) -> Array:
     """Flux operator (modes, out, in) of light that goes from node j to the directions wo_jq, a share of it each.
 
     Odd modes vanish at the pole like the sine: there the quotient by the sine is what polynomials interpolate. A few
@@ -169,20 +185,18 @@ def _deposit(grid: Grid, wo: Vector, share: Array, far: Region, near: Region, mo
     """
     odd = np.arange(modes) % 2 == 1
     share = jnp.where(near.exists[:, None], share, 0.0)
-    panels = grid.edges.shape[0]
 
     def deposit(rays: tuple[Vector, Array]) -> Array:
         wo, share = rays
         squared = wo[0] * wo[0] + wo[1] * wo[1]
         planar = safe_sqrt(squared)
-        weights, panel = spread(grid, far.ior, jnp.abs(wo[2]), squared)
+        weights = spread(grid, far.ior, jnp.abs(wo[2]), squared, blur)
         waves = cosines(jnp.where(squared > 0, wo[0] / jnp.where(squared > 0, planar, 1.0), 1.0), modes)
         spun = waves * jnp.where(odd[:, None], share * planar, share)
-        placed = (panel[:, :, None] * weights[:, None, :]).reshape(-1, grid.size)
-        return spun @ placed
+        return spun @ weights
 
     rows, points = share.shape
-    chunks = points * max(modes, panels * grid.nodes) * rows // AT_ONCE
+    chunks = points * max(modes, grid.size) * rows // AT_ONCE
     flux = jnp.moveaxis(by_rows(jax.vmap(deposit), (wo, share), chunks), 0, -1)
     flux = flux / jnp.where(odd[:, None], far.sine, 1.0)[:, :, None]
     return jnp.where(far.weight[:, None] > 0, flux, 0.0)

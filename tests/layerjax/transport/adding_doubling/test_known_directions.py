@@ -40,8 +40,7 @@ def test_agrees_with_tables_of_a_finer_grid(name):
 
 @pytest.mark.parametrize("medium", [lj.Medium(50.0, 0.5, lj.HenyeyGreenstein(0.2)), HAZE])
 def test_what_leaves_a_medium_below_does_not_come_back(medium):
-    """An open medium under an interface, seen from above alone, is followed too: against tables, which are not as
-    smooth (rays that pass the critical angle go from one panel of nodes to the next)."""
+    """An open medium under an interface, seen from above alone, is followed too: against tables."""
     wi, wo = pairs(STACKS["paint"])
 
     def stack(ior, alpha):
