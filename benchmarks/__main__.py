@@ -20,6 +20,8 @@ NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error
          "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "structures",
          "side-by-side")  # fmt: skip
 
+POSTERIORS = ("haze", "errors", "banana", "degenerate", "bounded")
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a benchmark, print its tables, and write them with all figures into a directory."""
@@ -73,9 +75,11 @@ def _parser() -> argparse.ArgumentParser:
     calibrated = commands.choices["calibration"]
     calibrated.add_argument("--repeats", type=int, metavar="N", help="how many there are to be in all")
     calibrated.add_argument(
-        "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), default=(6, 6), help="of AddingDoubling"
+        "--resolution", type=int, nargs=2, metavar=("NODES", "MODES"), help="of AddingDoubling (default: 6 6)"
     )
-    calibrated.add_argument("--errors", action="store_true", help="with errors of the model that readings share")
+    calibrated.add_argument(
+        "--posterior", choices=POSTERIORS, default="haze", help="which one: with all orders of scattering the first two"
+    )
     for command in (
         compared,
         calibrated,
@@ -108,12 +112,10 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
     if given.benchmark == "calibration":
         from layerjax import AddingDoubling
 
-        nodes, modes = given.resolution
-        options |= {
-            "transport": AddingDoubling(nodes=nodes, modes=modes),
-            "repeats": given.repeats,
-            "errors": given.errors,
-        }
+        options |= {"repeats": given.repeats, "posterior": given.posterior}
+        if given.resolution is not None:
+            nodes, modes = given.resolution
+            options["transport"] = AddingDoubling(nodes=nodes, modes=modes)
     return options
 
 

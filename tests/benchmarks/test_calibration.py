@@ -10,7 +10,8 @@ from scipy import stats
 
 import fits
 import layerjax as lj
-from benchmarks.studies.calibration import ranks, run
+from benchmarks.__main__ import POSTERIORS
+from benchmarks.studies.calibration import cases, ranks, run
 
 CHEAP = lj.AddingDoubling(orders="first")
 
@@ -43,9 +44,18 @@ def test_draws_come_from_the_whole_chain_after_its_burn_in() -> None:
     assert apart == pytest.approx(899 / 98 * 12 / 4.0)
 
 
-@pytest.mark.parametrize("name", run.FREE)
+def test_intervals_hold_what_they_say() -> None:
+    """Ranks that are each there once: 68 and 90 of 100 lie within, and as many are expected."""
+    row = ranks.judged("any", np.arange(100))
+    assert row.within == (68, 90)
+    for level, inside in zip(ranks.LEVELS, row.within, strict=True):
+        low, high = ranks.expected(100, level)
+        assert low < inside < high
+
+
+@pytest.mark.parametrize("name", cases.HAZE)
 def test_truths_come_from_the_prior(name: str) -> None:
-    free = run.FREE[name]
+    free = cases.HAZE[name]
     generator = np.random.default_rng(1)
     values = np.array([run.drawn(free, generator) for _ in range(1000)])
     if isinstance(free.prior, fits.LogNormal):
@@ -53,6 +63,22 @@ def test_truths_come_from_the_prior(name: str) -> None:
     else:
         centre = free.prior.mean
     assert stats.kstest(values, stats.norm(centre, free.prior.sd).cdf).pvalue > 0.01
+
+
+@pytest.mark.parametrize(
+    "name", ["bounded", "degenerate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("banana", "errors"))]
+)
+def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
+    """Without all orders; free parameters stand in the order of the problem's."""
+    assert tuple(cases.CASES) == POSTERIORS
+    case = cases.CASES[name]
+    cheap = {"transport": CHEAP} if case.errors else {}
+    text, paths = run.study(directory=tmp_path, repeats=1, surrogate=False, posterior=name, **cheap)
+    (record,) = json.loads(paths[0].read_text())["repeats"]
+    assert len(record["truth"]) == len(record["estimate"]) == len(case.free)
+    for free, estimate in zip(case.free.values(), record["estimate"], strict=True):
+        assert free.low <= estimate <= free.high
+    assert all(label in text for label in case.labels.values())
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:

@@ -19,6 +19,9 @@ BINS = (20, 10, 5, 4, 2)
 EXPECTED = 5
 """Repeats in a bin from which the chi-square distribution holds: fewer repeats have fewer bins."""
 
+LEVELS = (0.68, 0.9)
+"""Of central intervals of posteriors: whole numbers of ranks."""
+
 LEAST_P = 0.01
 BAND = 0.99
 
@@ -29,7 +32,8 @@ Floats = NDArray[np.float64]
 @dataclass(frozen=True)
 class Row:
     """Uniformity of the ranks of one parameter: the statistic and p-value of a chi-square test over `bins`, and that of
-    Kolmogorov and Smirnov; and the mean rank in standard errors from where it should be."""
+    Kolmogorov and Smirnov; the mean rank in standard errors from where it should be; and how many truths lie within
+    central intervals, see `LEVELS`."""
 
     parameter: str
     bins: int
@@ -37,6 +41,7 @@ class Row:
     p_chi_square: float
     p_kolmogorov_smirnov: float
     mean_off: float
+    within: tuple[int, ...]
     uniform: bool
 
 
@@ -64,8 +69,15 @@ def judged(parameter: str, ranks: Ranks) -> Row:
     share = (ranks + 0.5) / (DRAWS + 1)
     p_ks = stats.kstest(share, "uniform").pvalue
     off = (np.mean(share) - 0.5) * np.sqrt(12.0 * len(ranks))
+    within = tuple(int(np.sum(np.abs(share - 0.5) < 0.5 * level)) for level in LEVELS)
     uniform = min(p, p_ks) > LEAST_P
-    return Row(parameter, len(counts), float(chi_square), float(p), float(p_ks), float(off), bool(uniform))
+    return Row(parameter, len(counts), float(chi_square), float(p), float(p_ks), float(off), within, bool(uniform))
+
+
+def expected(repeats: int, level: float) -> tuple[float, float]:
+    """How many truths a central interval should hold: the central 95 % of the binomial distribution."""
+    low, high = stats.binom.interval(0.95, repeats, level)
+    return float(low), float(high)
 
 
 def picture(ranks: Mapping[str, Ranks]) -> Figure:

@@ -4,7 +4,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +17,25 @@ import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, rounded, table, write
 from benchmarks.studies.calibration import shared
-from benchmarks.studies.calibration.ranks import DRAWS, LEAST_P, Row, judged, picture, ranks_of, spread_draws
-from benchmarks.suite import coated_haze
+from benchmarks.studies.calibration.cases import CASES, FLOOR, Case
+from benchmarks.studies.calibration.ranks import (
+    DRAWS,
+    LEAST_P,
+    LEVELS,
+    Row,
+    expected,
+    judged,
+    picture,
+    ranks_of,
+    spread_draws,
+)
 from fits._files import write_bytes
 from fits.reporting.plots.data import as_png
 
-Floats = NDArray[np.float64]
-
-NAME = "calibration"
 REPEATS, QUICK = 200, 20
-TRANSPORT = lj.AddingDoubling(nodes=6, modes=6)
-NOISE, NOISE_BESIDE, FLOOR = 0.05, 0.02, 1e-6
-"""The second where readings share errors: these are of logarithms, in which noise is not quite normal."""
-
-STARTS, WALKERS, STEPS = 4, 12, 5000
+STARTS, WALKERS = 4, 12
 APART = 5.0
 """Autocorrelation times after which draws of one walker count as independent."""
-
-FREE = {
-    "ior": fits.Free(1.5, 1.2, 2.0, fits.Normal(1.5, 0.07)),
-    "alpha": fits.Free(0.3, 0.1, 0.9, fits.LogNormal(0.3, 0.25)),
-    "thickness": fits.Free(1.0, 0.1, 10.0, fits.LogNormal(1.0, 0.4)),
-    "g": fits.Free(0.5, -0.2, 0.95, fits.Normal(0.5, 0.1)),
-}
-"""Priors that end more than four standard deviations inside their bounds: no posterior leans on one."""
-
-LABELS = {"ior": "index", "alpha": "roughness", "thickness": "thickness", "g": "asymmetry g"} | shared.LABELS
 
 TEXT = """\
 # Calibration of posteriors
@@ -52,23 +45,18 @@ Simulation-based calibration (Talts, Betancourt, Simpson, Vehtari & Gelman 2018,
 drawn from the prior, data simulated from each, and the rank of the truth among {draws} draws of the posterior that
 `fits.fit` and `fits.sample` find. If fit, noise model, priors and sampler are right, ranks are uniform.
 
-Rough interface over haze (albedo 0.95) over a diffuse base (albedo 0.3), all orders of scattering, by
-`{transport}`. In-plane slices at incidence {incidence} degrees, {readings} readings, noise of
-{noise:.0%} of the exact value; the fit is told the level. {errors}
-The data are simulated by the solver that fits them, at its resolution: this judges the inference,
-[error-vs-time](error-vs-time.md) the solver. {starts} starts a fit, {walkers} walkers. Priors:
+{words} {readings} readings in the plane of incidence, noise of {noise:.0%} of the exact value; the fit is
+told the level. {starts} starts a fit, {walkers} walkers. Priors:
 
 {free}
 {rows}
 *chi-square* over {bins} equal bins, *KS* is the test of Kolmogorov and Smirnov; uniform: both p-values above {least:g}.
-*mean* is the mean rank less what it should be, in standard errors.
+*mean* is the mean rank less what it should be, in standard errors. *in 68 %*, *in 90 %*: truths within central
+intervals; {expected} of {repeats} are expected (central 95 % of the binomial distribution).
 
 ![A histogram of ranks for each parameter, with the band that should hold 99 % of the bars]({name}.png)
 
 {chains}"""
-
-ERRORS = """Readings share errors of their logarithm as well, drawn from a
-process whose numbers are drawn from their priors, by dense matrices; the fit finds these numbers. """
 
 
 @dataclass(frozen=True)
@@ -97,74 +85,72 @@ def study(
     report: Callable[[str], None] = lambda line: None,
     directory: Path = DIRECTORY,
     resume: bool = False,
-    transport: lj.Transport = TRANSPORT,
+    posterior: str = "haze",
+    transport: lj.Transport | None = None,
     surrogate: bool = True,
     repeats: int | None = None,
-    errors: bool = False,
 ) -> tuple[str, tuple[Path, ...]]:
     """Run it, and write ``calibration.json``, ``.md`` and ``.png``; returns the markdown and the paths.
 
-    With `errors` the files are ``calibration-errors.json`` and so on.
+    Of other posteriors than "haze" the files are ``calibration-errors.json`` and so on.
 
     Args:
         quick: 20 repeats: a look, no result to quote.
         resume: keep the repeats that the directory holds, and run those that it lacks. Each is written as it ends.
-        transport: carries the light in the data and in the fits.
-        surrogate: of `fits.sample`; left to the clock, a rerun might not be the same.
+        posterior: one of `CASES`.
+        transport: carries the light in the data and in the fits; None: that of the case.
+        surrogate: of `fits.sample`, where light is carried in all orders; left to the clock, a rerun might not be the
+            same.
         repeats: how many there are to be in all; 200 if None.
-        errors: whether readings share errors of the model.
 
     Raises:
         ValueError: repeats to resume that were run with other settings.
     """
+    case = CASES[posterior]
+    case = case if transport is None else replace(case, transport=transport)
     wanted = repeats or (QUICK if quick else REPEATS)
-    settings = settings_of(transport, surrogate, errors)
-    name = f"{NAME}-errors" if errors else NAME
-    done = _held(directory / f"{name}.json", settings) if resume else []
+    surrogate = surrogate and isinstance(case.transport, lj.AddingDoubling)
+    settings = settings_of(case, surrogate)
+    path = directory / f"{case.name}.json"
+    done = _held(path, settings) if resume else []
     surroundings = environment.describe()
-    model = _simulator(transport)
+    model = _simulator(case)
     if len(done) < wanted:
         report(f"{len(done)} of {wanted} repeats are there; the first to come compiles all programs")
     for index in range(len(done), wanted):
-        done.append(run_repeat(index, transport, surrogate, model, errors))
-        _save(done, settings, surroundings, directory, name)
+        done.append(run_repeat(index, case, surrogate, model))
+        _save(done, case, settings, surroundings, directory)
         typical = float(np.median([one.seconds for one in done]))
         report(
             f"repeat {index + 1}/{wanted}: {done[-1].steps} steps, {done[-1].seconds:.1f} s, "
             f"about {typical * (wanted - index - 1) / 60:.0f} min left"
         )
-    text, paths = _save(done, settings, surroundings, directory, name)
-    by_label = {LABELS[one]: _ranks(done, place) for place, one in enumerate(free_of(errors))}
-    write_bytes(directory / f"{name}.png", as_png(picture(by_label)), force=True)
-    return text, (*paths, directory / f"{name}.png")
+    text, paths = _save(done, case, settings, surroundings, directory)
+    by_label = {case.labels[one]: _ranks(done, place) for place, one in enumerate(case.free)}
+    write_bytes(path.with_suffix(".png"), as_png(picture(by_label)), force=True)
+    return text, (*paths, path.with_suffix(".png"))
 
 
-def free_of(errors: bool) -> dict[str, fits.Free]:
-    """What is free, in the order of the problem's parameters."""
-    return FREE | shared.FREE if errors else FREE
-
-
-def run_repeat(
-    index: int, transport: lj.Transport, surrogate: bool, model: Callable[..., Any], errors: bool = False
-) -> Repeat:
+def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any]) -> Repeat:
     """A truth from the prior, its data, fit and posterior, and its ranks; all of them drawn with `index`."""
     began = time.perf_counter()
     generator = np.random.default_rng([2018, index])
-    truth = {name: drawn(free, generator) for name, free in free_of(errors).items()}
-    own = {name: truth[name] for name in FREE}
-    level = NOISE_BESIDE if errors else NOISE
-    data = fits.simulate(
-        coated_haze.stack_of(coated_haze.PARAMETERS | own), coated_haze.readings(), model, level, FLOOR, seed=index
-    )
-    if errors:
+    truth = {name: drawn(free, generator) for name, free in case.free.items()}
+    own = {name: truth[name] for name in case.own}
+    data = fits.simulate(case.stack(own), case.readings, model, case.noise, FLOOR, seed=index)
+    data = replace(data, values=truth.get("scale", 1.0) * data.values)
+    if case.errors:
         data = shared.with_errors(data, truth, generator)
     # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
-    correlated = fits.Correlated(**shared.FREE) if errors else False
-    noise = fits.Noise(relative=level, floor=FLOOR, use_sigma=False, correlated=correlated)
-    stack = coated_haze.stack_of(coated_haze.PARAMETERS | FREE)
-    fit = fits.fit(stack, data, transport=transport, noise=noise, starts=STARTS, seed=index)
-    walkers = max(WALKERS, 2 * len(truth) + 2)
-    posterior = fits.sample(fit, walkers=walkers, seed=index, surrogate=surrogate, max_steps=STEPS, allow_short=True)
+    correlated = fits.Correlated(**shared.FREE) if case.errors else False
+    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, correlated=correlated)
+    scale = case.free["scale"] if case.scale else None
+    fit = fits.fit(
+        case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
+    )
+    posterior = fits.sample(
+        fit, walkers=_walkers(case), seed=index, surrogate=surrogate, max_steps=case.most_steps, allow_short=True
+    )
     draws, apart = spread_draws(posterior)
     return Repeat(
         repeat=index,
@@ -181,47 +167,52 @@ def run_repeat(
     )
 
 
+def _walkers(case: Case) -> int:
+    return max(WALKERS, 2 * len(case.free) + 2)
+
+
 def drawn(free: fits.Free, generator: np.random.Generator) -> float:
     """A draw from the prior within its bounds, without the density that `fits` computes."""
     low, high = float(free.low), float(free.high)  # type: ignore[arg-type]  # numbers here, no channels
     while True:
-        normal = generator.standard_normal()
         prior = free.prior
         if isinstance(prior, fits.Normal):
-            value = prior.mean + prior.sd * normal
+            value = prior.mean + prior.sd * generator.standard_normal()
         elif isinstance(prior, fits.LogNormal):
-            value = prior.median * np.exp(prior.sd * normal)
+            value = prior.median * np.exp(prior.sd * generator.standard_normal())
+        elif isinstance(prior, fits.Uniform):
+            value = generator.uniform(low, high)
         else:
             raise TypeError(f"no draws from {prior}")
         if low <= value <= high:
             return float(value)
 
 
-def settings_of(transport: lj.Transport, surrogate: bool, errors: bool = False) -> dict[str, Any]:
+def settings_of(case: Case, surrogate: bool) -> dict[str, Any]:
     """What has to be the same for repeats to stand in one file, as it stands there."""
-    beside = {"errors": {name: repr(free) for name, free in shared.FREE.items()}} if errors else {}
+    in_degrees = np.degrees(np.arccos(np.unique(case.readings.wi[:, 2].round(9))))
+    free = case.own if case.errors else case.free
     return rounded(
-        beside
+        dict(case.settings)
         | {
-            "transport": repr(transport),
+            "transport": repr(case.transport),
             "surrogate": surrogate,
-            "free": {name: repr(free) for name, free in FREE.items()},
-            "parameters": coated_haze.PARAMETERS,
-            "incidence_degrees": coated_haze.INCIDENCE,
-            "noise": NOISE_BESIDE if errors else NOISE,
+            "free": {name: repr(one) for name, one in free.items()},
+            "incidence_degrees": sorted(in_degrees.round(6).tolist()),
+            "noise": case.noise,
             "floor": FLOOR,
             "starts": STARTS,
             "walkers": WALKERS,
-            "most_steps": STEPS,
+            "most_steps": case.most_steps,
             "draws": DRAWS,
         }
     )
 
 
-def _simulator(transport: lj.Transport) -> Callable[..., Any]:
+def _simulator(case: Case) -> Callable[..., Any]:
     """The transport as the fits use it: one program for all truths, told of the directions and of nothing else."""
-    geometry = coated_haze.readings()
-    known = lj.known_directions(geometry.wi, geometry.wo) if transport.uses_known else None
+    transport = case.transport
+    known = lj.known_directions(case.readings.wi, case.readings.wo) if transport.uses_known else None
     return jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, known=known))
 
 
@@ -236,29 +227,28 @@ def _held(path: Path, settings: Mapping[str, Any]) -> list[Repeat]:
 
 
 def _save(
-    done: list[Repeat], settings: Mapping[str, Any], surroundings: Mapping[str, Any], directory: Path, name: str = NAME
+    done: list[Repeat], case: Case, settings: Mapping[str, Any], surroundings: Mapping[str, Any], directory: Path
 ) -> tuple[str, tuple[Path, Path]]:
     """Write all repeats so far and what they say; returns the markdown and the paths."""
-    free = free_of("errors" in settings)
-    rows = [judged(LABELS[one], _ranks(done, place)) for place, one in enumerate(free)]
+    rows = [judged(case.labels[one], _ranks(done, place)) for place, one in enumerate(case.free)]
     text = TEXT.format(
         environment=environment_lines(surroundings),
         repeats=len(done),
         draws=DRAWS,
-        transport=settings["transport"],
+        words=case.words.format(transport=settings["transport"]),
         free="".join(
-            f"- {LABELS[one]}: {value.prior!r} in [{value.low:g}, {value.high:g}]\n" for one, value in free.items()
+            f"- {case.labels[one]}: {value.prior!r} in [{value.low:g}, {value.high:g}]\n"
+            for one, value in case.free.items()
         ),
-        name=name,
-        errors=ERRORS if "errors" in settings else "",
-        incidence=", ".join(f"{angle:g}" for angle in coated_haze.INCIDENCE),
-        readings=len(coated_haze.readings()),
-        noise=settings["noise"],
+        name=case.name,
+        readings=len(case.readings),
+        noise=case.noise,
         starts=STARTS,
-        walkers=max(WALKERS, 2 * len(free) + 2),
+        walkers=_walkers(case),
         rows=_table(rows),
         bins=rows[0].bins,
         least=LEAST_P,
+        expected=" and ".join("{:.0f} to {:.0f}".format(*expected(len(done), level)) for level in LEVELS),
         chains=_chains(done),
     )
     content = {
@@ -267,7 +257,7 @@ def _save(
         "parameters": [asdict(row) for row in rows],
         "repeats": [asdict(one) for one in done],
     }
-    return text, write(name, content, text, directory)
+    return text, write(case.name, content, text, directory)
 
 
 def _ranks(done: list[Repeat], place: int) -> NDArray[np.int64]:
@@ -275,7 +265,7 @@ def _ranks(done: list[Repeat], place: int) -> NDArray[np.int64]:
 
 
 def _table(rows: list[Row]) -> str:
-    header = ("parameter", "chi-square", "p", "p of KS", "mean", "verdict")
+    header = ("parameter", "chi-square", "p", "p of KS", "mean", "in 68 %", "in 90 %", "verdict")
     body = [
         (
             row.parameter,
@@ -283,6 +273,7 @@ def _table(rows: list[Row]) -> str:
             figure(row.p_chi_square, 2),
             figure(row.p_kolmogorov_smirnov, 2),
             f"{row.mean_off:+.2f}",
+            *map(str, row.within),
             "uniform" if row.uniform else "**not uniform**",
         )
         for row in rows
