@@ -76,7 +76,7 @@ def predict(arguments: Namespace) -> int:
     use_jax()
     from fits.inference.prediction import predict as run_prediction
     from fits.reporting import results, verdicts
-    from fits.reporting.predictions import prediction_csv
+    from fits.reporting.predictions import UNRELIABLE, prediction_csv
 
     directory = Path(arguments.directory)
     posterior = results.load_posterior(directory)
@@ -91,6 +91,8 @@ def predict(arguments: Namespace) -> int:
     if arguments.out is not None:
         write_text(arguments.out, prediction_csv(found), force=arguments.force)
         print(f"{arguments.out}: predictions in 1/sr")
+        if not found.reliable:
+            print(UNRELIABLE)
     return DONE
 
 

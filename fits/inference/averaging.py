@@ -1,6 +1,7 @@
 """Predictions of several stacks as one, each with its weight."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -51,9 +52,9 @@ def average(
         raise ValueError("average: the fits differ in the tails of their noise")
     means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
     values = np.concatenate([part.values for part in parts])
-    return banded(
-        first.wi, first.wo, first.channels, levels, values, means, scales, softness, first.degrees_of_freedom, seed
-    )
+    freedom = first.degrees_of_freedom
+    found = banded(first.wi, first.wo, first.channels, levels, values, means, scales, softness, freedom, seed)
+    return replace(found, shape=float(np.fmax.reduce([part.shape for part in parts])))
 
 
 def _logarithmic(part: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 GOOD, ROUNDS = 0.5, 4
 """The Pareto shape below which the variance of weights is finite, and how many approximations are tried for it."""
 
+UNRELIABLE = 0.7
+"""The Pareto shape above which a part of the posterior may be missing."""
+
 FEWEST = 50
 """Draws that a mixture is fitted to are worth at least so many of the posterior; else weights are made more even."""
 
@@ -31,7 +34,7 @@ Floats = NDArray[np.float64]
 @dataclass(frozen=True, eq=False)
 class Weighted:
     """Draws of an approximation, unconstrained, (D, P), and the logarithms of posterior / approximation there, (D,);
-    shape: of the Pareto tail of the weights: above 0.7 a part of the posterior may be missing."""
+    shape: of the Pareto tail of the weights: above `UNRELIABLE` a part of the posterior may be missing."""
 
     positions: Floats
     log_weights: Floats

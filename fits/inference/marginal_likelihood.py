@@ -10,10 +10,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
-from fits.inference.importance import weighted
+from fits.inference.importance import UNRELIABLE, weighted
 
 DRAWS = 1000
-UNRELIABLE = 0.7
 
 
 @dataclass(frozen=True)

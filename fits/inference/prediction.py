@@ -1,7 +1,7 @@
 """What readings elsewhere will be: the model with its uncertainty, what it lacks, and the noise of a reading."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, Source
 from fits.inference.fit_result import Fit
-from fits.inference.importance import weighted
+from fits.inference.importance import UNRELIABLE, weighted
 from fits.inference.posterior import Posterior
 from fits.problem.logarithm import logarithm, size
 from fits.problem.logarithm import softness as soft
@@ -59,6 +59,8 @@ class Prediction:
         softness: of that, (M, C) or (D, M, C), in 1/sr; else None.
         values: of the stack itself, with each vector, (D, M, C), in 1/sr.
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
+        shape: Pareto shape of the weights by which draws stand for the posterior of a fit (see `evidence`); NaN where
+            they are those of a chain.
     """
 
     wi: Floats
@@ -72,6 +74,12 @@ class Prediction:
     softness: Floats | None
     degrees_of_freedom: float
     values: Floats
+    shape: float = math.nan
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the vectors stand for the whole posterior; else a chain is better asked."""
+        return not self.shape >= UNRELIABLE
 
     def log_density(self, values: Floats) -> Floats:
         """Log-density of readings (M, C), each by itself."""
@@ -131,14 +139,15 @@ def predict(
         raise ValueError(f"draws is {draws}; it must be at least 2")
     generator = np.random.default_rng(seed)
     data = _measurements(fit, at)
-    vectors = _vectors(of, draws, generator)
+    vectors, shape = _vectors(of, draws, generator)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
     sigma = _own_sigma(fit, values, data.sigma)
     means, scales, softness = _readings(fit, vectors, values, data, sigma)
     noise = fit.problem.noise
     freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
-    return banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
+    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
+    return replace(found, shape=shape)
 
 
 def banded(
@@ -239,12 +248,14 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
     return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
 
 
-def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> Floats:
+def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> tuple[Floats, float]:
+    """Draws (D, P) of the posterior, and the shape of their weights."""
     if isinstance(of, Posterior):
-        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws)
+        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))
-    positions = weighted(of, max(LEAST_DRAWS, 2 * draws), random).resampled(random, draws)
-    return np.asarray(jax.vmap(of.problem.model.box.constrain)(jnp.asarray(positions)), float)
+    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random)
+    positions = jnp.asarray(found.resampled(random, draws))
+    return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
 
 
 def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:

@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from fits.data.measurements import Measurements
     from fits.inference.prediction import Prediction, Scores
 
+UNRELIABLE = (
+    "The posterior is unlike what was drawn from, and a part of it may be missing: bands may be too narrow, those of a "
+    "chain are to be preferred (sample)."
+)
+
 
 def prediction_csv(prediction: "Prediction") -> str:
     """A row for each pair of directions and channel: angles in degrees, all else in 1/sr."""
@@ -48,6 +53,8 @@ def scores_table(prediction: "Prediction", readings: "Measurements", title: str)
         "error: of the prediction, |prediction / reading - 1|, its median and 95th percentile; of the stack alone, the "
         "median. Shares of readings inside the bands of 50 and 95 %. Score: mean log-density of a reading."
     )
+    if not prediction.reliable:
+        note = f"{note} {UNRELIABLE}"
     heads = ("incidence", "readings", "error", "95 % below", "stack alone", "in 50 %", "in 95 %", "log score")
     return Table(title, heads, tuple(rows), note)
 

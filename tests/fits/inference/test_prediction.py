@@ -1,5 +1,7 @@
 """Predictions beside what is known of them, and their scores by readings that were not fitted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -14,6 +16,7 @@ from fits.problem.correlated import Correlated
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
+from fits.reporting.predictions import UNRELIABLE, scores_table
 from tests.helpers.models import COUNT, design, line, line_fit
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
@@ -55,7 +58,7 @@ def test_bands_of_a_line_are_those_of_regression() -> None:
     np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
     np.testing.assert_allclose(at.model.mean, found.predicted, atol=0.1 * expected.max())
     wide = at.reading.quantiles[-1] - at.reading.quantiles[0]
-    np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(1.2 * expected, 0.05), rtol=0.08)
+    np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
 
 
 def test_a_posterior_says_the_same() -> None:
@@ -64,6 +67,17 @@ def test_a_posterior_says_the_same() -> None:
     at, by_fit = (predict(of, found.problem.data, draws=1000) for of in (posterior, found))
     np.testing.assert_allclose(at.reading.sd, by_fit.reading.sd, rtol=0.08)
     np.testing.assert_allclose(at.model.mean, by_fit.model.mean, atol=0.2 * by_fit.model.sd.max())
+    assert at.reliable
+    assert by_fit.reliable
+
+
+def test_draws_that_may_miss_a_part_are_said_to() -> None:
+    found = line_fit()
+    at = predict(found, found.problem.data)
+    assert UNRELIABLE not in scores_table(at, found.problem.data, "").note
+    lost = replace(at, shape=0.8)
+    assert not lost.reliable
+    assert UNRELIABLE in scores_table(lost, found.problem.data, "").note
 
 
 def test_wrong_models_need_shared_errors() -> None:
