@@ -19,7 +19,7 @@ from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import at_start, resolutions
 from fits.inference.shared_errors import alone, are_shared, left_open, points
-from fits.inference.starts import MOST_STEPS, End, Solver, rough_end, run_starts, start_points, unit_of
+from fits.inference.starts import MOST_STEPS, End, Solver, race, rough_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.compiled import cores, in_shares
 from fits.problem.likelihood import Noise, Objective
@@ -100,7 +100,8 @@ def fit_problem(
     Args:
         problem: what is fitted to what.
         starts, seed, solver, progress, checkpoint: see `fit`.
-        refine: False: stay at the resolution of the starts, do not ask for its error, and find the minimum roughly.
+        refine: False: stay at the resolution of the starts, do not ask for its error, follow only those that are
+            lowest after a few steps, and find the minimum roughly.
 
     Raises:
         ValueError: starts < 1; an unknown solver.
@@ -175,7 +176,10 @@ def _found(
     known = resolutions(problem)
     if known is not None and known.open:
         problem = replace(problem, transport=known.far)
-    ends = _ends(problem, places, solver, progress, checkpoint)
+    if refine or solver != "least_squares":
+        ends = _ends(problem, places, solver, progress, checkpoint)
+    else:
+        ends = race(problem, places)
     best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
     if known is not None and refine:
         best, accuracy = refined(best, known, solver, progress)

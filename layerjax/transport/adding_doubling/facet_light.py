@@ -23,7 +23,7 @@ from layerjax.transport.adding_doubling.grid import Grid, Region
 ENERGY_POINTS = (12, 8)
 """Points a panel, and in azimuth, of the quadrature of energies."""
 
-LEAST_FACETS = 24
+LEAST_FACETS = 16
 """Points of the dense quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
 
 

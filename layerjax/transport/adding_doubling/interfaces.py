@@ -45,7 +45,7 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
-BLUR = 0.25
+BLUR = 0.35
 """Of alpha / (1 + 2 alpha), half the width in s^2 over which rays move from one panel to another: as far apart as they
 are next to each other, or a few times that."""
 
