@@ -176,10 +176,8 @@ def _found(
     known = resolutions(problem)
     if known is not None and known.open:
         problem = replace(problem, transport=known.far)
-    if refine or solver != "least_squares":
-        ends = _ends(problem, places, solver, progress, checkpoint)
-    else:
-        ends = race(problem, places)
+    racing = not refine and solver == "least_squares"
+    ends = race(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
     best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
     if known is not None and refine:
         best, accuracy = refined(best, known, solver, progress)
