@@ -19,11 +19,11 @@ from fits.inference.laplace import Approximation
 if TYPE_CHECKING:
     from fits.inference.mixture import Mixture
 
-GOOD, ROUNDS = 0.5, 4
+FINITE, ROUNDS = 0.5, 4
 """The Pareto shape below which the variance of weights is finite, and how many approximations are tried for it."""
 
 UNRELIABLE = 0.7
-"""The Pareto shape above which a part of the posterior may be missing."""
+"""The Pareto shape above which a part of the posterior may be missing. Below it draws by weight are good enough."""
 
 FEWEST = 50
 """Draws that a mixture is fitted to are worth at least so many of the posterior; else weights are made more even."""
@@ -45,9 +45,12 @@ class Weighted:
         return self.positions[_chosen(self.log_weights, generator, count)]
 
 
-def weighted(fit: Fit, draws: int, generator: np.random.RandomState, *, along_ridge: bool = False) -> Weighted:
+def weighted(
+    fit: Fit, draws: int, generator: np.random.RandomState, *, good: float = FINITE, along_ridge: bool = False
+) -> Weighted:
     """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS`.
 
+    good: the shape that is enough.
     along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians.
     """
     from fits.inference.mixture import Mixture
@@ -59,7 +62,7 @@ def weighted(fit: Fit, draws: int, generator: np.random.RandomState, *, along_ri
         found = _drawn(fit, approximation, draws, generator)
         if best is None or found.shape < best.shape:
             best = found
-        if best.shape < GOOD or not np.isfinite(found.shape):
+        if best.shape < good or not np.isfinite(found.shape):
             break
         chosen = _chosen(_evened(found.log_weights), generator, draws)
         approximation = Mixture.through(found.positions[chosen], generator)

@@ -253,7 +253,7 @@ def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) ->
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))
-    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random)
+    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE)
     positions = jnp.asarray(found.resampled(random, draws))
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
 
