@@ -20,7 +20,7 @@ from fits.progress import Progress
 MOST_STEPS = 200
 MOST_ROUNDS = 20
 EARLY, FRONT = 20, 3
-"""Steps after which the starts of a race are looked at, and how many of them go on."""
+"""Steps, with sigma held and with it free, after which starts of a race are looked at, and how many of them go on."""
 WORTH = 1e-3
 """A start that ran out of steps goes on while a round of them gains this in the log-posterior."""
 STEP_WORTH = 1e-5

@@ -1,5 +1,7 @@
 """The lowest end of all starts is the fit, however many steps it took; no stack ends above what it contains."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from fits.inference import starts as starts_module
 from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import ENDED
 from fits.inference.optimise import fit
-from fits.inference.starts import WORTH
+from fits.inference.starts import WORTH, run_starts
 from fits.problem.problem import Problem
 from fits.problem.stack_file import read_problem
 from tests.helpers.models import LOBE, LOBE_STACK, directions, lobe, measured, noisy_lobe
@@ -69,6 +71,22 @@ def test_a_stack_never_ends_above_what_it_contains(pair, name, degrees, count):
         values = {parameter.replace(old, new): value for parameter, value in values.items()}
     # to what a start that goes on is worth
     assert whole.minima[0].cost <= cost_at(whole.problem, values) + WORTH
+
+
+@pytest.mark.parametrize("name", [STEEL, "aeroglaze_650nm_inplane.csv"])
+def test_a_race_ends_where_all_starts_do(name, monkeypatch):
+    """Of stacks with several minima; few steps tell which starts go on, and the others are not followed."""
+    given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
+    data = read_incidences(name, (10.0, 50.0))
+    problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, correlated=False), given.scale)
+    points = starts_module.start_points(problem, 8, 0)
+    monkeypatch.setattr(starts_module, "EARLY", 10)
+    ends, every = starts_module.race(problem, points), run_starts(problem, points, "least_squares", lambda *told: None)
+    assert min(end.cost for end in ends) <= min(end.cost for end in every) + WORTH
+    left = [end for end in ends if end.unfinished]
+    assert 1 <= len(left) <= len(points) - starts_module.FRONT
+    assert {end.steps for end in left} == {20}  # with sigma held, and free
+    assert sum(end.steps for end in ends) < sum(end.steps for end in every)
 
 
 def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
