@@ -32,16 +32,16 @@ class Foresight:
     """What one of several stacks is worth to who wants to know what was not measured.
 
     score: sum of log-densities of readings, each foretold by a fit without its incidence. behind: how far that falls
-    behind the best, and its standard error by the incidences. at_least: the same a reading, of the incidence where it
-    falls behind least. weight: of its predictions in the mixture that foretells
-    best (stacking, Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`. probability:
-    of this stack among those that are compared, all as probable beforehand.
+    behind the best, and its standard error by the incidences. least_behind: the same a reading, of the incidence where
+    that is least. weight: of its predictions in the mixture that foretells best (stacking, Yao, Vehtari, Simpson &
+    Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`. probability: of this stack among those that are
+    compared, all as probable beforehand.
     """
 
     score: float
     behind: float
     behind_error: float
-    at_least: float
+    least_behind: float
     weight: float
     evidence: Evidence
     probability: float
@@ -49,7 +49,7 @@ class Foresight:
     @property
     def surely_behind(self) -> float:
         """How far the score falls behind the best beyond chance; below 0 the data do not tell the two apart."""
-        return self.behind if self.at_least > EVERYWHERE else self.behind - BY_CHANCE * self.behind_error
+        return self.behind if self.least_behind > EVERYWHERE else self.behind - BY_CHANCE * self.behind_error
 
 
 def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
@@ -72,7 +72,7 @@ def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> 
             score=float(scores[index]),
             behind=float(gaps.sum()),
             behind_error=float(np.sqrt(gaps.size) * gaps.std(ddof=1)),
-            at_least=float(np.min(gaps / best.sizes)),
+            least_behind=float(np.min(gaps / best.sizes)),
             weight=float(weights[index]),
             evidence=evidences[name],
             probability=float(probabilities[index]),

@@ -195,4 +195,4 @@ def test_what_is_worse_everywhere_is_told_apart(gaps: tuple[float, ...], told: b
     known = Evidence(0.0, 0.1, 0.1)
     seen = together({"best": best, "other": other}, {"best": known, "other": known})["other"]
     assert (seen.surely_behind > 0.0) == told
-    assert seen.at_least == pytest.approx(min(gaps) / 10.0)
+    assert seen.least_behind == pytest.approx(min(gaps) / 10.0)
