@@ -42,8 +42,8 @@ of the model that they do (`Noise(correlated=True)`). {starts} starts a fit.
 {rows}
 *in 95 %*: share of the unseen readings inside the band of 95 %, at {asked} degrees; *error*: median of |prediction /
 reading - 1|, of all of them; *score*: mean log-density of a reading. *chi2*: per degree of freedom, of the fit.
-*size*: standard deviation of the errors that readings share, and how far they reach in the angles of half vector and
-difference.
+*size*: standard deviation of the errors that readings share, with light and viewer along the normal and at 60 degrees,
+and how far they reach in the angles of half vector and difference.
 
 {verdict}"""
 
@@ -66,6 +66,7 @@ class Row:
     difference: float | None
     at_bound: list[str]
     seconds: float
+    growth: float | None = None
 
     @property
     def holds(self) -> bool:
@@ -132,6 +133,7 @@ def run_row(stack: str, coating: str, shared: bool, starts: int = STARTS) -> Row
         difference=None if at is None else float(at.difference),
         at_bound=list(fit.at_bound),
         seconds=time.perf_counter() - began,
+        growth=None if at is None else float(at.growth),
     )
 
 
@@ -167,7 +169,8 @@ def _table(rows: list[Row]) -> str:
         last = pair[1]
         size = "-"
         if last is not None and last.amplitude is not None:
-            size = f"{100.0 * last.amplitude:.0f} %; {last.half:.0f}°, {last.difference:.0f}°"
+            ends = (last.amplitude, last.amplitude * 2.0 ** (last.growth or 0.0))
+            size = f"{' to '.join(f'{100.0 * end:.0f}' for end in ends)} %; {last.half:.0f}°, {last.difference:.0f}°"
         lines.append((f"`{stack}`", coating, *(cell for both in zip(*cells, strict=True) for cell in both), size))
     heads = [
         f"{what}{kind}" for what in ("chi2", "in 95 %", "error", "score") for kind in (", noise alone", ", shared")

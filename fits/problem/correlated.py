@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from fits.problem.parameters import Free, LogNormal
+from fits.problem.parameters import Free, LogNormal, Normal
 from fits.problem.process import Correlation, Process
 from fits.problem.values import shown
 
@@ -14,26 +14,29 @@ LONGEST = 40.0
 take the place of the stack's level."""
 
 ANGLES = (0.1, 360.0)
-AMPLITUDES = (1e-6, 1.0)
+RANGES = {"amplitude": (1e-6, 1.0), "growth": (0.0, 2.0), "channels": (0.0, 1.0)}
 
 
 @dataclass(frozen=True)
 class Correlated:
     """Errors of the model that neighbouring readings share, of its logarithm.
 
-    amplitude: their standard deviation, unitless, in [1e-6, 1]. half, difference: how far they reach, in degrees in
-    [0.1, 360], in the angle of the half vector to the normal, and in that of light and viewer to the half vector.
-    channels: correlation of two channels, in [0, 1]. Each a number, `Free`, or None for a free one with a wide prior.
+    amplitude: their standard deviation where light and viewer are along the normal, unitless, in [1e-6, 1]. half,
+    difference: how far they reach, in degrees in [0.1, 360], in the angle of the half vector to the normal, and in that
+    of light and viewer to the half vector. growth: the standard deviation is that of the normal times (2 / (cos i + cos
+    o)) to this power, in [0, 2]. channels: correlation of two channels, in [0, 1]. Each a number, `Free`, or None for a
+    free one with a wide prior.
     """
 
     amplitude: float | Free | None = None
     half: float | Free | None = None
     difference: float | Free | None = None
+    growth: float | Free | None = None
     channels: float | Free | None = None
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            low, high = {"amplitude": AMPLITUDES, "channels": (0.0, 1.0)}.get(entry.name, ANGLES)
+            low, high = RANGES.get(entry.name, ANGLES)
             value = getattr(self, entry.name)
             if isinstance(value, Free):
                 if value.shape != ():
@@ -60,6 +63,7 @@ def numbers_of(given: Correlated, process: Process, channels: int) -> Correlatio
         amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 1.0)) if given.amplitude is None else given.amplitude,
         half=half if given.half is None else given.half,
         difference=difference if given.difference is None else given.difference,
+        growth=Free(0.5, *RANGES["growth"], Normal(0.5, 0.5)) if given.growth is None else given.growth,
         channels=own,
     )
 

@@ -293,6 +293,6 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 def _unit(name: str) -> str:
     if name == "noise.floor":
         return "1/sr"
-    if name.startswith("noise.correlated.") and not name.endswith((".amplitude", ".channels")):
+    if name.startswith("noise.correlated.") and not name.endswith((".amplitude", ".growth", ".channels")):
         return "deg"
     return "optical depth" if re.sub(r"\[\d+\]$", "", name).endswith("thickness") else "1"

@@ -3,9 +3,10 @@
 With model value f, datum d and noise n, g(d) = g(f) + e + n, where g is the logarithm and, below four standard
 deviations of the noise, a straight line (`logarithm`). e has Matern kernels of the angles of half vector and difference
 (Rusinkiewicz 1998), folded so that light and viewer may change places: errors follow a lobe from one incidence to the
-next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Channels have one correlation. The process lives on
-nodes that are the product of two grids, a cubic between them, and costs a matrix of as many rows. Noise is that of the
-datum, so that the covariance does not depend on the model, and most of its derivatives vanish.
+next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Their standard deviation grows towards grazing, by
+a power of the mean cosine of light and viewer, cos half cos difference. Channels have one correlation. The process
+lives on nodes that are the product of two grids, a cubic between them, and costs a matrix of as many rows. Noise is
+that of the datum, so that the covariance does not depend on the model, and most of its derivatives vanish.
 
 The negative log-density of all readings is half a sum of squares again, up to a constant: with A from white numbers c
 to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
@@ -33,12 +34,17 @@ LEAST = 1e-6
 """Of the information about a number of the process: what is kept of its smallest eigenvalue."""
 
 
+GRAZING = 85.0
+"""Degrees from which errors grow no more."""
+
+
 class Correlation(NamedTuple):
     """The numbers of a process, as `fits.problem.correlated.Correlated` says of them."""
 
     amplitude: Any
     half: Any
     difference: Any
+    growth: Any
     channels: Any
 
 
@@ -113,14 +119,15 @@ class Process(eqx.Module):
     def elsewhere(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
         """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
         roots, root = self._factors(relative, at)
-        half = _half_kernel(self.half, at_places[:, 0], at.half)
-        difference = _difference_kernel(self.difference, at_places[:, 1:], at.difference)
+        half = _half_kernel(self.half, at_places[:, 0], at)
+        difference = _difference_kernel(self.difference, at_places[:, 1:], at)
         parts = (solve_triangular(a, b, lower=True) for a, b in ((roots.half, half), (roots.difference, difference)))
         rows = at.amplitude * jnp.einsum("cx,im,jm->mcxij", roots.channels, *parts)
         rows = rows.reshape(*rows.shape[:2], -1)
         solved = solve_triangular(root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
         told = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
-        return -rows @ found.latent, jnp.sqrt(jnp.maximum(at.amplitude**2 - told, 0.0))
+        size = at.amplitude * _sizes(at_places[:, 0], at.growth) * _sizes(_apart(at_places[:, 1:]), at.growth)
+        return -rows @ found.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - told, 0.0))
 
     def information_rows(self, relative: Array, at: Correlation) -> Array:
         """Rows whose Jacobian A has in A'A the Fisher information of the readings about the numbers of the process.
@@ -130,7 +137,7 @@ class Process(eqx.Module):
         count, nodes = relative.shape[-1], (self.half, self.difference)
         numbers = _numbers(at, count)
         held = jax.lax.stop_gradient(numbers)
-        roots, root = self._factors(relative, Correlation(*held, *[0.0] * (4 - len(held))))
+        roots, root = self._factors(relative, _as_correlation(held))
         inverse = _inverse(root)
         sizes = tuple(len(one) for one in roots)
         seen = (jnp.eye(len(root)) - inverse.T @ inverse).reshape(len(root), *sizes)
@@ -138,10 +145,9 @@ class Process(eqx.Module):
         tops = [_inverse(one) for one in roots]
         inner = [jnp.einsum("ij,jkn,lk->nil", top, one, top) for top, one in zip(tops, moved, strict=True)]
         parts = [2.0 / jnp.where(held[0] > 0.0, held[0], 1.0) * seen]
-        parts.append(jnp.einsum("rchd,hg->rcgd", seen, inner[1][1]))
-        parts.append(jnp.einsum("rchd,df->rchf", seen, inner[2][2]))
-        if count > 1:
-            parts.append(jnp.einsum("rchd,cx->rxhd", seen, inner[0][3]))
+        for by_channel, by_half, by_difference in zip(*(one[1:] for one in inner), strict=True):
+            along = jnp.einsum("rchd,hg->rcgd", seen, by_half) + jnp.einsum("rchd,df->rchf", seen, by_difference)
+            parts.append(along + jnp.einsum("rchd,cx->rxhd", seen, by_channel))
         flat = jnp.stack([part.reshape(root.shape) for part in parts])
         information = 0.5 * jnp.einsum("kij,lji->kl", flat, flat)
         scale = 1.0 / jnp.sqrt(jnp.maximum(jnp.diagonal(information), LEAST))
@@ -173,27 +179,43 @@ def matern(distance: Any, length: Any) -> Array:
     return (1.0 + x + x**2 / 3.0) * jnp.exp(-x)
 
 
-def _half_kernel(one: Array, other: Array, length: Any) -> Array:
-    return matern(jnp.abs(one[:, None] - other), length)
+def _half_kernel(one: Array, other: Array, at: Correlation) -> Array:
+    sizes = _sizes(one, at.growth)[:, None] * _sizes(other, at.growth)
+    return sizes * matern(jnp.abs(one[:, None] - other), at.half)
 
 
-def _difference_kernel(one: Array, other: Array, length: Any) -> Array:
+def _difference_kernel(one: Array, other: Array, at: Correlation) -> Array:
     """Between (D, 3) and (M, 3): angles, and sides that have nothing in common."""
     gaps = [one[:, None, k] - other[None, :, k] for k in range(3)]
-    return jnp.where(gaps[2] == 0.0, matern(jnp.hypot(gaps[0], gaps[1]), length), 0.0)
+    sizes = _sizes(_apart(one), at.growth)[:, None] * _sizes(_apart(other), at.growth)
+    return jnp.where(gaps[2] == 0.0, sizes * matern(jnp.hypot(gaps[0], gaps[1]), at.difference), 0.0)
+
+
+def _sizes(angle: Array, growth: Any) -> Array:
+    """By what errors are larger at this angle, in degrees, than at 0."""
+    return jnp.cos(jnp.radians(jnp.minimum(jnp.abs(angle), GRAZING))) ** -growth
+
+
+def _apart(difference: Array) -> Array:
+    """The angle (D,) of a difference (D, 3)."""
+    return jnp.hypot(difference[:, 0], difference[:, 1])
 
 
 def _numbers(at: Correlation, channels: int) -> Array:
-    """Those of a process that matter, (3,) or (4,)."""
-    return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:3])])
+    """Those of a process that matter, (4,) or (5,)."""
+    return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
+
+
+def _as_correlation(numbers: Array) -> Correlation:
+    return Correlation(*numbers, *[0.0] * (5 - len(numbers)))
 
 
 def _kernels(numbers: Array, nodes: tuple[Array, Array], channels: int) -> tuple[Array, Array, Array]:
     """Covariances, but for the amplitude: see `Roots`."""
-    between = numbers[3] + (1.0 - numbers[3]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
-    half, difference = nodes
-    plain = (between, _half_kernel(half, half, numbers[1]), _difference_kernel(difference, difference, numbers[2]))
-    first, second, third = (one + JITTER * jnp.eye(len(one)) for one in plain)
+    at, (half, difference) = _as_correlation(numbers), nodes
+    between = at.channels + (1.0 - at.channels) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
+    plain = (between, _half_kernel(half, half, at), _difference_kernel(difference, difference, at))
+    first, second, third = (one + JITTER * jnp.diag(jnp.diagonal(one)) for one in plain)
     return first, second, third
 
 

@@ -1,10 +1,14 @@
-"""What results of layerjax 0.1.0 mean, where what they say means something else by now."""
+"""What earlier results mean, where what they say means something else by now."""
 
+from collections.abc import Collection
 from dataclasses import replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import layerjax as lj
 from layerjax.stack import is_known, media_of, with_known
+
+if TYPE_CHECKING:
+    from fits.problem.likelihood import Noise
 
 DEFAULTS = {"nodes": 32, "modes": 48, "ordinates": (10, 24)}
 """The resolution of an `AddingDoubling` that was given none."""
@@ -17,6 +21,16 @@ def transport_meant(stack: lj.Stack, given: lj.Transport | Literal["auto"]) -> l
         return transport
     left_open: dict[str, Any] = {name: value for name, value in DEFAULTS.items() if getattr(transport, name) is None}
     return replace(transport, **left_open)
+
+
+def noise_meant(given: "Noise", names: Collection[str]) -> "Noise":
+    """The noise of a result with these parameters: errors that readings share once did not grow towards grazing."""
+    from fits.problem.correlated import Correlated
+
+    shared = given.correlated
+    if not isinstance(shared, Correlated) or shared.growth is not None or "noise.correlated.growth" in names:
+        return given
+    return replace(given, correlated=replace(shared, growth=0.0))
 
 
 def _automatic(stack: lj.Stack) -> lj.Transport:

@@ -28,7 +28,7 @@ def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurem
     """What was fitted to what: the stack file, with what the fit chose beside it."""
     from fits.problem.problem import Problem
     from fits.problem.stack_file import transport_from_dict
-    from fits.reporting.earlier import transport_meant
+    from fits.reporting.earlier import noise_meant, transport_meant
 
     source = content["source"] | {"notes": tuple(content["source"]["notes"])}
     if "transport" in content:  # with the resolution that the fit chose
@@ -36,6 +36,7 @@ def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurem
     else:
         transport = transport_meant(given.stack, given.transport)
     noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
+    noise = noise_meant(noise, [entry["name"] for entry in content["parameters"]])
     scale = given.scale if given.scale is not None else content["fixed_scale"]
     return Problem(given.stack, replace(data, source=Source(**source)), transport, noise, scale, given.objective)
 

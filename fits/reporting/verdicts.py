@@ -133,8 +133,10 @@ def shared_errors(fit: "Fit") -> list[str]:
     scatter = float(np.sum(np.square(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted))))
     share = 1.0 - float(np.sum(fit.residuals**2)) / scatter if scatter > 0.0 else 0.0
     reach = f"{float(at.half):.2g} degrees of the half vector and {float(at.difference):.2g} of the difference"
+    along = 100.0 * float(at.amplitude)
+    grazing = f" along the normal and {along * 2.0 ** float(at.growth):.2g} % at 60 degrees" if at.growth > 0.0 else ""
     return [
-        f"Neighbouring readings share errors of the model of {100.0 * float(at.amplitude):.2g} % of its value, alike "
+        f"Neighbouring readings share errors of the model of {along:.2g} % of its value{grazing}, alike "
         f"over {reach}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
         "bands of predictions, count them.",
         *_without_them(fit),

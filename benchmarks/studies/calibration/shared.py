@@ -12,10 +12,11 @@ FREE = {
     "amplitude": fits.Free(0.05, 0.01, 0.3, fits.LogNormal(0.05, 0.5)),
     "half": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
     "difference": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
+    "growth": fits.Free(0.5, 0.0, 1.0),
 }
 """Of `fits.Correlated`, within what its nodes resolve."""
 
-LABELS = {"amplitude": "amplitude", "half": "reach, half vector", "difference": "reach, difference"}
+LABELS = {"amplitude": "amplitude", "half": "reach, half vector", "difference": "reach, difference", "growth": "growth"}
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +28,8 @@ def with_errors(data: Measurements, numbers: dict[str, float], generator: np.ran
     tilt, apart = (np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) for cosine in (half[:, 2], _dot(half, data.wi)))
     covariance = _matern(tilt, numbers["half"]) * _matern(apart, numbers["difference"])
     root = np.linalg.cholesky(covariance + 1e-10 * np.eye(len(tilt)))
-    errors = numbers["amplitude"] * root @ generator.standard_normal(len(tilt))
+    sizes = numbers["amplitude"] * (0.5 * (data.wi[:, 2] + data.wo[:, 2])) ** -numbers["growth"]
+    errors = sizes * (root @ generator.standard_normal(len(tilt)))
     return replace(data, values=data.values * np.exp(errors)[:, None])
 
 

@@ -70,7 +70,7 @@ def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
     # the grid of nodes follows from the directions: of both it has to be the same for the same numbers
     np.testing.assert_allclose(whole.model.process.steps, fewer.model.process.steps)
     left = without(whole, rows)
-    moved = whole.start * np.array([1.1, 0.7, 1.5, 0.8, 1.2])
+    moved = whole.start * np.array([1.1, 0.7, 1.5, 0.8, 1.2, 0.6])
     gaps = [float(of.log_likelihood(moved) - of.log_likelihood(of.start)) for of in (left, fewer)]
     assert gaps[0] == pytest.approx(gaps[1], abs=1e-3)
 

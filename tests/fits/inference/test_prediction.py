@@ -29,7 +29,7 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     generator = np.random.default_rng(seed)
     count = len(GEOMETRY)
     empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
-    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 12.0, 12.0))
+    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 12.0, 12.0, 0.0))
     model = Problem(STACK, empty, line, noise).model
     exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
     process, at = model.process, model.build(np.array([1.0, 0.5])).correlation

@@ -79,7 +79,14 @@ def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
     tilt = matern(np.abs(one[:, None, 0] - other[None, :, 0]), float(at.half))
     apart = np.linalg.norm(one[:, None, 1:3] - other[None, :, 1:3], axis=-1)
     alike = tilt * matern(apart, float(at.difference)) * (one[:, None, 3] == other[None, :, 3])
-    return float(at.amplitude) ** 2 * alike
+    return float(at.amplitude) ** 2 * alike * np.outer(larger(one, at), larger(other, at))
+
+
+def larger(where: np.ndarray, at: Correlation) -> np.ndarray:
+    """Than along the normal, by the angles of half vector and difference, neither above 85 degrees."""
+    angles = np.abs(where[:, 0]), np.linalg.norm(where[:, 1:3], axis=-1)
+    cosines = np.prod([np.cos(np.radians(np.minimum(angle, 85.0))) for angle in angles], axis=0)
+    return (1.0 / cosines) ** float(at.growth)
 
 
 def soft(of: Problem) -> np.ndarray:
@@ -154,6 +161,13 @@ def test_places_are_the_half_vector_and_difference() -> None:
         np.testing.assert_allclose(np.hypot(*found[upright, 1:3].T), np.hypot(*expected[upright, 1:3].T), atol=1e-6)
 
 
+def test_errors_grow_by_the_mean_cosine() -> None:
+    at = Correlation(0.1, 20.0, 20.0, 0.7, 0.0)
+    for geometry in (LAYOUTS["two incidences"], LAYOUTS["two planes"]):
+        mean_cosine = 0.5 * (geometry.wi[:, 2] + geometry.wo[:, 2])
+        np.testing.assert_allclose(larger(places(geometry.wi, geometry.wo), at), mean_cosine**-0.7, rtol=1e-9)
+
+
 def test_light_and_viewer_may_change_places() -> None:
     generator = np.random.default_rng(3)
     wi, wo = (w / np.linalg.norm(w, axis=-1, keepdims=True) for w in generator.standard_normal((2, 200, 3)))
@@ -190,7 +204,7 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
     across = kernel(folded(new), grid, at) @ weights.T
     solved = np.linalg.solve(covariance, across.T).T
     expected = solved @ (logarithms(of)[0] - mean)
-    variance = 0.2**2 - np.sum(solved * across, axis=-1)
+    variance = (0.2 * larger(folded(new), at)) ** 2 - np.sum(solved * across, axis=-1)
     found, sd = of.call(Model.lack_at, of.start, places(new.wi, new.wo))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-5)
     np.testing.assert_allclose(np.ravel(sd), np.sqrt(variance), atol=1e-4)
@@ -282,10 +296,10 @@ def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
 
 
 def test_what_is_given_is_no_parameter() -> None:
-    every = tuple(f"noise.correlated.{name}" for name in ("amplitude", "half", "difference", "channels"))
-    assert problem("one scan").names == ("['a']", *every[:3])
+    every = tuple(f"noise.correlated.{name}" for name in ("amplitude", "half", "difference", "growth", "channels"))
+    assert problem("one scan").names == ("['a']", *every[:4])
     assert problem("two planes", 3).names[1:] == every
-    fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0))
+    fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0), growth=0.0)
     assert fixed.names == ("['a']", "noise.correlated.difference")
     assert fixed.units["noise.correlated.difference"] == "deg"
 

@@ -1,4 +1,4 @@
-"""Results of layerjax 0.1.0 keep the transport that they were made with."""
+"""Earlier results keep the transport and the noise that they were made with."""
 
 import json
 from pathlib import Path
@@ -7,6 +7,9 @@ import pytest
 
 import layerjax as lj
 from fits.inference.fit_result import Fit
+from fits.inference.optimise import fit
+from fits.problem.correlated import Correlated
+from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting.earlier import transport_meant
 from fits.reporting.results import load_fit, save_fit
@@ -43,3 +46,19 @@ def test_such_a_result_is_read_so(coat_fit: Fit, tmp_path: Path) -> None:
     assert loaded.problem.transport == lj.SingleScattering()
     assert loaded.numerical_error is None
     assert loaded.chi_square == pytest.approx(coat_fit.chi_square, rel=1e-9)
+
+
+def test_shared_errors_did_not_grow_towards_grazing(coat_fit: Fit, tmp_path: Path) -> None:
+    given = coat_fit.problem
+    noise = Noise(correlated=Correlated(amplitude=0.05, half=20.0, difference=20.0, growth=0.0))
+    save_fit(fit(given.stack, given.data, transport=given.transport, noise=noise, starts=1), tmp_path / "result")
+    problem, path = tmp_path / "result" / "problem.toml", tmp_path / "result" / "fit.json"
+    assert problem.read_text().count("growth = 0.0\n") == 1
+    problem.write_text(problem.read_text().replace("growth = 0.0\n", ""))
+    content = json.loads(path.read_text())
+    del content["checksum"], content["checksums"]  # of what they were
+    path.write_text(json.dumps(content))
+    loaded = load_fit(tmp_path / "result")
+    assert loaded.problem.names == tuple(entry["name"] for entry in content["parameters"])
+    assert loaded.problem.noise == noise
+    assert loaded.chi_square == pytest.approx(content["derived"]["chi_square"], rel=1e-9)
