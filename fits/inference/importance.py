@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
+from fits.problem.compiled import in_shares
 
 if TYPE_CHECKING:
     from fits.inference.mixture import Mixture
@@ -27,6 +28,9 @@ UNRELIABLE = 0.7
 
 FEWEST = 50
 """Draws that a mixture is fitted to are worth at least so many of the posterior; else weights are made more even."""
+
+SHARE = 50
+"""Draws that a core evaluates at a time: however many there are, one program serves."""
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +85,7 @@ def _drawn(
         positions, inside = approximation.draw(generator, draws), np.ones(draws, bool)
     else:
         positions, inside = approximation.draw_all(generator, draws)
-    heights = np.asarray(fit.problem.call(log_posteriors, positions), float)
+    (heights,) = in_shares(lambda part: [fit.problem.call(log_posteriors, part)], positions, SHARE)
     weights = heights - approximation.log_density(positions)
     weights = np.where(inside & np.isfinite(weights), weights, -np.inf)
     if not np.isfinite(weights).any():

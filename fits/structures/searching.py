@@ -132,9 +132,7 @@ def _searched(run: "_Fitting", looked: "_Looked", layers: int, progress: Progres
         before, lowest = looked.best(), looked.lowest()
         _screen(level, run, looked, progress)
         closer = sorted(level, key=looked.bic)[:CLOSER]
-        for number, structure in enumerate(closer):
-            _report(progress, "closer look", number, len(closer), structure)
-            looked.look(structure, run)
+        _look_closer(closer, run, looked, progress)
         if before is not None and not looked.ahead(before) and not looked.lowest() < lowest - STRONG:
             break
         level = _next(looked, library, layers)
@@ -182,6 +180,15 @@ def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: 
             looked.plain[structure] = found
             _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
     looked.clear(len(level))
+
+
+def _look_closer(closer: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
+    """At some structures of a level at a time, as they are screened."""
+    _report(progress, "closer look", 0, len(closer), closer[0])
+    with ThreadPoolExecutor(cores()) as pool:
+        looks = pool.map(lambda structure: looked.look(structure, run), closer)
+        for done, (structure, _) in enumerate(zip(closer, looks, strict=True), 1):
+            _report(progress, "closer look", done, len(closer), structure)
 
 
 def _next(looked: "_Looked", library: Library, layers: int) -> list[Structure]:
