@@ -16,15 +16,42 @@ LIGHT_AZIMUTH = 180.0  # degrees; the plane of incidence is x-z and the mirror d
 TANGENT_COSINE = 1e-9  # a direction with a smaller |cos theta| counts as lying in the surface
 
 
-@dataclass(frozen=True, eq=False)
-class Geometry:
-    """Pairs of directions to measure at: `wi` and `wo`, (N, 3) float64 unit vectors pointing away from the surface."""
+class Pairs:
+    """N pairs of directions: unit vectors `wi` and `wo`, (N, 3), towards the light and towards the viewer."""
 
     wi: Floats
     wo: Floats
 
     def __len__(self) -> int:
         return len(self.wi)
+
+    @property
+    def theta_i(self) -> Floats:
+        """Polar angle of the light, (N,), degrees in [0, 180]."""
+        return polar(self.wi)
+
+    @property
+    def phi_i(self) -> Floats:
+        """Azimuth of the light, (N,), degrees in [0, 360)."""
+        return azimuth(self.wi)
+
+    @property
+    def theta_o(self) -> Floats:
+        """Polar angle of the viewer, (N,), degrees in [0, 180]; above 90 is transmission for light from above."""
+        return polar(self.wo)
+
+    @property
+    def phi_o(self) -> Floats:
+        """Azimuth of the viewer, (N,), degrees in [0, 360)."""
+        return azimuth(self.wo)
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry(Pairs):
+    """Pairs of directions to measure at: `wi` and `wo`, (N, 3) float64 unit vectors pointing away from the surface."""
+
+    wi: Floats
+    wo: Floats
 
 
 def direction(theta: ArrayLike, phi: ArrayLike) -> Floats:

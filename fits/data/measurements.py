@@ -10,7 +10,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fits.data.geometry import TANGENT_COSINE, Floats, azimuth, polar
+from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
+from fits.data.selection import Angles, rows_of
 
 Quantity = Literal["brdf", "brdf_cos", "reflectance_factor"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -36,7 +37,7 @@ class Source:
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
+class Measurements(Pairs):
     """N samples of a BSDF in C channels.
 
     Args:
@@ -84,29 +85,6 @@ class Measurements:
             if (self.sigma[self.mask] == 0).any():
                 raise ValueError("sigma is 0 in a sample that is used, must be > 0 (sigma=None where it is unknown)")
 
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def theta_i(self) -> Floats:
-        """Polar angle of the light, (N,), degrees in [0, 180]."""
-        return polar(self.wi)
-
-    @property
-    def phi_i(self) -> Floats:
-        """Azimuth of the light, (N,), degrees in [0, 360)."""
-        return azimuth(self.wi)
-
-    @property
-    def theta_o(self) -> Floats:
-        """Polar angle of the viewer, (N,), degrees in [0, 180]; above 90 is transmission for light from above."""
-        return polar(self.wo)
-
-    @property
-    def phi_o(self) -> Floats:
-        """Azimuth of the viewer, (N,), degrees in [0, 360)."""
-        return azimuth(self.wo)
-
     def used(self) -> "Measurements":
         """Only the samples that take part in fits."""
         keep = self.mask
@@ -130,6 +108,74 @@ class Measurements:
             raise ValueError(f"keep has shape {keep.shape} and type {keep.dtype}, must be {self.mask.shape} bool")
         changed = replace(self, mask=self.mask & keep)
         return changed if note is None else changed.noted(note)
+
+    def select(
+        self,
+        *,
+        incidence: Angles | None = None,
+        azimuth: Angles | None = None,
+        theta_o: Angles | None = None,
+        in_plane: bool | None = None,
+        channels: str | Sequence[str] | None = None,
+    ) -> "Measurements":
+        """The used samples that all of these hold for, and these channels of them. Angles in degrees, to 0.5.
+
+        Args:
+            incidence: polar angles of the light.
+            azimuth: planes of the viewer, from that of incidence; 0 and 180 are the same.
+            theta_o: polar angles of the viewer, on either side of the normal.
+            in_plane: whether the viewer lies in the plane of incidence.
+            channels: their names.
+
+        Angles are a number, several, or a ``slice(low, high)`` of all between two, ends included.
+
+        Raises:
+            ValueError: nothing is given, or what the data do not hold.
+        """
+        keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
+        if not keep.any():
+            raise ValueError("select: no sample of the data is all of this")
+        return self.where(keep).used().of_channels(own)
+
+    def drop(
+        self,
+        *,
+        incidence: Angles | None = None,
+        azimuth: Angles | None = None,
+        theta_o: Angles | None = None,
+        in_plane: bool | None = None,
+        channels: str | Sequence[str] | None = None,
+    ) -> "Measurements":
+        """The used samples that `select` leaves, in all channels; or the other channels, if only `channels` is given.
+
+        Raises:
+            ValueError: as `select`, nothing is left, or channels stand beside angles.
+        """
+        keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
+        if channels is None:
+            rest = self.where(~keep).used()
+        elif any(one is not None for one in (incidence, azimuth, theta_o, in_plane)):
+            raise ValueError("drop: channels stand beside angles; drop one after the other")
+        else:
+            rest = self.used().of_channels([name for name in self.channels if name not in own])
+        if not rest.values.size:
+            raise ValueError("drop: nothing of the data is left")
+        return rest
+
+    def _chosen(
+        self,
+        incidence: Angles | None,
+        azimuth: Angles | None,
+        theta_o: Angles | None,
+        in_plane: bool | None,
+        channels: str | Sequence[str] | None,
+    ) -> tuple[NDArray[np.bool_], Sequence[str]]:
+        """Rows (N,) that all of it holds for, and names of channels."""
+        if all(one is None for one in (incidence, azimuth, theta_o, in_plane, channels)):
+            raise ValueError("select: nothing is given; it takes incidence, azimuth, theta_o, in_plane and channels")
+        keep = self.mask & rows_of(self, incidence, azimuth, theta_o, in_plane)
+        names = self.channels if channels is None else [channels] if isinstance(channels, str) else channels
+        return keep, self.of_channels(names).channels
 
     def of_channels(self, names: Sequence[str]) -> "Measurements":
         """These channels alone, in the order that they have here. ValueError for one that is not there."""

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fits.data.geometry import LIGHT_AZIMUTH
-from fits.data.measurements import Measurements
+from fits.data.geometry import LIGHT_AZIMUTH, Pairs
 
 SAME_ANGLE = 0.5  # degrees: closer incidences are one incidence, closer azimuths one plane
 AT_NORMAL = 1e-6  # degrees from the normal below which a direction has no azimuth
@@ -25,7 +24,7 @@ class Incidence:
         return f"θᵢ = {self.theta:g}°"
 
 
-def incidences(data: Measurements) -> list[Incidence]:
+def incidences(data: Pairs) -> list[Incidence]:
     """The distinct incident directions, by polar angle then azimuth; rows within `SAME_ANGLE` count as the same."""
     # Angles come back from unit vectors: rounding first keeps a value that sits between two bins in one of them.
     theta, phi = np.round(data.theta_i, 6), np.round(data.phi_i, 6) % 360.0
@@ -36,7 +35,7 @@ def incidences(data: Measurements) -> list[Incidence]:
     return [Incidence(_tidy(theta[rows]), _tidy(phi[rows]), rows) for rows in groups]
 
 
-def relative_azimuth(data: Measurements) -> np.ndarray:
+def relative_azimuth(data: Pairs) -> np.ndarray:
     """Azimuth of the viewer seen from the mirror side, (N,) degrees in (-180, 180]: 0 is forward, 180 backward.
 
     Light along the normal has no azimuth of its own: it counts as standing at `LIGHT_AZIMUTH`.
@@ -45,13 +44,13 @@ def relative_azimuth(data: Measurements) -> np.ndarray:
     return 180.0 - (phi_i - data.phi_o) % 360.0
 
 
-def signed_angle(data: Measurements) -> np.ndarray:
+def signed_angle(data: Pairs) -> np.ndarray:
     """Polar angle of the viewer, (N,) degrees, positive on the forward side of its own plane and negative behind."""
     side = np.where(np.abs(relative_azimuth(data)) <= 90.0, 1.0, -1.0)
     return side * data.theta_o
 
 
-def in_plane(data: Measurements) -> np.ndarray:
+def in_plane(data: Pairs) -> np.ndarray:
     """(N,) bool: the viewer lies in the plane of incidence, or the light in that of the viewer, to `SAME_ANGLE`."""
     light, viewer = np.sin(np.radians(data.theta_i)), np.sin(np.radians(data.theta_o))
     # near the normal the azimuth of the light hardly matters; on it, it counts as `relative_azimuth` says
@@ -60,13 +59,13 @@ def in_plane(data: Measurements) -> np.ndarray:
     return off_plane < np.sin(np.radians(SAME_ANGLE))
 
 
-def planes(data: Measurements) -> np.ndarray:
+def planes(data: Pairs) -> np.ndarray:
     """Plane that the viewer of each sample lies in, degrees in [0, 180) from that of incidence, (N,)."""
     turns = np.round(relative_azimuth(data) % 180.0 / SAME_ANGLE) % round(180.0 / SAME_ANGLE)
     return np.where(in_plane(data), 0.0, SAME_ANGLE * turns)
 
 
-def scans(data: Measurements) -> list[np.ndarray]:
+def scans(data: Pairs) -> list[np.ndarray]:
     """Rows in the order of the angle, one array per incidence and plane: neighbours in it are neighbours in angle."""
     angle, plane = signed_angle(data), planes(data)
     ordered = []

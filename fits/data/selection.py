@@ -1,20 +1,41 @@
 """Parts of measurements by what a user thinks in: incidences, planes, viewing angles, or a share in blocks."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.measurements import Measurements
-from fits.data.scans import SAME_ANGLE, incidences, planes, scans, signed_angle
+from fits.data.geometry import Pairs
+from fits.data.scans import SAME_ANGLE, in_plane, incidences, planes, scans, signed_angle
 
 BLOCK = 10.0
 """Of a share, in degrees along a scan: neighbouring readings are alike, and tell nothing of each other."""
 
+LISTED = 12
+"""So many angles of the data are named in an error; of more the first and the last."""
+
 Rows = NDArray[np.bool_]
+Angles = float | Sequence[float] | slice
 
 
-def select(data: Measurements, words: str) -> Rows:
+def rows_of(
+    data: Pairs, incidence: Angles | None, azimuth: Angles | None, theta_o: Angles | None, plane: bool | None
+) -> Rows:
+    """Samples (N,) that all of these hold for, see `Measurements.select`; plane: in that of incidence."""
+    chosen = np.ones(len(data), bool)
+    if incidence is not None:
+        chosen &= _at(_incidence_of(data), "incidence", incidence)
+    if azimuth is not None:
+        chosen &= _at(planes(data), "azimuth", azimuth, 180.0)
+    if theta_o is not None:
+        chosen &= _at(data.theta_o, "theta_o", theta_o)
+    if plane is not None:
+        chosen &= in_plane(data) == plane
+    return chosen
+
+
+def select(data: Pairs, words: str) -> Rows:
     """Samples (N,) that are meant by one of these, all angles in degrees.
 
     - ``incidence=30,70``: polar angles of the light;
@@ -31,29 +52,48 @@ def select(data: Measurements, words: str) -> Rows:
     return _KINDS[name](data, name, text)
 
 
-def _incidence(data: Measurements, name: str, text: str) -> Rows:
+def _incidence(data: Pairs, name: str, text: str) -> Rows:
+    return _at(_incidence_of(data), name, [_number(name, word) for word in text.split(",")])
+
+
+def _plane(data: Pairs, name: str, text: str) -> Rows:
+    return _at(planes(data), name, [_number(name, word) for word in text.split(",")])
+
+
+def _incidence_of(data: Pairs) -> NDArray[np.float64]:
+    """Polar angle of the light, (N,), alike for what counts as one incidence."""
     there = np.full(len(data), np.nan)
     for incidence in incidences(data):
         there[incidence.rows] = incidence.theta
-    return _among(there, name, text)
+    return there
 
 
-def _plane(data: Measurements, name: str, text: str) -> Rows:
-    return _among(planes(data), name, text)
-
-
-def _among(there: NDArray[np.float64], name: str, text: str) -> Rows:
+def _at(there: NDArray[np.float64], name: str, angles: Angles, turn: float = math.inf) -> Rows:
+    """Where angles (N,) are these, or turned by `turn`."""
+    if isinstance(angles, slice):
+        low = -math.inf if angles.start is None else angles.start - SAME_ANGLE
+        high = math.inf if angles.stop is None else angles.stop + SAME_ANGLE
+        if angles.step is not None or not low <= high:
+            raise ValueError(f"{name} is {angles}; it must be slice(low, high), the first not above the second")
+        return (there >= low) & (there <= high)
     chosen = np.zeros(len(there), bool)
-    for word in text.split(","):
-        near = np.abs(there - _number(name, word)) <= SAME_ANGLE
+    for angle in np.atleast_1d(np.asarray(angles, float)):
+        apart = np.abs(there - angle)
+        near = (apart if math.isinf(turn) else np.minimum(apart % turn, turn - apart % turn)) <= SAME_ANGLE
         if not near.any():
-            known = ", ".join(f"{angle:g}" for angle in np.unique(there))
-            raise ValueError(f"{name} {word.strip()} is not in the data; there are {known} degrees")
+            raise ValueError(f"{name} {angle:g} is not in the data; {_known(there)} degrees")
         chosen |= near
     return chosen
 
 
-def _angle(data: Measurements, name: str, text: str) -> Rows:
+def _known(there: NDArray[np.float64]) -> str:
+    every = np.unique(there)
+    if len(every) > LISTED:
+        return f"they go from {every[0]:g} to {every[-1]:g}"
+    return f"there are {', '.join(f'{angle:g}' for angle in every)}"
+
+
+def _angle(data: Pairs, name: str, text: str) -> Rows:
     angle, chosen = signed_angle(data), np.zeros(len(data), bool)
     for word in text.split(","):
         low, colon, high = word.partition(":")
@@ -67,7 +107,7 @@ def _angle(data: Measurements, name: str, text: str) -> Rows:
     return chosen
 
 
-def _share(data: Measurements, name: str, text: str) -> Rows:
+def _share(data: Pairs, name: str, text: str) -> Rows:
     share = _number(name, text)
     if not 0.0 < share < 1.0:
         raise ValueError(f"{name} is {share:g}; it must be above 0 and below 1")
@@ -93,7 +133,7 @@ def _number(name: str, word: str) -> float:
     return value
 
 
-_KINDS: dict[str, Callable[[Measurements, str, str], Rows]] = {
+_KINDS: dict[str, Callable[[Pairs, str, str], Rows]] = {
     "incidence": _incidence,
     "plane": _plane,
     "angle": _angle,

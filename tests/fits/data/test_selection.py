@@ -73,3 +73,71 @@ def test_a_share_of_what_is_no_scan_is_refused() -> None:
     few = readings.where(np.arange(len(readings)) < 2).used()
     with pytest.raises(ValueError, match=r"^share 0\.5: no scan of the data is longer than a block of 10 degrees"):
         select(few, "share=0.5")
+
+
+def test_parts_are_selected_and_the_rest_is_what_they_leave() -> None:
+    readings = data().where(data().theta_o < 79.0)
+    part, rest = readings.select(incidence=[10, 50.2]), readings.drop(incidence=[10, 50.2])
+    np.testing.assert_array_equal(np.unique(part.theta_i.round(6)), [10.0, 50.0])
+    np.testing.assert_array_equal(np.unique(rest.theta_i.round(6)), [30.0])
+    assert len(part) + len(rest) == readings.mask.sum()
+    assert part.mask.all()
+    assert rest.mask.all()
+    assert len(readings.select(incidence=30)) == len(rest)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"azimuth": 60}, lambda d: np.abs(np.sin(np.radians(d.phi_o))) > 0.1),
+        ({"azimuth": [180.0]}, lambda d: np.abs(np.sin(np.radians(d.phi_o))) < 0.1),
+        ({"azimuth": -120}, lambda d: np.abs(np.sin(np.radians(d.phi_o))) > 0.1),
+        ({"in_plane": False}, lambda d: np.abs(np.sin(np.radians(d.phi_o))) > 0.1),
+        ({"theta_o": [20, 40]}, lambda d: np.isin(d.theta_o.round(6), [20.0, 40.0])),
+        ({"theta_o": slice(None, 60)}, lambda d: d.theta_o < 60.5),
+        (
+            {"theta_o": slice(20, 60), "incidence": 10, "in_plane": True},
+            lambda d: (d.theta_o > 19.5) & (d.theta_o < 60.5) & (d.theta_i < 11.0) & (abs(d.wo[:, 1]) < 1e-6),
+        ),
+    ],
+)
+def test_what_is_selected(given, expected) -> None:
+    readings = data()
+    np.testing.assert_array_equal(readings.select(**given).wo, readings.wo[expected(readings)])
+    np.testing.assert_array_equal(readings.drop(**given).wo, readings.wo[~expected(readings)])
+
+
+def test_channels_are_selected() -> None:
+    geometry = slices([10.0], [0.0, 20.0, 40.0])
+    values, mask = np.arange(9.0).reshape(3, 3), np.array([True, True, False])
+    colours = Measurements(geometry.wi, geometry.wo, values, 0.1 + values, mask, ("red", "green", "blue"))
+    both = colours.select(channels=["red", "blue"], theta_o=20)
+    assert both.channels == ("red", "blue")
+    np.testing.assert_array_equal(both.values, [[3.0, 5.0]])
+    np.testing.assert_array_equal(both.sigma, [[3.1, 5.1]])
+    assert colours.select(channels="green").channels == ("green",)
+    np.testing.assert_array_equal(colours.drop(channels="green").values, [[0.0, 2.0], [3.0, 5.0]])
+    for given, message in (
+        ({"channels": "grey"}, "channel grey is not in the data; there are red, green, blue"),
+        ({"channels": "red", "incidence": 10}, "drop: channels stand beside angles"),
+        ({"channels": ["red", "green", "blue"]}, "drop: nothing of the data is left"),
+        ({"incidence": 10}, "drop: nothing of the data is left"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            colours.drop(**given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({}, "select: nothing is given; it takes incidence, azimuth, theta_o, in_plane and channels"),
+        ({"incidence": 35}, "incidence 35 is not in the data; there are 10, 30, 50 degrees"),
+        ({"azimuth": 90}, "azimuth 90 is not in the data; there are 0, 60 degrees"),
+        ({"theta_o": [20, 85]}, "theta_o 85 is not in the data; they go from 0 to 80 degrees"),
+        ({"theta_o": slice(60, 20)}, r"theta_o is slice\(60, 20, None\); it must be slice\(low, high\)"),
+        ({"theta_o": slice(81, 85)}, "select: no sample of the data is all of this"),
+    ],
+)
+def test_bad_selections_are_refused(given, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        data().select(**given)
