@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
+    from fits.inference.averaging import Average as Average
     from fits.inference.averaging import average as average
     from fits.inference.compare import Comparison as Comparison
     from fits.inference.compare import compare as compare
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
     from fits.inference.marginal_likelihood import evidence as evidence
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
+    from fits.inference.predicting import predict as predict
     from fits.inference.prediction import Prediction as Prediction
     from fits.inference.prediction import Scores as Scores
-    from fits.inference.prediction import predict as predict
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
     from fits.problem.correlated import Correlated as Correlated
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from fits.structures.searching import search as search
 
 _HOMES = {
+    "Average": "inference.averaging",
     "average": "inference.averaging",
     "Comparison": "inference.compare",
     "compare": "inference.compare",
@@ -76,7 +78,7 @@ _HOMES = {
     "Prediction": "inference.prediction",
     "Scores": "inference.prediction",
     "scores": "inference.prediction",
-    "predict": "inference.prediction",
+    "predict": "inference.predicting",
     "sample": "inference.sampling",
     "Search": "structures.searching",
     "search": "structures.searching",

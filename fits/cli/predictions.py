@@ -74,7 +74,7 @@ def predict(arguments: Namespace) -> int:
     if arguments.out is not None:
         require_free_place(arguments, ".csv", "predictions")
     use_jax()
-    from fits.inference.prediction import predict as run_prediction
+    from fits.inference.predicting import predict as run_prediction
     from fits.reporting import results, verdicts
     from fits.reporting.predictions import UNRELIABLE, prediction_csv
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from fits.inference.identifiability import Combination as Combination
     from fits.inference.optimise import fit as fit
     from fits.inference.posterior import Posterior as Posterior
+    from fits.inference.predicting import predict as predict
     from fits.inference.prediction import Prediction as Prediction
-    from fits.inference.prediction import predict as predict
     from fits.inference.sampling import sample as sample
 
 _HOMES = {
@@ -22,7 +22,7 @@ _HOMES = {
     "fit": "optimise",
     "Posterior": "posterior",
     "Prediction": "prediction",
-    "predict": "prediction",
+    "predict": "predicting",
     "sample": "sampling",
     "Comparison": "compare",
     "Combination": "identifiability",

@@ -1,60 +1,85 @@
 """Predictions of several stacks as one, each with its weight."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
+from fits.inference.foresight import foresights
 from fits.inference.posterior import Posterior
-from fits.inference.prediction import DRAWS, LEVELS, Prediction, banded, predict
+from fits.inference.predicting import DRAWS, LEVELS, predict
+from fits.inference.prediction import Prediction, banded
+from fits.progress import Progress
 
 STRAIGHT = 1e6
 """Softness of a prediction that is none of logarithms, in units of the largest value: asinh(x / s) is x / s there."""
 
 
+@dataclass(frozen=True, eq=False)
+class Average:
+    """Fits or posteriors of the same data, by name, and the weights of their predictions, which sum to 1."""
+
+    candidates: Mapping[str, Fit | Posterior]
+    weights: Mapping[str, float]
+
+    def predict(
+        self,
+        at: Geometry | Measurements,
+        *,
+        levels: tuple[float, ...] = LEVELS,
+        draws: int = DRAWS,
+        seed: int = 0,
+    ) -> Prediction:
+        """See `fits.predict`; draws: of all of them together, in proportion to the weights."""
+        counts = {name: round(draws * weight) for name, weight in self.weights.items()}
+        parts = [
+            predict(self.candidates[name], at, levels=levels, draws=max(count, 2), seed=seed + number)
+            for number, (name, count) in enumerate(counts.items())
+            if count > 0
+        ]
+        first = parts[0]
+        if any(part.degrees_of_freedom != first.degrees_of_freedom for part in parts):
+            raise ValueError("average: the fits differ in the tails of their noise")
+        means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
+        values = np.concatenate([part.values for part in parts])
+        freedom = first.degrees_of_freedom
+        found = banded(first.wi, first.wo, first.channels, levels, values, means, scales, softness, freedom, seed)
+        shape = float(np.fmax.reduce([part.shape for part in parts]))
+        return replace(found, shape=shape, readings=first.readings)
+
+
 def average(
     candidates: Mapping[str, Fit | Posterior],
-    weights: Mapping[str, float],
-    at: Geometry | Measurements,
+    weights: Mapping[str, float] | None = None,
     *,
-    levels: tuple[float, ...] = LEVELS,
-    draws: int = DRAWS,
-    seed: int = 0,
-) -> Prediction:
-    """What fits of the same data foretell together: a mixture of their predictions.
+    progress: Progress | None = None,
+) -> Average:
+    """Fits of the same data as one, whose predictions are a mixture of theirs: see `fits.predict`.
 
     Args:
         candidates: fits or posteriors, by name.
         weights: by the same names, none below 0: those of stacking (`Foresight.weight`) foretell best, probabilities
-            of the stacks (`Foresight.probability`) average over them as Bayes does.
-        at, levels, seed: see `predict`.
-        draws: of all of them together, in proportion to the weights.
+            of the stacks (`Foresight.probability`) average over them as Bayes does. None: those of stacking, for which
+            each is fitted again without each incidence (see `leave_out`).
+        progress: of these fits, see `leave_out`.
 
     Raises:
-        ValueError: weights that are missing, negative or all 0; readings with tails that differ; or as `predict`.
+        ValueError: no candidate; weights that are missing, negative or all 0; or as `leave_out`.
     """
+    if not candidates:
+        raise ValueError("average: there is no fit to average")
+    if weights is None:
+        plain = {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
+        weights = {name: seen.weight for name, seen in foresights(plain, progress).items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
         raise ValueError(
             f"weights is {dict(weights)}; it must give each of {', '.join(candidates)} a number of at least 0"
         )
-    counts = {name: round(draws * weights[name] / total) for name in candidates}
-    parts = [
-        predict(candidates[name], at, levels=levels, draws=max(count, 2), seed=seed + number)
-        for number, (name, count) in enumerate(counts.items())
-        if count > 0
-    ]
-    first = parts[0]
-    if any(part.degrees_of_freedom != first.degrees_of_freedom for part in parts):
-        raise ValueError("average: the fits differ in the tails of their noise")
-    means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
-    values = np.concatenate([part.values for part in parts])
-    freedom = first.degrees_of_freedom
-    found = banded(first.wi, first.wo, first.channels, levels, values, means, scales, softness, freedom, seed)
-    return replace(found, shape=float(np.fmax.reduce([part.shape for part in parts])))
+    return Average(dict(candidates), {name: weights[name] / total for name in candidates})
 
 
 def _logarithmic(part: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import refit
-from fits.inference.prediction import predict
+from fits.inference.predicting import predict
 from fits.problem.left_out import without
 from fits.progress import Progress
 

@@ -1,36 +1,26 @@
-"""What readings elsewhere will be: the model with its uncertainty, what it lacks, and the noise of a reading."""
+"""What readings elsewhere will be, as it was predicted: bands, quantiles and scores."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logsumexp
 
-from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements, Source
-from fits.inference.fit_result import Fit
-from fits.inference.importance import UNRELIABLE, weighted
-from fits.inference.posterior import Posterior
+from fits.data.measurements import Measurements
+from fits.inference.importance import UNRELIABLE
 from fits.problem.logarithm import logarithm, size
-from fits.problem.logarithm import softness as soft
-from fits.problem.model import Model
-from fits.problem.nodes import places
-
-LEAST_DRAWS = 400
-"""Of the approximation that draws of a posterior are chosen from."""
-
-DRAWS = 256
-"""Vectors of parameters that a prediction is made with."""
 
 BESIDE = 8
 """Readings that are drawn for each of them."""
 
-LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+HELD = (0.5, 0.95)
+"""Central intervals whose shares of readings are told."""
+
+HALVINGS = 50
+"""Of an interval that a quantile lies in."""
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +51,7 @@ class Prediction:
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
         shape: Pareto shape of the weights by which draws stand for the posterior of a fit (see `evidence`); NaN where
             they are those of a chain.
+        readings: those that were to be predicted, None where directions alone were asked for.
     """
 
     wi: Floats
@@ -75,6 +66,42 @@ class Prediction:
     degrees_of_freedom: float
     values: Floats
     shape: float = math.nan
+    readings: Measurements | None = None
+
+    @property
+    def mean(self) -> Floats:
+        """Of the stack's own value, (M, C), in 1/sr."""
+        return self.model.mean
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviation of the stack's own value, (M, C), in 1/sr."""
+        return self.model.sd
+
+    def quantile(self, level: float) -> Floats:
+        """Of the stack's own value, (M, C), in 1/sr; level in (0, 1)."""
+        require_level(level)
+        return np.quantile(self.values, level, axis=0)
+
+    def reading_quantile(self, level: float) -> Floats:
+        """Of a new reading, (M, C), in 1/sr; level in (0, 1)."""
+        require_level(level)
+        ends = self.means + self.scales * self._tails.ppf(level)
+        if self.softness is not None:
+            ends = self.softness * np.sinh(ends)
+        low, high = ends.min(axis=0), ends.max(axis=0)  # a mixture's lies between those of its parts
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            below = self.rank(middle) < level
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        return 0.5 * (low + high)
+
+    @property
+    def scores(self) -> "Scores":
+        """How well the readings were predicted. ValueError where directions alone were asked for."""
+        if self.readings is None:
+            raise ValueError("scores: directions alone were predicted; predict readings (Measurements) to score them")
+        return scores(self, self.readings)
 
     @property
     def reliable(self) -> bool:
@@ -105,49 +132,6 @@ class Prediction:
     @property
     def _tails(self) -> "stats.rv_frozen":
         return stats.norm() if math.isinf(self.degrees_of_freedom) else stats.t(self.degrees_of_freedom)
-
-
-def predict(
-    of: Fit | Posterior,
-    at: Geometry | Measurements,
-    *,
-    levels: tuple[float, ...] = LEVELS,
-    draws: int = DRAWS,
-    seed: int = 0,
-) -> Prediction:
-    """What the fitted stack is expected to reflect, and what would be read.
-
-    Args:
-        of: a posterior, or a fit, of whose posterior draws are made by weights (see `fits.inference.importance`).
-        at: pairs of directions, above or below; of `Measurements` their used samples, with their own sigma.
-        levels: of the quantiles, in (0, 1).
-        draws: vectors of parameters, at least 2.
-        seed: of these, and of the noise.
-
-    Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
-
-    Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels, or
-            directions that the transport cannot answer.
-    """
-    fit = of.fit if isinstance(of, Posterior) else of
-    if not fit.is_posterior:
-        raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
-    if not all(0.0 < level < 1.0 for level in levels):
-        raise ValueError(f"levels is {levels}; they must be in (0, 1)")
-    if draws < 2:
-        raise ValueError(f"draws is {draws}; it must be at least 2")
-    generator = np.random.default_rng(seed)
-    data = _measurements(fit, at)
-    vectors, shape = _vectors(of, draws, generator)
-    values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
-    values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
-    sigma = _own_sigma(fit, values, data.sigma)
-    means, scales, softness = _readings(fit, vectors, values, data, sigma)
-    noise = fit.problem.noise
-    freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
-    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
-    return replace(found, shape=shape)
 
 
 def banded(
@@ -188,17 +172,16 @@ def banded(
 class Scores:
     """How well readings were predicted.
 
-    count: readings times channels. median_error, large_error: median and 95th percentile of |prediction / reading - 1|,
-    the prediction being the median; model_error: the median of that for the model's own value. within_half, within_95:
-    shares of readings in the central 50 and 95 % intervals. log_score: mean log-density of a reading.
+    count: readings times channels. median_error, p95_error: median and 95th percentile of |prediction / reading - 1|,
+    the prediction being the median; model_error: the median of that for the model's own value. coverage: share of the
+    readings in the central interval, by what that should hold: 0.5 and 0.95. log_score: mean log-density of a reading.
     """
 
     count: int
     median_error: float
-    large_error: float
+    p95_error: float
     model_error: float
-    within_half: float
-    within_95: float
+    coverage: Mapping[float, float]
     log_score: float
 
 
@@ -223,74 +206,17 @@ def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool
     return Scores(
         count=values.size,
         median_error=float(np.median(error)),
-        large_error=float(np.quantile(error, 0.95)),
+        p95_error=float(np.quantile(error, 0.95)),
         model_error=float(np.median(of_model)),
-        within_half=float(np.mean((rank > 0.25) & (rank < 0.75))),
-        within_95=float(np.mean((rank > 0.025) & (rank < 0.975))),
+        coverage={share: float(np.mean(np.abs(2.0 * rank - 1.0) < share)) for share in HELD},
         log_score=float(np.mean(prediction.log_density(used.values)[keep])),
     )
 
 
+def require_level(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level is {level}; it must be in (0, 1)")
+
+
 def _band(values: Floats, levels: tuple[float, ...]) -> Band:
     return Band(values.mean(axis=0), values.std(axis=0), np.quantile(values, levels, axis=0))
-
-
-def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
-    if isinstance(at, Measurements):
-        if len(at.channels) != len(fit.problem.data.channels):
-            raise ValueError(
-                f"predict: the readings have the channels {', '.join(at.channels)}, "
-                f"the fit {', '.join(fit.problem.data.channels)}"
-            )
-        return at.used()
-    count, channels = len(at), fit.problem.data.channels
-    nothing = np.zeros((count, len(channels)))
-    return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
-
-
-def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> tuple[Floats, float]:
-    """Draws (D, P) of the posterior, and the shape of their weights."""
-    if isinstance(of, Posterior):
-        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
-    random = np.random.RandomState(generator.integers(2**31))
-    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE)
-    positions = jnp.asarray(found.resampled(random, draws))
-    return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
-
-
-def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
-    """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
-    used = fit.problem.data.used()
-    if used.sigma is None or not fit.problem.noise.use_sigma:
-        return np.zeros(values.shape[1:])
-    if sigma is not None:
-        return sigma
-    relative = np.median(used.sigma / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0)
-    return relative * np.median(np.abs(values), axis=0)
-
-
-def _readings(
-    fit: Fit, vectors: Floats, values: Floats, data: Measurements, sigma: Floats
-) -> tuple[Floats, Floats, Floats | None]:
-    """Means, scales and softness of readings (see `Prediction`), where the model has these values, (D, M, C)."""
-    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
-    if fit.problem.model.process is None:
-        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None
-    lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
-    softness = soft(np.median(values, axis=0), np.hypot(sigma, np.median(floor)))
-    means = np.asarray(logarithm(values, softness)) + lack
-    corrected = softness * np.sinh(means)
-    noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
-    return means, np.hypot(unknown, noise), softness
-
-
-def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
-    def one(vector: Array) -> tuple[Array, Array]:
-        parts = model.build(vector)
-        return parts.relative, parts.floor
-
-    return jax.vmap(one)(vectors)
-
-
-def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
-    return jax.lax.map(lambda vector: model.lack_at(vector, where), vectors)

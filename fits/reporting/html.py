@@ -86,7 +86,7 @@ def report(
 
 def foretell(fit: "Fit", posterior: "Posterior | None", unseen: Measurements) -> Foretold:
     """What the posterior, or the fit where there is none to report from, says of readings that were not fitted."""
-    from fits.inference.prediction import predict
+    from fits.inference.predicting import predict
 
     of = posterior if posterior is not None and verdicts.reportable(posterior) else fit
     return Foretold(unseen, predict(of, unseen))

@@ -66,5 +66,5 @@ def _only(count: int, rows: np.ndarray) -> np.ndarray:
 
 
 def _row(label: str, found: "Scores") -> tuple[str, ...]:
-    shares = (found.median_error, found.large_error, found.model_error, found.within_half, found.within_95)
+    shares = (found.median_error, found.p95_error, found.model_error, *found.coverage.values())
     return (label, f"{found.count:,}", *(f"{100.0 * share:.1f} %" for share in shares), f"{found.log_score:.2f}")

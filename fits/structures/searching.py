@@ -80,6 +80,16 @@ class Search:
         """What foretells best."""
         return self.found[0]
 
+    @property
+    def ranking(self) -> tuple[str, ...]:
+        """Names of all structures, best first."""
+        return tuple(one.name for one in self.found)
+
+    @property
+    def probabilities(self) -> dict[str, float]:
+        """By name, of the structures that were looked at closely: among these, all as probable beforehand."""
+        return {one.name: one.foresight.probability for one in self.found if one.foresight is not None}
+
 
 def named(structure: Structure) -> str:
     """A structure as words."""

@@ -10,11 +10,11 @@ from fits.data.measurements import Measurements
 from fits.inference.averaging import average
 from fits.inference.compare import compare
 from fits.inference.fit_result import Fit
-from fits.inference.foresight import stacking, together
+from fits.inference.foresight import foresights, stacking, together
 from fits.inference.left_out import LeftOut, groups_of, leave_out
 from fits.inference.marginal_likelihood import Evidence, evidence
 from fits.inference.optimise import fit
-from fits.inference.prediction import predict
+from fits.inference.predicting import predict
 from fits.problem.left_out import without
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, Normal
@@ -147,11 +147,11 @@ def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
 
 def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
     candidates, at = {"line": found, "flat": flat}, readings()
-    alone = average(candidates, {"line": 1.0, "flat": 0.0}, at, draws=1000)
+    alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
     one = predict(found, at, draws=1000)
     np.testing.assert_allclose(alone.reading.mean, one.reading.mean, atol=0.01)
     np.testing.assert_allclose(alone.log_density(at.values), one.log_density(at.values), atol=1e-6)
-    both = average(candidates, {"line": 3.0, "flat": 1.0}, at, draws=4000)
+    both = predict(average(candidates, {"line": 3.0, "flat": 1.0}), at, draws=4000)
     parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
     np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
 
@@ -162,7 +162,16 @@ def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
 )
 def test_bad_weights_are_refused(found: Fit, flat: Fit, weights: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        average({"line": found, "flat": flat}, weights, GEOMETRY)
+        average({"line": found, "flat": flat}, weights)
+
+
+def test_averages_are_weighted_by_stacking(found: Fit, flat: Fit) -> None:
+    both = average({"line": found, "flat": flat})
+    weights = {name: seen.weight for name, seen in foresights({"line": found, "flat": flat}).items()}
+    assert both.weights == pytest.approx(weights)
+    assert predict(both, readings()).scores.count == readings().values.size
+    with pytest.raises(ValueError, match="there is no fit to average"):
+        average({})
 
 
 def test_fits_that_say_nothing_of_readings_are_refused() -> None:

@@ -46,6 +46,9 @@ def found(data: fits.Measurements, directory: Path) -> fits.Search:
 def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
     assert found.best.name == "interface / diffuse"
     assert found.alike == ()
+    assert found.ranking == tuple(one.name for one in found.found)
+    assert found.probabilities["interface / diffuse"] == found.best.foresight.probability
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert {one.name for one in found.found} == {"diffuse", "metal", "interface / diffuse", "interface / metal"}
     assert found.best.bic == 0.0
     assert found.best.foresight.probability > 0.999

@@ -1,0 +1,144 @@
+"""What readings elsewhere will be: the model with its uncertainty, what it lacks, and the noise of a reading."""
+
+import math
+from dataclasses import replace
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from fits.data.geometry import Geometry
+from fits.data.measurements import Measurements, Source
+from fits.inference.fit_result import Fit
+from fits.inference.importance import UNRELIABLE, weighted
+from fits.inference.posterior import Posterior
+from fits.inference.prediction import Floats, Prediction, banded, require_level
+from fits.problem.logarithm import logarithm, size
+from fits.problem.logarithm import softness as soft
+from fits.problem.model import Model
+from fits.problem.nodes import places
+
+LEAST_DRAWS = 400
+"""Of the approximation that draws of a posterior are chosen from."""
+
+DRAWS = 256
+"""Vectors of parameters that a prediction is made with."""
+
+LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+
+
+class Mixed(Protocol):
+    """Several fits that predict as one: see `fits.average`."""
+
+    def predict(
+        self, at: Geometry | Measurements, *, levels: tuple[float, ...], draws: int, seed: int
+    ) -> Prediction: ...
+
+
+def predict(
+    of: Fit | Posterior | Mixed,
+    at: Geometry | Measurements,
+    *,
+    levels: tuple[float, ...] = LEVELS,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """What the fitted stack is expected to reflect, and what would be read.
+
+    Args:
+        of: a posterior, or a fit, of whose posterior draws are made by weights (see `fits.inference.importance`); or an
+            average of some.
+        at: pairs of directions, above or below; of `Measurements` their used samples, with their own sigma.
+        levels: of the quantiles, in (0, 1).
+        draws: vectors of parameters, at least 2.
+        seed: of these, and of the noise.
+
+    Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
+
+    Raises:
+        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels, or
+            directions that the transport cannot answer.
+    """
+    for level in levels:
+        require_level(level)
+    if draws < 2:
+        raise ValueError(f"draws is {draws}; it must be at least 2")
+    if not isinstance(of, Fit | Posterior):
+        return of.predict(at, levels=levels, draws=draws, seed=seed)
+    fit = of.fit if isinstance(of, Posterior) else of
+    if not fit.is_posterior:
+        raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
+    generator = np.random.default_rng(seed)
+    data = _measurements(fit, at)
+    vectors, shape = _vectors(of, draws, generator)
+    values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
+    values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
+    sigma = _own_sigma(fit, values, data.sigma)
+    means, scales, softness = _readings(fit, vectors, values, data, sigma)
+    noise = fit.problem.noise
+    freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
+    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
+    return replace(found, shape=shape, readings=at.used() if isinstance(at, Measurements) else None)
+
+
+def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
+    if isinstance(at, Measurements):
+        if len(at.channels) != len(fit.problem.data.channels):
+            raise ValueError(
+                f"predict: the readings have the channels {', '.join(at.channels)}, "
+                f"the fit {', '.join(fit.problem.data.channels)}"
+            )
+        return at.used()
+    count, channels = len(at), fit.problem.data.channels
+    nothing = np.zeros((count, len(channels)))
+    return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
+
+
+def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> tuple[Floats, float]:
+    """Draws (D, P) of the posterior, and the shape of their weights."""
+    if isinstance(of, Posterior):
+        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
+    random = np.random.RandomState(generator.integers(2**31))
+    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE)
+    positions = jnp.asarray(found.resampled(random, draws))
+    return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
+
+
+def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
+    """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
+    used = fit.problem.data.used()
+    if used.sigma is None or not fit.problem.noise.use_sigma:
+        return np.zeros(values.shape[1:])
+    if sigma is not None:
+        return sigma
+    relative = np.median(used.sigma / np.maximum(np.abs(fit.predicted), np.finfo(float).tiny), axis=0)
+    return relative * np.median(np.abs(values), axis=0)
+
+
+def _readings(
+    fit: Fit, vectors: Floats, values: Floats, data: Measurements, sigma: Floats
+) -> tuple[Floats, Floats, Floats | None]:
+    """Means, scales and softness of readings (see `Prediction`), where the model has these values, (D, M, C)."""
+    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
+    if fit.problem.model.process is None:
+        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None
+    lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
+    softness = soft(np.median(values, axis=0), np.hypot(sigma, np.median(floor)))
+    means = np.asarray(logarithm(values, softness)) + lack
+    corrected = softness * np.sinh(means)
+    noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
+    return means, np.hypot(unknown, noise), softness
+
+
+def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
+    def one(vector: Array) -> tuple[Array, Array]:
+        parts = model.build(vector)
+        return parts.relative, parts.floor
+
+    return jax.vmap(one)(vectors)
+
+
+def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
+    return jax.lax.map(lambda vector: model.lack_at(vector, where), vectors)
