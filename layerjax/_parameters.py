@@ -1,6 +1,7 @@
 """Numeric fields of the material classes: conversion to arrays, and validation of concrete values by name and range."""
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -48,6 +49,8 @@ PER_CHANNEL = frozenset(
 VECTORS = frozenset({"SGGX.axis"})
 """Fields that take a vector, shape (3,)."""
 
+
+_PART, _WEIGHT = re.compile(r"\bparts\['([^']+)'\]"), re.compile(r"\bweights\['([^']+)'\]")
 
 Parameter = Any
 """Type of a numeric field: numbers, sequences, traced arrays and placeholders go in, arrays or placeholders stay."""
@@ -125,7 +128,12 @@ def check_range(name: str, array: jax.Array) -> None:
 def leaves_with_names(tree: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Every leaf of the tree with its name as a user would write it, such as ``layers[0].phase.alpha``."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=is_placeholder):
-        yield prefix + jax.tree_util.keystr(path).lstrip("."), leaf
+        yield prefix + plain_name(jax.tree_util.keystr(path)), leaf
+
+
+def plain_name(path: str) -> str:
+    """The name of a leaf from JAX's: ``parts['coat'].layers[0].ior`` of a mixture is ``coat.layers[0].ior``."""
+    return _WEIGHT.sub(r"weights.\1", _PART.sub(r"\1", path)).lstrip(".")
 
 
 def in_precision(tree: Any, dtype: jnp.dtype) -> Any:

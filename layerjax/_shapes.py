@@ -42,7 +42,19 @@ class Number(NamedTuple):
 
 
 def numbers_of(stack: Any) -> Iterator[Number]:
-    """Every number of a stack that has a value; what phase functions hold besides is the same for all texels."""
+    """Every number of a stack that has a value; what phase functions hold besides is the same for all texels.
+
+    Of a mixture those of its parts, and their weights.
+    """
+    if hasattr(stack, "parts"):
+        for name, part in stack.parts.items():
+            for number in numbers_of(part):
+                yield number._replace(name=f"{name}.{number.name}")
+            if hasattr(stack.weights[name], "shape") and not is_placeholder(stack.weights[name]):
+                yield Number(f"weights.{name}", stack.weights[name].shape, 0, False)
+        return
+    if not hasattr(stack, "layers"):  # a part of a mixture that is prepared
+        return
     for index, layer in enumerate(stack.layers):
         yield from _numbers_in(f"layers[{index}]", layer)
     if stack.base is not None:

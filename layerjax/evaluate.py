@@ -1,4 +1,4 @@
-"""The public way in: evaluate, evaluate_with_error, sample, pdf, albedo, unscattered, prepare.
+"""The public way in: evaluate, evaluate_with_error, sample, pdf, albedo, unscattered; `prepare` lies beside it.
 
 Everything here is a pure function of arrays, compiled once per structure and shape, and usable inside ``jit``,
 ``vmap`` and ``grad``. Large batches run in chunks that fit the cache; a chunk is computed again on the way back, so
@@ -10,6 +10,7 @@ from functools import cache, partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
@@ -17,11 +18,13 @@ from jax.typing import ArrayLike
 from layerjax import maps
 from layerjax._batching import in_chunks
 from layerjax._devices import compiled
-from layerjax._numerics import horizon
+from layerjax._numerics import horizon, safe_div
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, read_directions, split
+from layerjax.mixture import Mixture
+from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
 from layerjax.stack import (
     Interface,
     Medium,
@@ -30,54 +33,13 @@ from layerjax.stack import (
     optical_depths,
     require_numbers,
     simplify,
-    simplify_and_name,
 )
 from layerjax.transport import Side, Transport
-from layerjax.transport.automatic import automatic
 from layerjax.transport.known_directions import MOST_COSINES, Known, KnownDirections, known_directions, own_cosines
 
 
-class Prepared(eqx.Module):
-    """A stack made ready for a transport by `prepare`: `evaluate`, `sample`, `pdf` and `albedo` take it for a stack."""
-
-    state: Any
-    transport: Transport
-    channels: int = eqx.field(static=True)
-
-
-def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Prepared:
-    """Do all the work that no direction is needed for, once.
-
-    Args:
-        stack: the layered material.
-        transport: how light is carried. ``"auto"``: all orders of scattering. `SingleScattering` where nothing
-            scatters light twice (a base under media that are known only to absorb), else `AddingDoubling`, which by
-            measurement is nearer to the truth than the closed forms of `Statistical`.
-
-    Raises:
-        ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
-    """
-    return _prepare(stack, transport, lambda: None)
-
-
-def choose_transport(
-    stack: Stack, transport: Transport | Literal["auto"] = "auto", *, known: KnownDirections | None = None
-) -> Transport:
-    """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
-
-    Args:
-        stack: the layered material. What is traced in it counts as not known.
-        transport: see `prepare`.
-        known: what `known_directions` says of the directions of `evaluate`; None: they are many, or not known.
-
-    Raises:
-        ValueError: as `prepare`.
-    """
-    return _chosen(stack, transport, lambda: known)[0]
-
-
 def evaluate(
-    stack: Stack | Prepared,
+    stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
     wo: ArrayLike,
     transport: Transport | Literal["auto"] = "auto",
@@ -115,15 +77,19 @@ def evaluate(
             f"known: it is of directions of shapes {known.of_wi.shape} and {known.of_wo.shape}, "
             f"wi and wo have {wi.shape[:-1]} and {wo.shape[:-1]}"
         )
+    if isinstance(stack, Mixture):
+        return _of_parts(stack).mean(
+            lambda part, own: evaluate(part, wi, wo, transport, side=side, key=own, known=known), key
+        )
     shape = _shape_of(stack)
     if shape:
         return _evaluate_map(stack, wi, wo, transport, side, key, shape)
-    prepared = _prepared(stack, transport, wi.dtype, lambda: known_directions(wi, wo) if known is None else known)
+    prepared = prepared_at(stack, transport, wi.dtype, lambda: known_directions(wi, wo) if known is None else known)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
 def evaluate_with_error(
-    stack: Stack | Prepared,
+    stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
     wo: ArrayLike,
     transport: Transport | Literal["auto"] = "auto",
@@ -143,8 +109,10 @@ def evaluate_with_error(
     wi, wo = read_directions(wi=wi, wo=wo)
     if not isinstance(stack, Prepared):
         require_single(stack, "evaluate_with_error")
+    if isinstance(stack, Mixture):
+        return _mixed_with_error(stack, wi, wo, transport, side, key)
     known = cache(partial(known_directions, wi, wo))
-    prepared = _prepared(stack, transport, wi.dtype, known)
+    prepared = prepared_at(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
     other = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
     values, errors = _evaluate(prepared, wi, wo, side, key)
@@ -155,7 +123,7 @@ def evaluate_with_error(
 
 
 def sample(
-    stack: Stack | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
+    stack: Stack | Mixture | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
 ) -> tuple[Array, Array, Array]:
     """Draw one outgoing direction for each wi (and each texel of a map of stacks, as in `evaluate`).
 
@@ -165,30 +133,34 @@ def sample(
         weight 0, and a direction in the tangent plane if they have none.
     """
     (wi,) = read_directions(wi=wi)
+    if isinstance(stack, Mixture):
+        return _sample_mixture(stack, wi, key, transport)
     shape = _shape_of(stack)
     if shape:
         mapped, chosen, at = _mapped(stack, transport, shape, wi)
         return maps.draws(mapped, chosen, at, at.spread(wi), channel_count(stack), key)
-    return _sample(_prepared(stack, transport, wi.dtype), wi, key)
+    return _sample(prepared_at(stack, transport, wi.dtype), wi, key)
 
 
 def pdf(
-    stack: Stack | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
+    stack: Stack | Mixture | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
 ) -> Array:
     """Density in solid angle, 1/sr, with which `sample` draws wo for wi; shape ``broadcast(wi, wo)[:-1]``.
 
     Maps of stacks as in `evaluate`.
     """
     wi, wo = read_directions(wi=wi, wo=wo)
+    if isinstance(stack, Mixture):
+        return _of_parts(stack).mean(lambda part, _: pdf(part, wi, wo, transport), by_channel=False)
     shape = _shape_of(stack)
     if shape:
         mapped, chosen, at = _mapped(stack, transport, shape, wi, wo)
         return maps.densities(mapped, chosen, at, (at.spread(wi), at.spread(wo)))
-    return _pdf(_prepared(stack, transport, wi.dtype), wi, wo)
+    return _pdf(prepared_at(stack, transport, wi.dtype), wi, wo)
 
 
 def albedo(
-    stack: Stack | Prepared,
+    stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
     transport: Transport | Literal["auto"] = "auto",
     *,
@@ -204,22 +176,26 @@ def albedo(
     Maps of stacks as in `evaluate`.
     """
     (wi,) = read_directions(wi=wi)
+    if isinstance(stack, Mixture):
+        return _of_parts(stack).mean(lambda part, own: albedo(part, wi, transport, nodes=nodes, key=own), key)
     shape = _shape_of(stack)
     if shape:
         mapped, chosen, at = _mapped(stack, transport, shape, wi)
         given = chosen.needed(key, "albedo")
         return maps.energies(mapped, chosen, at, at.spread(wi), channel_count(stack), nodes, given)
-    prepared = _prepared(stack, transport, wi.dtype)
+    prepared = prepared_at(stack, transport, wi.dtype)
     return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
 
-def unscattered(stack: Stack, wi: ArrayLike) -> Array:
+def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes straight through the stack without a collision, shape ``(..., C)``.
 
     The delta part of the BSDF: 0 over an opaque base and through rough interfaces. Maps of stacks as in `evaluate`.
     """
     require_numbers(stack)
     (wi,) = read_directions(wi=wi)
+    if isinstance(stack, Mixture):
+        return _of_parts(stack).mean(lambda part, _: unscattered(part, wi))
     slim, channels, shape = in_precision(simplify(stack), wi.dtype), channel_count(stack), map_shape(stack)
     if shape:
         return maps.of_directions(_unscattered, slim, maps.layout(shape, wi), wi, channels)
@@ -261,7 +237,39 @@ def _unscattered(stack: Stack, wi: Array, channels: int) -> Array:
     return jnp.stack([jnp.where(visible, jnp.exp(-total), 0.0) for total in totals], axis=-1)
 
 
-def _shape_of(stack: Stack | Prepared) -> Shape:
+def _of_parts(mixture: Mixture) -> Mixture:
+    require_numbers(mixture)
+    return mixture.over(map_shape(mixture))
+
+
+def _mixed_with_error(
+    mixture: Mixture, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None
+) -> tuple[Array, Array]:
+    """Standard errors of independent walks add in squares, numerical errors as they are."""
+    found = mixture.weighed(lambda part, own: evaluate_with_error(part, wi, wo, transport, side=side, key=own), key)
+    values = sum(share * value for share, (value, _) in found)
+    errors = jnp.stack(jnp.broadcast_arrays(*(share * error for share, (_, error) in found)))
+    return values, jnp.sum(errors, axis=0) if key is None else jnp.linalg.norm(errors, axis=0)
+
+
+def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> tuple[Array, Array, Array]:
+    """A draw from every part, of which one is chosen by weight: its density is the mean of all."""
+    shape = map_shape(mixture)
+    mixture = _of_parts(mixture) if shape else prepare(mixture, transport)
+    wi = jnp.broadcast_to(wi, (*jnp.broadcast_shapes(shape, wi.shape[:-1]), 3))
+    draws, choice, values = jax.random.split(key, 3)
+    found = mixture.weighed(lambda part, own: sample(part, wi, own, transport)[0], draws)
+    pick = jax.random.uniform(choice, wi.shape[:-1], wi.dtype)
+    wo, passed = found[0][1], found[0][0]
+    for share, drawn in found[1:]:
+        wo = jnp.where((pick < passed)[..., None], wo, drawn)
+        passed = passed + share
+    density = pdf(mixture, wi, wo, transport)
+    value = evaluate(mixture, wi, wo, transport, key=values)
+    return wo, density, safe_div(value * jnp.abs(wo[..., 2:]), density[..., None])
+
+
+def _shape_of(stack: Stack | Mixture | Prepared) -> Shape:
     return () if isinstance(stack, Prepared) else map_shape(stack)
 
 
@@ -270,7 +278,7 @@ def _mapped(
 ) -> tuple[Stack, Transport, maps.Layout]:
     """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
     at = maps.layout(shape, *directions)
-    chosen, simplified = _chosen(stack, transport, known)
+    chosen, simplified = chosen_for(stack, transport, known)
     layers = (_without_upright_axis(layer) for layer in simplified.layers)
     simplified = eqx.tree_at(lambda s: s.layers, simplified, tuple(layers))
     return in_precision(simplified, directions[0].dtype), chosen, at
@@ -314,28 +322,4 @@ def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> Pr
         raise ValueError(
             f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
         )
-    return _prepare(stack, other, known)
-
-
-def _prepared(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
-    prepared = stack if isinstance(stack, Prepared) else _prepare(stack, transport, known)
-    return in_precision(prepared, dtype)
-
-
-def _prepare(stack: Stack, transport: Any, known: Known) -> Prepared:
-    known = cache(known)
-    require_numbers(stack)
-    require_single(stack, "prepare")
-    chosen, simplified = _chosen(stack, transport, known)
-    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
-
-
-def _chosen(stack: Stack, transport: Any, known: Known) -> tuple[Transport, Stack]:
-    """The transport with nothing left open, and the simplified stack."""
-    require_numbers(stack)
-    simplified, names = simplify_and_name(stack)
-    chosen = automatic(stack, simplified) if transport == "auto" else transport
-    if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
-    chosen.check(simplified, names)
-    return chosen.chosen_for(simplified, known), simplified
+    return prepare_at(stack, other, known)

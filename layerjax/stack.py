@@ -106,7 +106,7 @@ class Stack(eqx.Module):
         return channel_count(self)
 
 
-def require_numbers(stack: Stack) -> None:
+def require_numbers(stack: Any) -> None:
     """Refuse a stack that still holds placeholders (a family of stacks rather than one)."""
     free = [name for name, leaf in leaves_with_names(stack) if is_placeholder(leaf)]
     if free:

@@ -32,6 +32,7 @@ OPAQUE = {
     "conductor": lj.Stack([], lj.Conductor(0.2, 3.9, 0.3)),
     "haze on conductor": lj.Stack([haze(0.5, 0.7, 0.8)], lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.5, 2.4], 0.25)),
 }
+OPAQUE["mixture"] = lj.Mixture({"metal": OPAQUE["conductor"], "dusty": OPAQUE["haze on conductor"]}, [0.35, 0.65])
 CASES = [(name, stack, ABOVE) for name, stack in (STACKS | OPAQUE).items()]
 CASES += [(name, STACKS[name], BELOW) for name in ("surface, tilted", "fiber, in the plane", "haze", "three layers")]
 CASES += [(name, OPAQUE[name], GRAZING) for name in ("oren-nayar", "conductor")]
@@ -43,7 +44,7 @@ def test_samples_follow_their_density(name, stack, wi):
     wi = lj.direction(*wi)
     towards = jnp.broadcast_to(wi, (DRAWS, 3))
     wo, density, weight = lj.sample(stack, towards, jax.random.key(7), SINGLE)
-    above_only = stack.base is not None  # a surface states its density above the horizon alone
+    above_only = name in OPAQUE  # a surface states its density above the horizon alone
     keep = wo[:, 2] > 0 if above_only else slice(None)
 
     def cells(w):

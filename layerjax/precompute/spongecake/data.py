@@ -18,8 +18,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from layerjax.evaluate import evaluate, prepare
+from layerjax.evaluate import evaluate
 from layerjax.phase import SGGX, HenyeyGreenstein
+from layerjax.preparation import prepare
 from layerjax.stack import Medium, Stack
 from layerjax.transport.adding_doubling import AddingDoubling
 

@@ -1,0 +1,156 @@
+"""A surface that is partly one material and partly another, as the eye or an instrument sees it: a mean by area."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from layerjax._parameters import RANGES, Parameter, check_range, floating, is_placeholder
+from layerjax._shapes import Shape, axes_of_map, channel_count, map_shape
+from layerjax.stack import Stack
+
+WEIGHTS = "Mixture.weights"
+RANGES[WEIGHTS] = (0.0, 1.0)
+
+SUM_SLACK = 1e-6
+"""By which weights may miss a sum of 1: digits that a file has left out."""
+
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")
+
+
+class Mixture(eqx.Module):
+    """Stacks side by side, each covering a share of the area; no light passes from one to another.
+
+    It stands wherever a `Stack` may. Its BSDF, albedo and what passes unscattered are the means of those of its parts;
+    a direction is drawn from a part that is drawn by its weight, with the density of all of them.
+
+    Args:
+        parts: stacks, or mixtures, by name: letters, digits, ``-`` and ``_``, a letter first.
+        weights: shares of the area in [0, 1], in the order of the parts or by name, which sum to 1. One may be None: it
+            covers the rest. Of shape (), or that of a map (see `layerjax._shapes`).
+
+    Raises:
+        ValueError: names or weights that are missing or wrong, weights that do not sum to 1, a placeholder without a
+            weight that is None, or parts that disagree on channels or the shape of a map.
+    """
+
+    parts: dict[str, Any]
+    weights: dict[str, Parameter]
+
+    def __init__(self, parts: Mapping[str, "Stack | Mixture"], weights: Sequence[Parameter] | Mapping[str, Parameter]):
+        for name in parts:
+            if not (isinstance(name, str) and _NAME.fullmatch(name)) or name in _TAKEN:
+                raise ValueError(
+                    f"Mixture.parts: {name!r} is no name; it must be letters, digits, - and _, a letter first, and not "
+                    f"one of {', '.join(_TAKEN)}"
+                )
+        self.parts = dict(parts)
+        self.weights = {name: _weight(name, value) for name, value in _by_name(parts, weights).items()}
+
+    def __check_init__(self) -> None:
+        for name, part in self.parts.items():
+            if not isinstance(part, Stack | Mixture):
+                raise ValueError(f"Mixture.parts[{name!r}]: {part!r:.60} is not a Stack or a Mixture")
+        _check_sum(self.weights)
+        channel_count(self)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels C of the values."""
+        return channel_count(self)
+
+    def shares(self) -> dict[str, Array]:
+        """Weights by name, that which is None worked out."""
+        rest = 1.0 - sum(weight for weight in self.weights.values() if weight is not None)
+        return {name: jnp.asarray(rest if weight is None else weight) for name, weight in self.weights.items()}
+
+    def each(self, function: Callable[[Any], Any]) -> "Mixture":
+        """The same mixture of function(part) for every part."""
+        found = {name: function(part) for name, part in self.parts.items()}
+        return eqx.tree_at(lambda mixture: mixture.parts, self, found)
+
+    def weighed(self, function: Callable[[Any, Any], Any], key: Array | None = None) -> list[tuple[Array, Any]]:
+        """The weight of every part, and function(part, its own key) of it; without a key each has None."""
+        keys = [None] * len(self.parts) if key is None else [*jax.random.split(key, len(self.parts))]
+        shares = self.shares()
+        return [(shares[name], function(part, own)) for (name, part), own in zip(self.parts.items(), keys, strict=True)]
+
+    def mean(self, function: Callable[[Any, Any], Any], key: Array | None = None, by_channel: bool = True) -> Any:
+        """Arrays of function(part, key), weighted and summed; by_channel: their last axis counts channels."""
+
+        def times(share: Array, value: Array) -> Array:
+            share = share.astype(value.dtype)
+            return (share[..., None] if by_channel else share) * value
+
+        found = [jax.tree.map(partial(times, share), value) for share, value in self.weighed(function, key)]
+        return jax.tree.map(lambda *values: sum(values[1:], values[0]), *found)
+
+    def over(self, shape: Shape) -> "Mixture":
+        """The same with parts that are maps of exactly this shape, or single stacks."""
+        return self.each(lambda part: part.over(shape) if isinstance(part, Mixture) else _over(part, shape))
+
+
+def stacks_of(material: Stack | Mixture) -> list[Stack]:
+    """The stacks that a material is made of; itself, if it is one."""
+    if isinstance(material, Mixture):
+        return [stack for part in material.parts.values() for stack in stacks_of(part)]
+    return [material]
+
+
+def _by_name(parts: Mapping[str, Any], weights: Any) -> dict[str, Any]:
+    if isinstance(weights, Mapping):
+        if set(weights) != set(parts):
+            raise ValueError(f"{WEIGHTS} are of {', '.join(weights)}; they must be of {', '.join(parts)}")
+        return {name: weights[name] for name in parts}
+    given = list(weights)
+    if len(given) != len(parts) or not given:
+        raise ValueError(f"{WEIGHTS}: {len(given)} given for {len(parts)} parts; each part must have one")
+    return dict(zip(parts, given, strict=True))
+
+
+def _weight(name: str, value: Any) -> Any:
+    if value is None or is_placeholder(value):
+        return value
+    array = floating(f"{WEIGHTS}[{name!r}]", value)
+    try:
+        check_range(WEIGHTS, array)
+    except ValueError as error:
+        raise ValueError(str(error).replace(WEIGHTS, f"{WEIGHTS}[{name!r}]", 1)) from None
+    return array
+
+
+def _check_sum(weights: Mapping[str, Any]) -> None:
+    given = [weight for weight in weights.values() if weight is not None]
+    rest = len(weights) - len(given)
+    if rest > 1:
+        raise ValueError(f"{WEIGHTS}: {rest} are None; at most one may be, which covers the rest")
+    if any(map(is_placeholder, given)):
+        if not rest:
+            raise ValueError(f"{WEIGHTS}: one has to be free of choice: None, which covers the rest")
+        return
+    if any(isinstance(weight, jax.core.Tracer) for weight in given):
+        return
+    totals = np.asarray(sum(np.asarray(weight, np.float64) for weight in given))
+    wrong = totals > 1.0 + SUM_SLACK if rest else np.abs(totals - 1.0) > SUM_SLACK
+    if wrong.any():
+        must = "at most 1, with one that is None" if rest else "1"
+        raise ValueError(f"{WEIGHTS} sum to {float(totals[wrong].ravel()[0]):g}; they must sum to {must}")
+
+
+def _over(part: Any, shape: Shape) -> Any:
+    """A map with its numbers broadcast to this shape; a single stack, or one that is prepared, as it is."""
+    if not isinstance(part, Stack) or map_shape(part) in ((), shape):
+        return part
+    own = map_shape(part)
+
+    def broadcast(leaf: Any, is_mapped: bool) -> Any:
+        return jnp.broadcast_to(leaf, (*shape, *leaf.shape[len(own) :])) if is_mapped else leaf
+
+    return jax.tree.map(broadcast, part, axes_of_map(part, own))

@@ -1,0 +1,101 @@
+"""Stacks made ready for a transport: all the work that no direction is needed for, and what is left open chosen."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, Literal, overload
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from layerjax._parameters import in_precision
+from layerjax._shapes import channel_count, require_single
+from layerjax.mixture import Mixture, stacks_of
+from layerjax.stack import Stack, require_numbers, simplify_and_name
+from layerjax.transport import Transport
+from layerjax.transport.adding_doubling import AddingDoubling
+from layerjax.transport.automatic import automatic
+from layerjax.transport.known_directions import Known, KnownDirections
+
+
+class Prepared(eqx.Module):
+    """A stack made ready for a transport by `prepare`: `evaluate`, `sample`, `pdf` and `albedo` take it for a stack."""
+
+    state: Any
+    transport: Transport
+    channels: int = eqx.field(static=True)
+
+
+@overload
+def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Prepared: ...
+@overload
+def prepare(stack: Mixture, transport: Transport | Literal["auto"] = "auto") -> Mixture: ...
+def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Prepared | Mixture:
+    """Do all the work that no direction is needed for, once.
+
+    Args:
+        stack: the layered material; of a mixture each part is prepared, and a mixture of these is returned.
+        transport: how light is carried. ``"auto"``: all orders of scattering. `SingleScattering` where nothing
+            scatters light twice (a base under media that are known only to absorb), else `AddingDoubling`, which by
+            measurement is nearer to the truth than the closed forms of `Statistical`.
+
+    Raises:
+        ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
+    """
+    if isinstance(stack, Mixture):
+        return stack.each(lambda part: prepare(part, transport))
+    return prepare_at(stack, transport, lambda: None)
+
+
+def choose_transport(
+    stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto", *, known: KnownDirections | None = None
+) -> Transport:
+    """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
+
+    Args:
+        stack: the layered material. What is traced in it counts as not known. Of a mixture `evaluate` chooses for each
+            part; here that which carries all of them, as fine as the part needs that needs most.
+        transport: see `prepare`.
+        known: what `known_directions` says of the directions of `evaluate`; None: they are many, or not known.
+
+    Raises:
+        ValueError: as `prepare`.
+    """
+    found = [chosen_for(part, transport, lambda: known)[0] for part in stacks_of(stack)]
+    solvers = [one for one in found if isinstance(one, AddingDoubling)]
+    return _finest(solvers) if solvers else found[0]
+
+
+def prepared_at(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
+    prepared = stack if isinstance(stack, Prepared) else prepare_at(stack, transport, known)
+    return in_precision(prepared, dtype)
+
+
+def prepare_at(stack: Stack, transport: Any, known: Known) -> Prepared:
+    known = cache(known)
+    require_numbers(stack)
+    require_single(stack, "prepare")
+    chosen, simplified = chosen_for(stack, transport, known)
+    return Prepared(chosen.prepare_for(simplified, known), chosen, channel_count(stack))
+
+
+def chosen_for(stack: Stack, transport: Any, known: Known) -> tuple[Transport, Stack]:
+    """The transport with nothing left open, and the simplified stack."""
+    require_numbers(stack)
+    simplified, names = simplify_and_name(stack)
+    chosen = automatic(stack, simplified) if transport == "auto" else transport
+    if not isinstance(chosen, Transport):
+        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
+    chosen.check(simplified, names)
+    return chosen.chosen_for(simplified, known), simplified
+
+
+def _finest(found: Sequence[AddingDoubling]) -> AddingDoubling:
+    """As fine in each dimension as the finest of them."""
+    cosines = [one.ordinates or (0, 0) for one in found]
+    return replace(
+        found[0],
+        nodes=max(one.nodes or 0 for one in found),
+        modes=max(one.modes or 0 for one in found),
+        ordinates=(max(first for first, _ in cosines), max(second for _, second in cosines)),
+    )
