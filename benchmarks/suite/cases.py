@@ -121,6 +121,7 @@ def load(families: Sequence[str] | None = None) -> list[Case]:
 
 def _read(path: Path) -> Case:
     problem = read_problem(path)
+    assert isinstance(problem.stack, lj.Stack)
     about = {key: problem.about.get(key, "") for key in ("source", "remark", "differs")}
     return Case(path.stem, path.parent.name, stack=problem.stack, **about)
 

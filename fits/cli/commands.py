@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
     from fits.reporting.html import Foretold
-    from layerjax import Stack
+    from layerjax import Mixture, Stack
 
 DONE, DOUBTFUL = 0, 1
 
@@ -270,6 +270,7 @@ def render(arguments: Namespace) -> int:
     from layerjax import gallery
 
     name, transport = arguments.material, None
+    stack: Stack | Mixture
     if name in gallery.names():
         stack = gallery.stack(name)
     elif Path(name).suffix == ".toml":
@@ -332,7 +333,7 @@ def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, 
     return candidates
 
 
-def _at_start(stack: "Stack") -> "Stack":
+def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
     """The stack with every free parameter at its start value."""
     import jax
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.model import Model
 from fits.problem.problem import Problem
+from layerjax.mixture import stacks_of
 from layerjax.transport.adding_doubling.resolution import FINEST, LADDER, ORDINATES_LADDER, is_tilted
 
 ENOUGH = 0.1
@@ -114,7 +115,8 @@ def resolutions(problem: Problem) -> Resolutions | None:
 
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
-        return lj.choose_transport(stack, transport, known=model.known), any(map(is_tilted, stack.layers))
+        layers = [layer for part in stacks_of(stack) for layer in part.layers]
+        return lj.choose_transport(stack, transport, known=model.known), any(map(is_tilted, layers))
 
     start = jnp.asarray(problem.start)
     kind, tilted = eqx.filter_eval_shape(traced, start)

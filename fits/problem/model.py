@@ -328,6 +328,6 @@ def forward(
     # a class is callable too, but only a transport that lacks its brackets: layerjax says so
     if callable(transport) and not isinstance(transport, lj.Transport | type):
         return transport(stack, jnp.asarray(wi), jnp.asarray(wo))
-    if isinstance(stack, lj.Stack):
+    if isinstance(stack, lj.Stack | lj.Mixture):
         require_single(stack, "inference")
     return lj.evaluate(stack, wi, wo, cast(lj.Transport | Literal["auto"], transport), side=side, known=known)

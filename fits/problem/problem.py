@@ -26,6 +26,7 @@ from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.process import Process, make_process
+from layerjax._parameters import plain_name
 from layerjax.stack import with_known
 
 Floats = NDArray[np.float64]
@@ -206,7 +207,7 @@ def _require_known(objective: str, scale: Any) -> None:
 def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple[Any, ...]:
     """All that a parameter may stand for, in the order of `Parts`."""
     # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
-    stack = with_known(problem.stack) if isinstance(problem.stack, lj.Stack) else problem.stack
+    stack = _with_known(problem.stack)
     scale = 1.0 if problem.scale is None else problem.scale
     correlation = None
     if process is not None:
@@ -216,11 +217,27 @@ def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple
     return (stack, *jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free))
 
 
+def _with_known(stack: Any) -> Any:
+    if isinstance(stack, lj.Mixture):
+        _require_room(stack)
+        return stack.each(_with_known)
+    return with_known(stack) if isinstance(stack, lj.Stack) else stack
+
+
+def _require_room(mixture: lj.Mixture) -> None:
+    """Refuse weights that could leave less than nothing for the rest."""
+    given = [weight for weight in mixture.weights.values() if weight is not None]
+    if any(map(is_free, given)):
+        most = sum(float(weight.arrays()[2] if is_free(weight) else weight) for weight in given)
+        if most > 1.0:
+            raise ValueError(f"Mixture.weights: at their upper bounds they sum to {most:g}; it must be at most 1")
+
+
 def _parameter_name(path: str) -> str:
     """The name of a place in the tuple that `_numbers` returns."""
     for index, name in enumerate(("", "scale", "noise.relative", "noise.floor", "noise.correlated")):
         if path.startswith(f"[{index}]"):
-            return (name + path.removeprefix(f"[{index}]")).lstrip(".")
+            return plain_name(name + path.removeprefix(f"[{index}]"))
     return path
 
 

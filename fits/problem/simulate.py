@@ -12,7 +12,7 @@ from fits.problem.model import Transport, forward
 
 
 def simulate(
-    stack: lj.Stack,
+    stack: lj.Stack | lj.Mixture,
     geometry: Geometry,
     transport: Transport = "auto",
     noise: float = 0.0,

@@ -255,9 +255,9 @@ def _fitted(fit: "Fit") -> str:
 def _stack_text(fit: "Fit") -> str:
     import tomli_w
 
-    from fits.problem.stack_file import stack_to_dict
+    from fits.problem.tables import material_to_dict
 
-    return f"<pre>{html.escape(tomli_w.dumps(stack_to_dict(fit.stack)))}</pre>"
+    return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
 
 
 def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures) -> str:

@@ -14,6 +14,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 import layerjax as lj
 from fits.reporting.plots.data import CYCLE, STYLE
+from layerjax.mixture import stacks_of
+
+Prepared = lj.Prepared | lj.Mixture
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +45,7 @@ DECADES, MATRIX_BELOW = 4.0, np.radians(75.0)
 
 
 def render(
-    stack: lj.Stack,
+    stack: lj.Stack | lj.Mixture,
     transport: lj.Transport | Literal["auto"] | None = None,
     *,
     title: str = "",
@@ -65,17 +68,13 @@ def render(
     """
     if size < 16:
         raise ValueError(f"size: {size} is not >= 16 pixels")
-    interfaces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
-    if stack.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
-        raise ValueError(
-            f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the picture is of a sheet "
-            "in air: close it with an Interface of ior 1, or give it a base"
-        )
+    for part in stacks_of(stack):
+        _require_air_below(part)
     chosen = lj.AddingDoubling() if transport is None else transport
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
     prepared = lj.prepare(stack, chosen)
-    maps = _in_plane(prepared, stack.base is None)
+    maps = _in_plane(prepared, any(part.base is None for part in stacks_of(stack)))
     lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 7.2), layout="constrained")
@@ -92,7 +91,16 @@ def render(
     return figure
 
 
-def _sphere(stack: lj.Stack, prepared: lj.Prepared, light: tuple[float, float, float], size: int) -> Floats:
+def _require_air_below(stack: lj.Stack) -> None:
+    interfaces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
+    if stack.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
+        raise ValueError(
+            f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the picture is of a sheet "
+            "in air: close it with an Interface of ior 1, or give it a base"
+        )
+
+
+def _sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
     """Colours of the pixels, (size, size, 3) in 0 to 1."""
     number = SAMPLES * size
     place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04
@@ -114,7 +122,7 @@ def _sphere(stack: lj.Stack, prepared: lj.Prepared, light: tuple[float, float, f
     return _display(picture)
 
 
-def _sky(stack: lj.Stack, prepared: lj.Prepared, wo: Floats) -> Floats:
+def _sky(stack: lj.Stack | lj.Mixture, prepared: Prepared, wo: Floats) -> Floats:
     """Of a sky of radiance 1 all around, what reaches the viewer: by reciprocity what light from there scatters."""
     cosine = np.sin(0.5 * np.pi * (np.arange(SKY_COSINES) + 0.5) / SKY_COSINES)
     azimuth = np.linspace(-np.pi, np.pi, SKY_AZIMUTHS + 1)
@@ -132,7 +140,7 @@ def _display(radiance: Floats) -> Floats:
     return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * np.maximum(shown, 0.0031308) ** (1 / 2.4) - 0.055)
 
 
-def _lobes(axes: Axes, prepared: lj.Prepared, transmits: bool) -> None:
+def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
     """Lobes in the plane of incidence: mean f |cos| by the angle from the normal, the light coming from the left."""
     angle = np.radians(np.linspace(-180.0, 180.0, 721) if transmits else np.linspace(-90.0, 90.0, 361))
     wo = lj.direction(angle, 0.0)
@@ -150,7 +158,7 @@ def _lobes(axes: Axes, prepared: lj.Prepared, transmits: bool) -> None:
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
 
 
-def _in_plane(prepared: lj.Prepared, open_below: bool) -> dict[str, Floats]:
+def _in_plane(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
     """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
     wi = lj.direction(-_middle(INCIDENT), 0.0)[:, None]
     sides = {"reflected": lj.direction(_middle(OUTGOING), 0.0)}

@@ -77,7 +77,8 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
     """
     from fits.problem.parameters import Free
-    from fits.problem.stack_file import transport_to_dict, write_problem
+    from fits.problem.stack_file import write_problem
+    from fits.problem.tables import transport_to_dict
     from layerjax import Transport
 
     problem, transport = fit.problem, fit.problem.transport

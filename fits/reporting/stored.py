@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import layerjax as lj
 from fits.data.formats import read
 from fits.data.measurements import Measurements, Source
 
@@ -27,13 +28,14 @@ def held_out_of(directory: str | Path) -> Measurements | None:
 def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurements) -> "Problem":
     """What was fitted to what: the stack file, with what the fit chose beside it."""
     from fits.problem.problem import Problem
-    from fits.problem.stack_file import transport_from_dict
+    from fits.problem.tables import transport_from_dict
     from fits.reporting.earlier import noise_meant, transport_meant
 
     source = content["source"] | {"notes": tuple(content["source"]["notes"])}
     if "transport" in content:  # with the resolution that the fit chose
         transport = transport_from_dict(content["transport"])
     else:
+        assert isinstance(given.stack, lj.Stack)  # there were no mixtures
         transport = transport_meant(given.stack, given.transport)
     noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
     noise = noise_meant(noise, [entry["name"] for entry in content["parameters"]])

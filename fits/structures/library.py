@@ -7,7 +7,7 @@ from typing import Any
 
 import layerjax as lj
 from fits.problem.parameters import Free, LogUniform
-from fits.problem.stack_file import stack_from_dict
+from fits.problem.tables import stack_from_dict
 from fits.problem.values import check_keys, read_tables, require_table
 
 Structure = tuple[str, ...]

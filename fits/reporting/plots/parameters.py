@@ -13,7 +13,7 @@ from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
-    from layerjax import Stack
+    from layerjax import Mixture, Stack
 
 
 def corner_picture(posterior: "Posterior") -> Figure:
@@ -76,10 +76,13 @@ def correlation_picture(fit: "Fit") -> Figure:
     return figure
 
 
-def stack_picture(stack: "Stack") -> Figure:
-    """The layers from top to bottom, not to scale, each with its parameters; thin: an interface, hatched: a base."""
-    parts = [*stack.layers, *([] if stack.base is None else [stack.base])]
-    heights = [0.3 if type(part).__name__ == "Interface" else 0.8 for part in parts]
+def stack_picture(stack: "Stack | Mixture") -> Figure:
+    """The layers from top to bottom, not to scale, each with its parameters; thin: an interface, hatched: a base.
+
+    Parts of a mixture stand one below the other.
+    """
+    parts = _rows(stack)
+    heights = [0.3 if type(part).__name__ in ("Interface", "str") else 0.8 for part, _ in parts]
     with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(9.5, 0.62 * sum(heights) + 1.0))
         axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -89,16 +92,31 @@ def stack_picture(stack: "Stack") -> Figure:
         axes.annotate("", xy=(1.2, 0.0), xytext=(0.7, 0.8), arrowprops=arrow)
         axes.annotate("", xy=(1.7, 0.8), xytext=(1.2, 0.0), arrowprops=arrow)
         top = 0.0
-        for part, height in zip(parts, heights, strict=True):
-            is_base, is_line = part is stack.base, height < 0.5
+        for (part, is_base), height in zip(parts, heights, strict=True):
+            if isinstance(part, str):
+                axes.text(0.2, top - height / 2, part, va="center", fontsize=8, color=GREY)
+                top -= height
+                continue
+            is_line = height < 0.5
             face = "#c8c8c8" if is_base else "#8fb8d6" if is_line else "#dcecf7"
             hatch = "//" if is_base else None
             axes.add_patch(Rectangle((0.2, top - height), 2.4, height, facecolor=face, edgecolor=GREY, hatch=hatch))
             axes.text(2.8, top - height / 2, "\n".join(wrap(describe(part), 95)), va="center", fontsize=8.5, color=INK)
             top -= height
-        if stack.base is None:
-            axes.text(0.2, top - 0.05, "no base: light passes", va="top", fontsize=8, color=GREY)
     return figure
+
+
+def _rows(stack: "Stack | Mixture") -> list[tuple[object, bool]]:
+    """Layers, bases and words from top to bottom, and whether each is a base."""
+    import layerjax as lj
+
+    if isinstance(stack, lj.Mixture):
+        rows: list[tuple[object, bool]] = []
+        for (name, part), share in zip(stack.parts.items(), stack.shares().values(), strict=True):
+            rows += [(f"{name}: {100.0 * float(share):.3g} % of the area", False), *_rows(part)]
+        return rows
+    base = [("no base: light passes", False)] if stack.base is None else [(stack.base, True)]
+    return [*((layer, False) for layer in stack.layers), *base]
 
 
 def describe(part: object) -> str:

@@ -9,7 +9,8 @@ import pytest
 import layerjax as lj
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, is_free
-from fits.problem.stack_file import read_problem, stack_from_dict, stack_to_dict, write_problem
+from fits.problem.stack_file import read_problem, write_problem
+from fits.problem.tables import stack_from_dict, stack_to_dict
 from tests.helpers import places
 
 EXAMPLES = sorted(places.EXAMPLES.glob("*.toml"))
