@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
     from fits.problem.correlated import Correlated as Correlated
+    from fits.problem.instrument import Instrument as Instrument
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -66,6 +67,7 @@ _HOMES = {
     "slices": "data.geometry",
     "Combination": "inference.identifiability",
     "Correlated": "problem.correlated",
+    "Instrument": "problem.instrument",
     "Noise": "problem.likelihood",
     "Measurements": "data.measurements",
     "fit": "inference.optimise",

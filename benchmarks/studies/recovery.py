@@ -17,7 +17,8 @@ import fits
 import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
-from fits.inference.optimise import Repeats, fit_many, fit_problem
+from fits.inference.optimise import fit_problem
+from fits.inference.repeats import Repeats, fit_many
 
 Floats = NDArray[np.float64]
 

@@ -63,6 +63,7 @@ def fit(arguments: Namespace) -> int:
             noise=given.noise,
             scale=given.scale,
             objective=objective,
+            instrument=given.instrument,
             starts=arguments.starts,
             seed=arguments.seed,
             solver=arguments.solver,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 
 LIGHT_AZIMUTH = 180.0  # degrees; the plane of incidence is x-z and the mirror direction lies at azimuth 0
+AT_NORMAL = 1e-6  # degrees from the normal below which a direction has no azimuth
 TANGENT_COSINE = 1e-9  # a direction with a smaller |cos theta| counts as lying in the surface
 
 

@@ -2,28 +2,26 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
-from fits.inference.descent import PROMISE, ROUGHLY, descend
+from fits.inference.descent import PROMISE, ROUGHLY
 from fits.inference.fit_result import ENDED, Alone, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
-from fits.inference.resolution import at_start, resolutions
+from fits.inference.resolution import resolutions
 from fits.inference.shared_errors import alone, are_shared, left_open, points
-from fits.inference.starts import MOST_STEPS, End, Solver, race, rough_end, run_starts, start_points, unit_of
+from fits.inference.starts import End, Solver, race, rough_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
-from fits.problem.compiled import cores, in_shares
+from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise, Objective
-from fits.problem.model import Model, Transport
+from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -38,15 +36,6 @@ SAME_COST = 1e-3
 """Costs agree within this, in the log-posterior, times the reduced chi-square where that is above 1."""
 
 
-class Repeats(NamedTuple):
-    """Fits of K data sets: vectors and standard errors (K, P), cost and convergence (K,)."""
-
-    vectors: Floats
-    standard_errors: Floats
-    cost: Floats
-    converged: NDArray[np.bool_]
-
-
 def fit(
     stack: Any,
     data: Measurements,
@@ -55,6 +44,7 @@ def fit(
     noise: Noise | None = None,
     scale: float | Free | None = None,
     objective: Objective = "likelihood",
+    instrument: Instrument | None = None,
     starts: int = 32,
     seed: int = 0,
     solver: Solver = "least_squares",
@@ -66,9 +56,9 @@ def fit(
     Args:
         stack: holds `Free` where a number is to be fitted.
         data: only the samples that its mask leaves in are used.
-        transport, noise, scale, objective: see `Problem`. A resolution that the transport leaves open is chosen: coarse
-            for the starts, at the end so fine that the numerical error of the model stays below a tenth of the data's
-            standard deviation, where that is within reach. `Fit.problem` has it.
+        transport, noise, scale, objective, instrument: see `Problem`. A resolution that the transport leaves open is
+            chosen: coarse for the starts, at the end so fine that the numerical error of the model stays below a tenth
+            of the data's standard deviation, where that is within reach. `Fit.problem` has it.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
             parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or
@@ -81,7 +71,7 @@ def fit(
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
-    problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective)
+    problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
     return fit_problem(problem, starts=starts, seed=seed, solver=solver, progress=progress, checkpoint=checkpoint)
 
 
@@ -229,48 +219,6 @@ def _ends(
 
     with StartsFile(checkpoint, problem, points, solver) as kept:
         return run_starts(problem, points, solver, progress, kept)
-
-
-def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int = 0) -> Repeats:
-    """Fit K data sets (K, N, C) in the place of the problem's used values, in one compiled program.
-
-    Args:
-        problem: gives the stack, the directions and the noise. A resolution that its transport leaves open is that of
-            the start values; the problem of a `Fit` has the one that the noise asks for.
-        values: BSDF in 1/sr, (K, N, C).
-        starts: of each fit; the lowest end is kept, converged or not.
-        seed: of the starts.
-
-    Returns:
-        Vectors and standard errors (K, P), costs and convergence (K,). The errors are those of the unbounded optimum:
-        they mean nothing for parameters that end on a bound.
-
-    Raises:
-        ValueError: values of another shape.
-    """
-    values, problem = np.asarray(values, float), at_start(problem)
-    expected = problem.model.values.shape
-    if values.ndim != 3 or values.shape[1:] != expected:
-        raise ValueError(f"values has shape {values.shape}; it must be (K, {expected[0]}, {expected[1]})")
-    points = start_points(problem, starts, seed)
-    workers = max(1, min(cores(), len(values)))
-    share = -(-len(values) // (4 * workers)) if workers > 1 else len(values)
-    return Repeats(*in_shares(lambda part: problem.call(_solve_repeats, points, part), values, share))
-
-
-def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
-    def one(row: Array) -> tuple[Array, Array, Array, Array]:
-        repeat = eqx.tree_at(lambda m: m.values, model, row)
-        most, promise = jnp.asarray(MOST_STEPS), jnp.asarray(PROMISE)
-        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, promise), starts)
-        end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
-        width = model.box.slope(end.vector)
-        covariance = jnp.linalg.pinv(end.root.T @ end.root + jnp.diag(model.box.prior_slopes() ** 2), hermitian=True)
-        if model.objective != "likelihood":
-            covariance = covariance * 2.0 * end.cost / max(row.size - width.size, 1)
-        return end.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, end.cost, end.converged
-
-    return jax.lax.map(one, values)
 
 
 def _minima(

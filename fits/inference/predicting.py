@@ -15,10 +15,12 @@ from fits.inference.fit_result import Fit
 from fits.inference.importance import UNRELIABLE, weighted
 from fits.inference.posterior import Posterior
 from fits.inference.prediction import Floats, Prediction, banded, require_level
+from fits.problem.instrument import gain_unknown
 from fits.problem.logarithm import logarithm, size
 from fits.problem.logarithm import softness as soft
 from fits.problem.model import Model
 from fits.problem.nodes import places
+from fits.problem.problem import polar_angles
 
 LEAST_DRAWS = 400
 """Of the approximation that draws of a posterior are chosen from."""
@@ -122,6 +124,7 @@ def _readings(
 ) -> tuple[Floats, Floats, Floats | None]:
     """Means, scales and softness of readings (see `Prediction`), where the model has these values, (D, M, C)."""
     relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
+    relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
     if fit.problem.model.process is None:
         return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None
     lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))

@@ -16,6 +16,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.problem.instrument import Optics, Setting
 from fits.problem.likelihood import (
     Objective,
     Tails,
@@ -46,11 +47,13 @@ Side = Literal["all", "reflection"]
 class Parts(NamedTuple):
     """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
 
-    correlation: of errors that readings share, None where they share none.
+    instrument: None where there is nothing to say of it. correlation: of errors that readings share, None where they
+    share none.
     """
 
     stack: Any
     scale: Array
+    instrument: Setting | None
     relative: Array
     floor: Array
     correlation: Correlation | None
@@ -72,6 +75,7 @@ class Model(eqx.Module):
         transport: how the values are computed.
         side: "reflection" if all directions lie above.
         known: what is known of the directions beforehand.
+        optics: how an instrument sees them, None where there is nothing to say of it.
         process: errors that readings share, None where they share none.
         softness: of their `logarithm`, (N, C), in 1/sr; None where they share none.
         objective, tails: see `Problem` and `Noise`.
@@ -89,6 +93,7 @@ class Model(eqx.Module):
     degrees_of_freedom: Array
     transport: Transport
     known: lj.KnownDirections | None
+    optics: Optics | None
     process: Process | None
     softness: Array | None
     side: Side = eqx.field(static=True)
@@ -104,7 +109,14 @@ class Model(eqx.Module):
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr."""
         parts = self.build(vector)
-        return parts.scale * forward(parts.stack, self.wi, self.wo, self.transport, self.side, self.known)
+
+        def values(wi: Array, wo: Array, known: lj.KnownDirections | None) -> Array:
+            return forward(parts.stack, wi, wo, self.transport, self.side, known)
+
+        if self.optics is None:
+            return parts.scale * values(self.wi, self.wo, self.known)
+        assert parts.instrument is not None
+        return parts.scale * self.optics.seen(values, parts.instrument, len(self.wi))
 
     def sigma(self, vector: Array) -> Array:
         """Scale of the noise, (N, C), in 1/sr."""

@@ -19,8 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 
 import layerjax as lj
 from fits.data.measurements import Measurements
+from fits.data.scans import incidences
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
+from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.levels import Levels, noise_levels
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Parts, Side, Transport
@@ -50,6 +52,7 @@ class Problem:
         noise: how a datum scatters about the model.
         scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".
+        instrument: by which the readings were taken; None: exact directions, one scale.
 
     Raises:
         ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
@@ -62,6 +65,7 @@ class Problem:
     noise: Noise = field(default_factory=Noise)
     scale: float | Free | None = None
     objective: Objective = "likelihood"
+    instrument: Instrument | None = None
 
     def __post_init__(self) -> None:
         _ = self._assembled  # now, so that what does not fit together is refused where it was given
@@ -116,13 +120,7 @@ class Problem:
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
-        model = replace(
-            self.model,
-            wi=jnp.asarray(wi),
-            wo=jnp.asarray(wo),
-            known=lj.known_directions(wi, wo) if _uses_known(self.transport) else None,
-            side=_side(wi, wo),
-        )
+        model = replace(self.model, **_directions(self, wi, wo))
         arrays, static = eqx.partition(model, eqx.is_array)
         return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
 
@@ -164,6 +162,10 @@ class Problem:
         return arrays, Static(static)
 
 
+PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.correlated")
+"""How names begin of what stands in each place of `Parts`."""
+
+
 class _Assembled(NamedTuple):
     """What follows from a problem as it was given; start, low, high: (P,)."""
 
@@ -179,7 +181,7 @@ def _assemble(problem: Problem) -> _Assembled:
     used = problem.data.used()
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
-    levels = noise_levels(problem.noise, used)
+    levels = noise_levels(_with_floor(problem.noise, problem.instrument), used)
     process = make_process(used.wi, used.wo) if problem.noise.correlated else None
     if process is not None:
         process = replace(process, gram=levels.gram(process, used.values))
@@ -213,7 +215,8 @@ def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple
     if process is not None:
         assert isinstance(problem.noise.correlated, Correlated)
         correlation = numbers_of(problem.noise.correlated, process, problem.data.values.shape[1])
-    rest = (scale, levels.relative, levels.floor, correlation)
+    instrument = None if problem.instrument is None else setting_of(problem.instrument, polar_angles(problem.data))
+    rest = (scale, instrument, levels.relative, levels.floor, correlation)
     return (stack, *jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free))
 
 
@@ -235,7 +238,7 @@ def _require_room(mixture: lj.Mixture) -> None:
 
 def _parameter_name(path: str) -> str:
     """The name of a place in the tuple that `_numbers` returns."""
-    for index, name in enumerate(("", "scale", "noise.relative", "noise.floor", "noise.correlated")):
+    for index, name in enumerate(PLACES):
         if path.startswith(f"[{index}]"):
             return plain_name(name + path.removeprefix(f"[{index}]"))
     return path
@@ -270,22 +273,47 @@ def _model(
     return Model(
         template=template,
         box=box,
-        wi=jnp.asarray(used.wi),
-        wo=jnp.asarray(used.wo),
         values=jnp.asarray(used.values),
         variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
         lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
         degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
         transport=problem.transport,
-        known=lj.known_directions(used.wi, used.wo) if _uses_known(problem.transport) else None,
         process=process,
         softness=None if process is None else jnp.asarray(levels.softness(used.values)),
-        side=_side(used.wi, used.wo),
         objective=problem.objective,
         tails=problem.noise.tails,
         varying=levels.varying if process is None else levels.fitted,
         moving=sum(not name.startswith("noise.") for name in names),
+        **_directions(problem, used.wi, used.wo),
     )
+
+
+def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
+    """What a model holds of readings along these directions, (N, 3) each."""
+    follow, given, optics = _uses_known(problem.transport), problem.instrument, None
+    if given is not None:
+        optics = optics_of(given, problem.stack, wi, wo, polar_angles(problem.data), follow)
+    return {
+        "wi": jnp.asarray(wi),
+        "wo": jnp.asarray(wo),
+        "known": lj.known_directions(wi, wo) if follow and optics is None else None,
+        "optics": optics,
+        "side": _side(wi, wo),
+    }
+
+
+def _with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
+    """The noise with an instrument's floor."""
+    if instrument is None or instrument.floor is None:
+        return noise
+    if noise.floor is not None:
+        raise ValueError("Noise.floor and Instrument.floor are both given; there is one floor")
+    return replace(noise, floor=instrument.floor)
+
+
+def polar_angles(data: Measurements) -> Floats:
+    """Of the light, (K,), for each incidence of the used samples, in degrees."""
+    return np.unique([one.theta for one in incidences(data.used())])
 
 
 def _side(wi: Floats, wo: Floats) -> Side:
@@ -310,6 +338,8 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 def _unit(name: str) -> str:
     if name == "noise.floor":
         return "1/sr"
+    if name == "instrument.offset":
+        return "deg"
     if name.startswith("noise.correlated.") and not name.endswith((".amplitude", ".growth", ".channels")):
         return "deg"
     return "optical depth" if re.sub(r"\[\d+\]$", "", name).endswith("thickness") else "1"

@@ -21,12 +21,14 @@
                                                # correlated: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
+    [instrument]                               # optional: source, detector, offset, gain_per_incidence, floor
+
 Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
 ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -34,10 +36,13 @@ import tomli_w
 
 import layerjax as lj
 from fits._files import write_text
+from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.parameters import Free
 from fits.problem.tables import (
     MATERIAL,
+    changed_to_dict,
+    instrument_from_dict,
     material_from_dict,
     material_to_dict,
     noise_from_dict,
@@ -59,6 +64,7 @@ class ProblemFile:
     noise: Noise
     scale: Free | None
     objective: Objective
+    instrument: Instrument | None
     about: Mapping[str, str]
     text: str
 
@@ -72,7 +78,7 @@ def read_problem(path: str | Path) -> ProblemFile:
     path = Path(path)
     text, tables = read_tables(path)
     try:
-        known = ("about", "transport", "objective", *MATERIAL, "noise", "scale")
+        known = ("about", "transport", "objective", *MATERIAL, "noise", "scale", "instrument")
         check_keys("the file", tables, known)
         return ProblemFile(
             stack=material_from_dict({key: tables[key] for key in MATERIAL if key in tables}),
@@ -80,6 +86,7 @@ def read_problem(path: str | Path) -> ProblemFile:
             noise=noise_from_dict(tables.get("noise", {})),
             scale=scale_from_dict(tables["scale"]) if "scale" in tables else None,
             objective=cast(Objective, choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
+            instrument=instrument_from_dict(tables["instrument"]) if "instrument" in tables else None,
             about=_about(tables.get("about", {})),
             text=text,
         )
@@ -95,6 +102,7 @@ def write_problem(
     noise: Noise | None = None,
     scale: Free | None = None,
     objective: Objective = "likelihood",
+    instrument: Instrument | None = None,
     force: bool = False,
 ) -> None:
     """Write a TOML file that `read_problem` reads back to the same.
@@ -102,7 +110,8 @@ def write_problem(
     Args:
         path: the file.
         stack: may hold `Free`.
-        transport, noise, scale, objective: see `Problem`; what is left out of the call is left out of the file.
+        transport, noise, scale, objective, instrument: see `Problem`; what is left out of the call is left out of the
+            file.
         force: replace a file that is there.
 
     Raises:
@@ -116,11 +125,9 @@ def write_problem(
         tables["objective"] = objective
     tables |= material_to_dict(stack)
     if noise is not None:
-        tables["noise"] = {
-            entry.name: to_plain(getattr(noise, entry.name))
-            for entry in fields(noise)
-            if getattr(noise, entry.name) != entry.default
-        }
+        tables["noise"] = changed_to_dict(noise)
+    if instrument is not None:
+        tables["instrument"] = changed_to_dict(instrument)
     if scale is not None:
         tables["scale"] = to_plain(scale)
     write_text(path, tomli_w.dumps(tables), force)

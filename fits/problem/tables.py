@@ -10,6 +10,7 @@ import numpy as np
 
 import layerjax as lj
 from fits.problem.correlated import Correlated
+from fits.problem.instrument import Instrument
 from fits.problem.likelihood import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
 from fits.problem.values import (
@@ -227,6 +228,26 @@ def _correlated(value: Any) -> Correlated | bool:
     check_keys(where, require_table(where, value), names)
     given: dict[str, Any] = {key: _number_or_free(f"{where}.{key}", entry, ANY) for key, entry in value.items()}
     return Correlated(**given)
+
+
+def instrument_from_dict(table: Any) -> Instrument:
+    """An instrument, from the table of that name."""
+    table = require_table("instrument", table)
+    check_keys("instrument", table, tuple(entry.name for entry in fields(Instrument)))
+    given: dict[str, Any] = {
+        key: _free(f"instrument.{key}", value) if isinstance(value, dict) else one_number(f"instrument.{key}", value)
+        for key, value in table.items()
+    }
+    try:
+        return Instrument(**given)
+    except ValueError as error:
+        raise ValueError(str(error).replace("Instrument.", "instrument.")) from None
+
+
+def changed_to_dict(of: Noise | Instrument) -> dict[str, Any]:
+    """What is not as it is by default, of plain numbers, strings, lists and dictionaries."""
+    every = {entry.name: (getattr(of, entry.name), entry.default) for entry in fields(of)}
+    return {name: to_plain(value) for name, (value, default) in every.items() if value != default}
 
 
 def scale_from_dict(table: Any) -> Free:

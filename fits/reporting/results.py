@@ -96,6 +96,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
             noise=problem.noise,
             scale=scale,
             objective=problem.objective,
+            instrument=problem.instrument,
         )
     write_problem(folder / FITTED, fit.stack, transport=transport)
     content = {

@@ -40,7 +40,8 @@ def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurem
     noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
     noise = noise_meant(noise, [entry["name"] for entry in content["parameters"]])
     scale = given.scale if given.scale is not None else content["fixed_scale"]
-    return Problem(given.stack, replace(data, source=Source(**source)), transport, noise, scale, given.objective)
+    data = replace(data, source=Source(**source))
+    return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
 
 
 def stored_number(value: float | str) -> float:

@@ -19,7 +19,8 @@ import layerjax as lj
 from benchmarks.measuring.timing import interleaved
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.suite.scenes import pairs
-from fits.inference.optimise import fit_many, fit_problem
+from fits.inference.optimise import fit_problem
+from fits.inference.repeats import fit_many
 
 Floats = NDArray[np.float64]
 

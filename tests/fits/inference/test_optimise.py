@@ -13,7 +13,8 @@ import layerjax as lj
 from fits.data.geometry import slices
 from fits.inference.descent import PROMISE
 from fits.inference.identifiability import Combination
-from fits.inference.optimise import fit, fit_many, fit_problem, start_points
+from fits.inference.optimise import fit, fit_problem, start_points
+from fits.inference.repeats import fit_many
 from fits.problem.compiled import _run
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal

@@ -14,7 +14,8 @@ from fits.inference import refinement
 from fits.inference import resolution as resolution_module
 from fits.inference import starts as starts_module
 from fits.inference.fit_result import Fit
-from fits.inference.optimise import fit, fit_many
+from fits.inference.optimise import fit
+from fits.inference.repeats import fit_many
 from fits.inference.resolution import ENOUGH, LEAST_SCATTER, resolutions, spread
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free

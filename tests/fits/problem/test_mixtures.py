@@ -8,7 +8,7 @@ import pytest
 import fits
 import layerjax as lj
 from fits.cli.parser import main
-from fits.inference.optimise import fit_many
+from fits.inference.repeats import fit_many
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reporting.plots.data import as_png

@@ -1,0 +1,70 @@
+"""Where a reading has to be the mean over a cone of directions, by what a stack may hold: see `needs_cone`."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+import layerjax as lj
+from fits.problem.parameters import is_free
+from layerjax.mixture import stacks_of
+
+SHIFT = 1e-3
+"""Relative difference between a mean over a cone and its middle that does not count."""
+
+STEEPEST = np.radians(85.0)
+"""Of a half vector."""
+
+LEAST = 1e-6
+"""Of the squared sum of two directions."""
+
+Floats = NDArray[np.float64]
+
+
+def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Floats) -> NDArray[np.bool_]:
+    """Readings (N,) whose mean over the cones may differ from their middle by more than `SHIFT`.
+
+    GGX facets of width alpha whose half vector lies at tangent t change by at most 2 r^2 / (t^2 + alpha^2) over a disc
+    of radius r, half of that of the cones over the cosine of the difference angle; what faces elsewhere (particles,
+    tilted flakes) counts as if it were met at its peak, light that passes as narrow. Cosines change by r^2 / (2 cos)^2.
+
+    Args:
+        source, detector: full angles of the cones, degrees.
+        stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks all may be narrow.
+        wi, wo: (N, 3).
+    """
+    if not isinstance(stack, lj.Stack | lj.Mixture):
+        return np.ones(len(wi), bool)
+    radii = np.radians(0.5 * source), np.radians(0.5 * detector)
+    facets, others = _narrowest(stack)
+    half = wi + wo
+    square = (radii[0] ** 2 + radii[1] ** 2) / np.maximum(np.sum(half**2, axis=-1), LEAST)
+    tilt = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2]))
+    nearest = np.maximum(np.tan(np.minimum(tilt, STEEPEST)) - np.sqrt(square), 0.0)
+    lobe = 2.0 * square / (nearest**2 + facets**2) + 2.0 * square / others**2
+    steep = [0.25 * (r / np.maximum(np.abs(w[:, 2]), r)) ** 2 for r, w in zip(radii, (wi, wo), strict=True) if r > 0.0]
+    return (np.maximum(lobe, sum(steep)) > SHIFT) | (wi[:, 2] * wo[:, 2] < 0.0)
+
+
+def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
+    """Width of the narrowest facets that face up, and of anything else; infinite where there are none."""
+    facets, others = [np.inf], [np.inf]
+    for stack in stacks_of(material):
+        for part in (*stack.layers, stack.base):
+            if isinstance(part, lj.Interface | lj.Conductor):
+                facets.append(_least(part.alpha))
+            elif isinstance(part, lj.Medium):
+                for phase in (_at(part.phase, end) for end in (1, 2)):
+                    upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
+                    (facets if upright else others).append(float(np.min(phase.width)))
+    return min(facets), min(others)
+
+
+def _least(alpha: Any) -> float:
+    return float(np.min(alpha.arrays()[1] if is_free(alpha) else np.asarray(alpha)))
+
+
+def _at(phase: lj.PhaseFunction, end: int) -> lj.PhaseFunction:
+    """With free parameters at their lower (1) or upper (2) bounds."""
+    return jax.tree.map(lambda leaf: leaf.arrays()[end] if is_free(leaf) else leaf, phase, is_leaf=is_free)
