@@ -99,9 +99,17 @@ class Mixture(eqx.Module):
 
 def stacks_of(material: Stack | Mixture) -> list[Stack]:
     """The stacks that a material is made of; itself, if it is one."""
-    if isinstance(material, Mixture):
-        return [stack for part in material.parts.values() for stack in stacks_of(part)]
-    return [material]
+    return list(stacks_by_name(material).values())
+
+
+def stacks_by_name(material: Stack | Mixture, prefix: str = "") -> dict[str, Stack]:
+    """The stacks that a material is made of, by what names of their numbers begin with, such as ``coat.``."""
+    if not isinstance(material, Mixture):
+        return {prefix: material}
+    found: dict[str, Stack] = {}
+    for name, part in material.parts.items():
+        found |= stacks_by_name(part, f"{prefix}{name}.")
+    return found
 
 
 def _by_name(parts: Mapping[str, Any], weights: Any) -> dict[str, Any]:

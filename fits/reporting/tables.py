@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TextIO
 import numpy as np
 
 from fits.data.scans import in_plane, incidences
+from fits.inference.limits import instrument_limits
 from fits.reporting.diagnostics import ResidualStructure
 from fits.reporting.verdicts import identifiability
 
@@ -112,12 +113,12 @@ def html_table(table: Table) -> str:
 
 def parameter_table(fit: "Fit") -> Table:
     """Value, standard error, unit, bounds and what the data says about each fitted parameter."""
-    verdicts = identifiability(fit)
+    verdicts, limits = identifiability(fit), instrument_limits(fit)
     rows = []
     for index, (name, value) in enumerate(fit.values.items()):
         low, high = float(fit.problem.low[index]), float(fit.problem.high[index])
         error = fit.standard_errors[name]
-        number, spread = with_error(value, error)
+        number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
         rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
     note = (
         ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
+from fits.inference.limits import instrument_limits
 from fits.inference.resolution import ENOUGH
 from fits.problem.model import Model
 from fits.reporting.diagnostics import ResidualStructure
@@ -26,6 +27,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
     """For each parameter, in a few words, whether the data determines it; combinations count from 1, worst first."""
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
+    limits = instrument_limits(fit)
     worst = {name: place for place in range(len(fit.unresolved), 0, -1) for name in fit.unresolved[place - 1].weights}
     words = {}
     for index, name in enumerate(names):
@@ -34,6 +36,8 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
         if name in fit.without_influence:
             words[name] = "NO INFLUENCE on the data"
+        elif name in limits:
+            words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
         elif name in worst:
@@ -101,6 +105,8 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
     sentences += shared_errors(fit)
     if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
+    for name, least in instrument_limits(fit).items():
+        sentences.append(f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved.")
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
     if fit.without_influence:

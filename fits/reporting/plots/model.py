@@ -167,9 +167,6 @@ def assumed_sigma(fit: "Fit") -> Floats:
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
-    from fits.problem.compiled import run
-    from layerjax import known_directions
-
     data = fit.problem.data
     flat, signed = in_plane(data), signed_angle(data)
     angles, wi, wo = [], [], []
@@ -183,10 +180,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
-    along = np.concatenate(wi), np.concatenate(wo)
-    # what is known of them counts as in the fit, so that curves run through its values
-    known = None if fit.problem.model.known is None else known_directions(*along)
-    values = np.asarray(run(_along, fit.problem.split_model, vectors, *along, known))
+    values = np.asarray(fit.problem.predict_at(vectors, np.concatenate(wi), np.concatenate(wo)))
     values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
     band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
     ends = np.cumsum([len(angle) for angle in angles])
@@ -194,16 +188,3 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
         _Curve(angle, values[0, end - len(angle) : end], None if band is None else band[:, end - len(angle) : end])
         for angle, end in zip(angles, ends, strict=True)
     ]
-
-
-def _along(model: Any, vectors: Any, wi: Any, wo: Any, known: Any) -> Any:
-    """Scaled BSDF (S, M, C) of the stacks that `vectors` (S, P) describe."""
-    import jax
-
-    from fits.problem.model import forward
-
-    def one(vector: Any) -> Any:
-        parts = model.build(vector)
-        return parts.scale * forward(parts.stack, wi, wo, model.transport, known=known)
-
-    return jax.lax.map(one, vectors)

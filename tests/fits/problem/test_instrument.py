@@ -14,6 +14,7 @@ from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
+from tests.helpers.cones import mean_over_cones
 
 SINGLE = lj.SingleScattering()
 GEOMETRY = fits.slices([10.0, 40.0, 65.0], np.arange(-80.0, 81.0, 4.0))
@@ -31,34 +32,6 @@ def readings(geometry: fits.Geometry = GEOMETRY) -> Measurements:
 
 def problem(instrument: Instrument | None, low: float = 0.02, geometry: fits.Geometry = GEOMETRY) -> Problem:
     return Problem(metal(Free(0.2, low, 1.0)), readings(geometry), SINGLE, EXACT, instrument=instrument)
-
-
-def disc(w: np.ndarray, width: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Directions over a cone about w (3,) of this full angle, (K, 3), and their shares of its solid angle."""
-    radius = np.radians(0.5 * width)
-    x, weights = np.polynomial.legendre.leggauss(count)
-    cosine = 0.5 * (1.0 + np.cos(radius)) + 0.5 * (1.0 - np.cos(radius)) * x
-    turn = 2.0 * np.pi * (np.arange(2 * count) + 0.5) / (2 * count)
-    helper = np.array([0.0, 1.0, 0.0]) if abs(w[1]) < 0.5 else np.array([1.0, 0.0, 0.0])
-    first = np.cross(helper, w) / np.linalg.norm(np.cross(helper, w))
-    across = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * np.cross(w, first)
-    sine = np.sqrt(1.0 - cosine**2)
-    found = cosine[:, None, None] * w + sine[:, None, None] * across
-    return found.reshape(-1, 3), np.repeat(0.5 * weights, 2 * count) / (2 * count)
-
-
-def mean_over_cones(stack: lj.Stack, wi: np.ndarray, wo: np.ndarray, source: float, detector: float) -> np.ndarray:
-    """Readings (N, C), each by some thousand pairs of directions."""
-    found = []
-    for i, o in zip(wi, wo, strict=True):
-        (lights, a), (views, b) = (
-            disc(w, width, 6) if width else (w[None], np.ones(1)) for w, width in ((i, source), (o, detector))
-        )
-        values = np.asarray(lj.evaluate(stack, lights[:, None], views[None], SINGLE))
-        cosines = np.abs(lights[:, None, 2] * views[None, :, 2]) / abs(i[2] * o[2])
-        above = (lights[:, None, 2] * i[2] > 0.0) & (views[None, :, 2] * o[2] > 0.0)
-        found.append(np.einsum("i,j,ijc->c", a, b, values * (cosines * above)[..., None]))
-    return np.array(found)
 
 
 @pytest.mark.parametrize(("source", "detector"), [(0.0, 2.0), (1.5, 0.0), (1.0, 3.0), (3.0, 3.0)])
