@@ -210,6 +210,7 @@ def search(arguments: Namespace) -> int:
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
     from fits.reporting import tables
+    from fits.reporting.data_statements import data_statements
     from fits.reporting.plots.data import as_png, data_picture
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
@@ -218,6 +219,8 @@ def info(arguments: Namespace) -> int:
     data = _measurements(arguments)
     for table in (tables.source_table(data), tables.data_table(data)):
         tables.print_table(table, sys.stdout)
+    for sentence in data_statements(data):
+        print(sentence)
     if Path(out).exists() and not arguments.force:
         print(f"Picture: {out} exists already (--force draws it again)")
         return DONE

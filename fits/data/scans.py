@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, Pairs
+from fits.data.geometry import AT_NORMAL as AT_NORMAL
+from fits.data.geometry import LIGHT_AZIMUTH, Pairs
 
 SAME_ANGLE = 0.5  # degrees: closer incidences are one incidence, closer azimuths one plane
 SHORTEST_SCAN = 5  # points in one plane before neighbours in it mean anything

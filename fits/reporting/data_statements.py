@@ -1,0 +1,81 @@
+"""What measurements allow, in plain sentences: see `fits.data.checks`."""
+
+import math
+from typing import TYPE_CHECKING
+
+from fits.data.checks import Energy, Pairs, Peak, energies, peaks, reciprocity, repeats, symmetry
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+
+FEWEST = 3
+"""Readings above half of a peak's height from which its width is sampled."""
+
+SHOWN = 6
+"""Incidences whose energy is listed."""
+
+
+def data_statements(data: "Measurements") -> list[str]:
+    """Sentences on reciprocity, energy, symmetry, sampling and repeated readings of the used samples."""
+    return [
+        _reciprocity(reciprocity(data)),
+        _energy(energies(data)),
+        _symmetry(symmetry(data)),
+        _sampling(peaks(data)),
+        _repeats(repeats(data)),
+    ]
+
+
+def _reciprocity(found: Pairs | None) -> str:
+    if found is None:
+        return "Reciprocity: no two readings have light and viewer the other way round, it cannot be tested."
+    return (
+        f"Reciprocity: in {found.count:,} pairs of readings light and viewer change places; {_apart(found)}. "
+        "No reciprocal model comes closer to these than half of that."
+    )
+
+
+def _symmetry(found: Pairs | None) -> str:
+    if found is None:
+        return "Symmetry: no readings lie on both sides of the plane of incidence, it cannot be tested."
+    return f"Symmetry: {found.count:,} pairs lie on either side of the plane of incidence; {_apart(found)}."
+
+
+def _repeats(found: Pairs | None) -> str:
+    if found is None:
+        return "Repeats: no reading was taken twice; the noise has to come from the file's sigma or from the fit."
+    noise = 100.0 * found.median / (0.6745 * math.sqrt(2.0))
+    return f"Repeats: {found.count:,} readings were taken again; {_apart(found)}: a noise of about {noise:.2g} %."
+
+
+def _apart(found: Pairs) -> str:
+    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.most:.2g} %)"
+    return words if math.isnan(found.z) else f"{words}, {found.z:.2g} of their standard errors"
+
+
+def _energy(found: list[Energy]) -> str:
+    if not found:
+        return "Energy: no incidence has readings over half of the hemisphere, what is reflected in all is not known."
+    parts = []
+    for one in found[:SHOWN]:
+        share = "/".join(f"{part:.3g}" for part in one.share)
+        parts.append(f"{share} of the light at {one.theta:g}° over {100.0 * one.covered:.0f} % of it")
+    more = f", and {len(found) - SHOWN} more incidences" if len(found) > SHOWN else ""
+    words = f"Energy, by the projected hemisphere that is covered: {'; '.join(parts)}{more}."
+    above = [one for one in found if max(one.share) > 1.0]
+    if above:
+        words += f" More than all of it at {', '.join(f'{one.theta:g}°' for one in above)}: the scale is wrong."
+    return words
+
+
+def _sampling(found: list[Peak]) -> str:
+    if not found:
+        return "Sampling: no scan crosses the mirror direction of its light, the peak was not seen."
+    worst = min(found, key=lambda one: one.readings)
+    words = (
+        f"Sampling: the peak about the mirror direction holds {worst.readings} readings above half its height at least "
+        f"(at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
+    )
+    if worst.readings < FEWEST:
+        return f"{words}: it may be narrower than the steps, and a roughness fitted to it is limited by them."
+    return f"{words}: its width is sampled."
