@@ -35,7 +35,14 @@ from layerjax.stack import (
     simplify,
 )
 from layerjax.transport import Side, Transport
-from layerjax.transport.known_directions import MOST_COSINES, Known, KnownDirections, known_directions, own_cosines
+from layerjax.transport.known_directions import (
+    MOST_COSINES,
+    Known,
+    KnownDirections,
+    known_above,
+    known_directions,
+    own_cosines,
+)
 
 
 def evaluate(
@@ -297,14 +304,15 @@ def _evaluate_map(
     pairs = math.prod(at.ahead)
     own_known = not at.shared and 0 < 2 * pairs <= MOST_COSINES
     first = [w if at.shared else w[0] for w in directions] if pairs and not at.empty else None
-    known = None
+    known, above = None, own_known and known_above(wi, wo)
     if first is not None:
-        known = own_cosines(*first) if own_known else known_directions(*first)
+        known = own_cosines(first[0], first[1], above) if own_known else known_directions(*first)
     mapped, chosen, _ = _mapped(stack, transport, shape, wi, wo, known=lambda: known)
     given, channels = chosen.needed(key, "evaluate"), channel_count(stack)
     if not chosen.uses_known:
         known, own_known = None, False
-    return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own_known)
+    own = maps.Own(own_known, above)
+    return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own)
 
 
 def _check_side(side: Side) -> None:

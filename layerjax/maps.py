@@ -57,6 +57,13 @@ class Layout(NamedTuple):
         return jnp.swapaxes(found, 0, 1).reshape(*self.result, *found.shape[2:])
 
 
+class Own(NamedTuple):
+    """Whether the directions of each texel are few enough to be known, and whether all are known to lie above."""
+
+    known: bool
+    above: bool
+
+
 def layout(shape: Shape, *directions: Array) -> Layout:
     """How directions (..., 3) lie over a map of this shape.
 
@@ -136,16 +143,15 @@ def values(
     channels: int,
     key: Array | None,
     known: KnownDirections | None,
-    own_known: bool,
+    own: Own,
 ) -> Array:
     """BSDF of every texel of a simplified map, ``at.result + (channels,)``.
 
-    directions: wi and wo as `Layout.spread` gives them. known: of directions that are shared; own_known: whether those
-    of each texel are few enough to be known.
+    directions: wi and wo as `Layout.spread` gives them. known: of directions that are shared.
     """
 
     def one(stack: Stack, wi: Array, wo: Array, key: Array | None) -> tuple[Array, ...]:
-        state = transport.prepare_for(stack, lambda: own_cosines(wi, wo) if own_known else known)
+        state = transport.prepare_for(stack, lambda: own_cosines(wi, wo, own.above) if own.known else known)
         found, _ = transport.measured(state, wi, wo, side, channels, key)
         return tuple(found[..., c] for c in range(channels))
 

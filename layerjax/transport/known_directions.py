@@ -67,10 +67,15 @@ def known_directions(wi: Any, wo: Any) -> KnownDirections | None:
     return KnownDirections(above, below, i, o, all_above=bool(np.all(z > 0)))
 
 
-def own_cosines(wi: Array, wo: Array) -> KnownDirections:
+def known_above(*directions: Any) -> bool:
+    """Whether it is known that none of these, (..., 3) each, lies below."""
+    return all(not isinstance(w, jax.core.Tracer) and bool(np.all(np.asarray(w)[..., 2] > 0)) for w in directions)
+
+
+def own_cosines(wi: Array, wo: Array, all_above: bool) -> KnownDirections:
     """Directions (n, 3) each, known or traced, as if each had a cosine of its own: of few pairs that is as good."""
     z = jnp.concatenate([wi[:, 2], wo[:, 2]])
     size = jnp.where(jnp.abs(z) > horizon(z.dtype), jnp.minimum(jnp.abs(z), 1.0), STAND_IN)
     place = jnp.arange(z.size) + jnp.where(z > 0, 0, z.size)
     above, below = (jnp.where(side, size, STAND_IN) for side in (z > 0, z <= 0))
-    return KnownDirections(above, below, place[: z.size // 2], place[z.size // 2 :])
+    return KnownDirections(above, below, place[: z.size // 2], place[z.size // 2 :], all_above)

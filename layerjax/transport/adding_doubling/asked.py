@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, not_negative
+from layerjax._numerics import horizon, not_negative, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector
 from layerjax.transport.adding_doubling.grid import Region
@@ -35,7 +35,7 @@ class Between(eqx.Module):
 def asked_region(cosine: Array, ior: Array) -> Region:
     """The directions as nodes without weight."""
     zero = jnp.zeros_like(cosine)
-    return Region(ior, cosine, jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), zero, zero, zero == 0)
+    return Region(ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), zero, zero, zero == 0)
 
 
 def between(whole: Layer, known: KnownDirections, bottom: Array, opaque: bool) -> Between:

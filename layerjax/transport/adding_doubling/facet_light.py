@@ -23,8 +23,9 @@ from layerjax.transport.adding_doubling.grid import Grid, Region
 ENERGY_POINTS = (12, 8)
 """Points a panel, and in azimuth, of the quadrature of energies."""
 
-LEAST_FACETS = 16
-"""Points of the dense quadrature of visible normals in either direction, at least (see `_visible_normals`)."""
+LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
+"""Points of the dense quadrature of visible normals in either direction, at least (see `_visible_normals`): of a single
+interface, and where there are several, between which light goes on."""
 
 
 class Normals(NamedTuple):
@@ -111,7 +112,8 @@ def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -
     two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
     from pole to rim.
     """
-    polar_facets, azimuth_facets = max(LEAST_FACETS, 3 * grid.nodes // 2), max(LEAST_FACETS, 3 * modes // 4)
+    least = LEAST_OF_SEVERAL if grid.interfaces > 1 else LEAST_FACETS
+    polar_facets, azimuth_facets = max(least, 3 * grid.nodes // 2), max(least, 3 * modes // 4)
     alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
     if normals.distribution == "vmf":

@@ -96,8 +96,9 @@ def seen_facets(cosine: Array, sine: Array, at: Parallels, alpha: Array, azimuth
     mx = at.sine[..., None] - (mu * at.across)[..., None] * back
     my = at.across[..., None] * 2.0 * sin_half * cos_half * norm
     mz = at.cosine[..., None] - (sin_w * at.across)[..., None] * back
-    across = mx * mx + my * my
-    shares = turn / (alpha * alpha * mz * mz + across) ** 2
+    # in units of alpha: fourth powers of the narrowest have derivatives beyond single precision
+    slopes = (mx / alpha) ** 2 + (my / alpha) ** 2
+    shares = turn / (alpha * alpha) / (alpha * alpha) / (mz * mz + slopes) ** 2
     flat = (mu.shape[0], -1)
     facing = at.facing[..., None] * jnp.ones_like(back)
     return (mx.reshape(flat), my.reshape(flat), mz.reshape(flat)), facing.reshape(flat), shares.reshape(flat)

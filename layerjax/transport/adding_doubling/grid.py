@@ -72,6 +72,11 @@ class Grid(eqx.Module):
     nodes: int = eqx.field(static=True)
 
     @property
+    def interfaces(self) -> int:
+        """Between the regions."""
+        return len(self.regions) - 1
+
+    @property
     def size(self) -> int:
         """Number of nodes of all panels."""
         return self.edges.shape[0] * self.nodes

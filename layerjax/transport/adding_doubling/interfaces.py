@@ -156,8 +156,14 @@ def _unresolved(grid: Grid, normals: Normals) -> Array:
 
 
 def _blur(grid: Grid, normals: Normals) -> Array:
-    """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there."""
+    """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
+
+    None between several interfaces either: light that is kept there by total reflection meets the edge again and again,
+    and a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
+    """
     alpha = jnp.asarray(normals.alpha)
+    if grid.interfaces > 1:
+        return jnp.zeros_like(alpha)
     return BLUR * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
 
 
