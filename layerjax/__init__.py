@@ -20,6 +20,7 @@ from layerjax.preparation import prepare as prepare
 from layerjax.stack import Interface as Interface
 from layerjax.stack import Medium as Medium
 from layerjax.stack import Stack as Stack
+from layerjax.stack import TurbidMedium as TurbidMedium
 from layerjax.surfaces import Conductor as Conductor
 from layerjax.surfaces import Lambertian as Lambertian
 from layerjax.surfaces import OrenNayar as OrenNayar

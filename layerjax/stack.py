@@ -5,7 +5,7 @@ refuse concrete values outside the documented box (`layerjax.RANGES`) by name.
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -70,6 +70,45 @@ class Medium(eqx.Module):
             )
 
 
+class TurbidMedium(eqx.Module):
+    """A `Medium` by its thickness and its coefficients, as tissue and pigments are measured.
+
+    ============ ====== ========== ======= ===========================================================================
+    parameter    symbol range      default meaning
+    ============ ====== ========== ======= ===========================================================================
+    thickness_mm d      [0, 1e4]           in millimetres
+    mu_s         mu_s   [0, 1e4]           coefficient of scattering, 1/mm, per channel; not the reduced one, which is
+                                           mu_s (1 - g)
+    mu_a         mu_a   [0, 1e4]   0       coefficient of absorption, 1/mm, per channel
+    phase, f0                              as of a `Medium`
+    ============ ====== ========== ======= ===========================================================================
+
+    The optical depth is (mu_s + mu_a) d, at most 1e4, the albedo mu_s / (mu_s + mu_a).
+    """
+
+    thickness_mm: Parameter = parameter("TurbidMedium.thickness_mm")
+    mu_s: Parameter = parameter("TurbidMedium.mu_s")
+    mu_a: Parameter = parameter("TurbidMedium.mu_a", default=0.0)
+    phase: PhaseFunction = eqx.field(default_factory=lambda: HenyeyGreenstein(g=0.0))
+    f0: Parameter = parameter("TurbidMedium.f0", default=None, optional=True)
+
+    def __check_init__(self) -> None:
+        if not isinstance(self.phase, PhaseFunction):
+            raise ValueError(
+                f"TurbidMedium.phase: {self.phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
+            )
+
+    def as_medium(self) -> Medium:
+        """The same medium by optical depth and albedo; ValueError for a concrete depth above 1e4."""
+        thickness, mu_s, mu_a = (jnp.asarray(number) for number in (self.thickness_mm, self.mu_s, self.mu_a))
+        extinction = mu_s + mu_a
+        some = extinction > 0
+        albedo = jnp.where(some, mu_s / jnp.where(some, extinction, 1.0), 0.0)
+        # of a map of thicknesses the channels lie behind
+        depth = (thickness[..., None] if thickness.ndim else thickness) * extinction
+        return Medium(depth, 0.0 if is_known(self.mu_s, 0.0) else albedo, self.phase, self.f0)
+
+
 class Stack(eqx.Module):
     """Layers from top to bottom over a base.
 
@@ -77,7 +116,7 @@ class Stack(eqx.Module):
     they are told from channels.
 
     Args:
-        layers: any number of `Interface` and `Medium`, the topmost first.
+        layers: any number of `Interface`, `Medium` and `TurbidMedium`, the topmost first.
         base: an opaque surface (`Lambertian`, `OrenNayar`, `VMFDiffuse`, `Conductor`), or None: light passes.
 
     Raises:
@@ -85,17 +124,17 @@ class Stack(eqx.Module):
             the map.
     """
 
-    layers: tuple[Interface | Medium, ...]
+    layers: tuple[Interface | Medium, ...]  # and turbid media, until `simplify`
     base: Surface | None = None
 
-    def __init__(self, layers: Iterable[Interface | Medium], base: Surface | None = None):
-        self.layers = tuple(layers)
+    def __init__(self, layers: Iterable[Interface | Medium | TurbidMedium], base: Surface | None = None):
+        self.layers = cast(tuple[Interface | Medium, ...], tuple(layers))
         self.base = base
 
     def __check_init__(self) -> None:
         for index, layer in enumerate(self.layers):
-            if not isinstance(layer, Interface | Medium):
-                raise ValueError(f"Stack.layers[{index}]: {layer!r} is not an Interface or a Medium")
+            if not isinstance(layer, Interface | Medium | TurbidMedium):
+                raise ValueError(f"Stack.layers[{index}]: {layer!r} is not an Interface, a Medium or a TurbidMedium")
         if self.base is not None and not isinstance(self.base, Surface):
             raise ValueError(f"Stack.base: {self.base!r} is not a surface or None")
         channel_count(self)
@@ -116,9 +155,9 @@ def require_numbers(stack: Any) -> None:
 def simplify(stack: Stack) -> Stack:
     """The same stack without what its concrete values say is not there.
 
-    Media of thickness 0 go, and interfaces whose index is that of what lies above them (all light passes straight);
-    f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing. Traced values are kept as
-    they are, so derivatives with respect to them are exact.
+    Turbid media become media. Media of thickness 0 go, and interfaces whose index is that of what lies above them (all
+    light passes straight); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
+    Traced values are kept as they are, so derivatives with respect to them are exact.
     """
     return simplify_and_name(stack)[0]
 
@@ -132,6 +171,8 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
             if _are_equal(layer.ior, above):
                 continue
             above = layer.ior
+        if isinstance(layer, TurbidMedium):
+            layer = _turbid_with_known(layer).as_medium()
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
@@ -145,7 +186,7 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
 
 def with_known(stack: Stack) -> Stack:
     """The same stack with albedos and f0 that are 0 or 1 for all channels as Python floats: known also under `jit`."""
-    layers = tuple(_with_known(layer) if isinstance(layer, Medium) else layer for layer in stack.layers)
+    layers = tuple(_layer_with_known(layer) for layer in stack.layers)
     return eqx.tree_at(lambda s: s.layers, stack, layers)
 
 
@@ -171,6 +212,17 @@ def is_known(value: Any, number: float) -> bool:
 def _with_known(medium: Medium) -> Medium:
     known = [_known(medium.albedo), None if medium.f0 is None else _known(medium.f0)]
     return eqx.tree_at(lambda m: (m.albedo, m.f0), medium, known, is_leaf=lambda leaf: leaf is None)
+
+
+def _layer_with_known(layer: Any) -> Any:
+    if isinstance(layer, TurbidMedium):
+        return _turbid_with_known(layer)
+    return _with_known(layer) if isinstance(layer, Medium) else layer
+
+
+def _turbid_with_known(medium: TurbidMedium) -> TurbidMedium:
+    """Without scattering: known also while tracing."""
+    return eqx.tree_at(lambda m: m.mu_s, medium, 0.0) if _is_everywhere(medium.mu_s, 0.0) else medium
 
 
 def _known(value: Any) -> Any:

@@ -54,7 +54,7 @@ def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:
         for part in (*stack.layers, stack.base):
             if isinstance(part, lj.Interface | lj.Conductor):
                 facets.append(_least(part.alpha))
-            elif isinstance(part, lj.Medium):
+            elif isinstance(part, lj.Medium | lj.TurbidMedium):
                 for phase in (_at(part.phase, end) for end in (1, 2)):
                     upright = isinstance(phase, lj.SGGX) and phase.kind == "surface" and phase.is_upright
                     (facets if upright else others).append(float(np.min(phase.width)))

@@ -162,6 +162,15 @@ class Problem:
         return arrays, Static(static)
 
 
+UNITS = {
+    "noise.floor": "1/sr",
+    "instrument.offset": "deg",
+    "noise.correlated.half": "deg",
+    "noise.correlated.difference": "deg",
+    **{"thickness": "optical depth", "thickness_mm": "mm", "mu_s": "1/mm", "mu_a": "1/mm"},
+}
+"""Of parameters by their names, or by what these end with; all others are plain ratios."""
+
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.correlated")
 """How names begin of what stands in each place of `Parts`."""
 
@@ -336,10 +345,4 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 
 
 def _unit(name: str) -> str:
-    if name == "noise.floor":
-        return "1/sr"
-    if name == "instrument.offset":
-        return "deg"
-    if name.startswith("noise.correlated.") and not name.endswith((".amplitude", ".growth", ".channels")):
-        return "deg"
-    return "optical depth" if re.sub(r"\[\d+\]$", "", name).endswith("thickness") else "1"
+    return UNITS.get(name) or UNITS.get(re.sub(r"\[\d+\]$", "", name).rpartition(".")[2], "1")

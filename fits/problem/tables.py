@@ -30,7 +30,7 @@ from layerjax import gallery
 from layerjax._shapes import require_single
 
 _Kinds = Mapping[str, type]
-_LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium)}
+_LAYERS: _Kinds = {kind.__name__: kind for kind in (lj.Interface, lj.Medium, lj.TurbidMedium)}
 _BASES: _Kinds = {kind.__name__: kind for kind in (lj.Lambertian, lj.OrenNayar, lj.VMFDiffuse, lj.Conductor)}
 _PHASES: _Kinds = {kind.__name__: kind for kind in (lj.HenyeyGreenstein, lj.Rayleigh, lj.SGGX)}
 _TRANSPORTS: _Kinds = {
@@ -64,7 +64,7 @@ def _parts(where: str, stack: lj.Stack | lj.Mixture) -> list[tuple[str, Any, _Ki
     parts: list[tuple[str, Any, _Kinds]] = []
     for index, layer in enumerate(stack.layers):
         parts.append((f"{where}layers[{index}]", layer, _LAYERS))
-        if isinstance(layer, lj.Medium):
+        if isinstance(layer, lj.Medium | lj.TurbidMedium):
             parts.append((f"{where}layers[{index}].phase", layer.phase, _PHASES))
     if stack.base is not None:
         parts.append((f"{where}base", stack.base, _BASES))

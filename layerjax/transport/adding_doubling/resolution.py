@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from layerjax.stack import Interface, Medium, Stack, is_known
+from layerjax.stack import Interface, Medium, Stack, TurbidMedium, is_known
 from layerjax.surfaces import Conductor
 
 LADDER = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96))
@@ -153,4 +153,4 @@ def rungs(stack: Stack) -> Iterator[Resolution]:
 
 def is_tilted(layer: Any) -> bool:
     """Whether the layer is a medium that is not symmetric about the normal (as far as is known while tracing)."""
-    return isinstance(layer, Medium) and not layer.phase.is_upright
+    return isinstance(layer, Medium | TurbidMedium) and not layer.phase.is_upright
