@@ -85,6 +85,8 @@ def goniophotometer(
     Raises:
         ValueError: a count is too small, or the stack holds a placeholder.
     """
+    if not isinstance(stack, Stack):
+        raise ValueError("stack: goniophotometer takes a Stack; of a Mixture take the mean over its parts")
     require_numbers(stack)
     require_single(stack, "goniophotometer")
     for name, value, least in (
