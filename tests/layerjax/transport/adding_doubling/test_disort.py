@@ -13,7 +13,7 @@ from benchmarks.peers import disort
 
 pytestmark = [pytest.mark.peers, pytest.mark.skipif(disort.why_not() is not None, reason=str(disort.why_not()))]
 
-STREAMS = 64
+STREAMS, FINE = 64, lj.AddingDoubling(nodes=32, modes=48)
 INCIDENCES = (0.15, 0.55, 0.95)
 """None at a node, where DISORT's beam resonates."""
 AZIMUTHS = np.array([0.0, 0.7, 2.0, np.pi])
@@ -27,7 +27,7 @@ def worst(found, reference):
 
 @pytest.mark.parametrize(("thickness", "g", "albedo"), SLABS)
 def test_radiance_at_the_nodes_of_disort(thickness, g, albedo):
-    prepared = lj.prepare(lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))]), lj.AddingDoubling())
+    prepared = lj.prepare(lj.Stack([lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g))]), FINE)
     wi = lj.direction(jnp.arccos(jnp.array(INCIDENCES))[:, None, None], 0.0)
     wo = lj.direction(np.arccos(disort.nodes(STREAMS))[:, None], AZIMUTHS)
     values = np.asarray(lj.evaluate(prepared, wi, wo))[..., 0]
