@@ -15,6 +15,7 @@ from benchmarks.peers.mitsuba_volpath import Volpath, surface_values
 from tests.helpers.cases import X, flakes, haze
 
 TILTED = (0.4, 0.2, 0.9)
+SINGLE = lj.SingleScattering()
 MITSUBA_PATHS = 1 << 19
 WALKS, SURFACE_WALKS = 1 << 17, 1 << 12
 LEAST = 0.01
@@ -75,9 +76,9 @@ def test_the_translation_keeps_the_first_order(name):
     for wi in lit_from(stack).values():
         scene = Volpath(stack, wi, order=1)
         value, error = scene.values(viewers(stack), MITSUBA_PATHS)
-        expected = np.asarray(lj.evaluate(stack, wi, viewers(stack), lj.SingleScattering()))
+        expected = np.asarray(lj.evaluate(stack, wi, viewers(stack), SINGLE))
         assert np.all(np.abs(value - expected) < 4 * error + 1e-3 * expected)
-        for (energy, uncertain), exact in zip(scene.energies(1 << 20), lj.albedo(stack, wi), strict=True):
+        for (energy, uncertain), exact in zip(scene.energies(1 << 20), lj.albedo(stack, wi, SINGLE), strict=True):
             assert np.all(np.abs(energy - np.asarray(exact)) < 4 * uncertain + 1e-3 * np.asarray(exact))
 
 
