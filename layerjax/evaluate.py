@@ -256,7 +256,15 @@ def _mixed_with_error(
     found = mixture.weighed(lambda part, own: evaluate_with_error(part, wi, wo, transport, side=side, key=own), key)
     values = sum(share * value for share, (value, _) in found)
     errors = jnp.stack(jnp.broadcast_arrays(*(share * error for share, (_, error) in found)))
-    return values, jnp.sum(errors, axis=0) if key is None else jnp.linalg.norm(errors, axis=0)
+    return values, jnp.linalg.norm(errors, axis=0) if _is_random(mixture, transport) else jnp.sum(errors, axis=0)
+
+
+def _is_random(material: Any, transport: Any) -> bool:
+    """Whether values are drawn; what is prepared has a transport of its own."""
+    if isinstance(material, Mixture):
+        return any(_is_random(part, transport) for part in material.parts.values())
+    chosen = material.transport if isinstance(material, Prepared) else transport
+    return isinstance(chosen, Transport) and chosen.random
 
 
 def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> tuple[Array, Array, Array]:

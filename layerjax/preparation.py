@@ -67,11 +67,13 @@ def choose_transport(
 
 
 def prepared_at(stack: Stack | Prepared, transport: Any, dtype: jnp.dtype, known: Known = lambda: None) -> Prepared:
+    """A stack, prepared or not, for directions of this floating type, of which this is known."""
     prepared = stack if isinstance(stack, Prepared) else prepare_at(stack, transport, known)
     return in_precision(prepared, dtype)
 
 
 def prepare_at(stack: Stack, transport: Any, known: Known) -> Prepared:
+    """`prepare` for values at directions of which this is known."""
     known = cache(known)
     require_numbers(stack)
     require_single(stack, "prepare")

@@ -64,10 +64,7 @@ class Medium(eqx.Module):
     f0: Parameter = parameter("Medium.f0", default=None, optional=True)
 
     def __check_init__(self) -> None:
-        if not isinstance(self.phase, PhaseFunction):
-            raise ValueError(
-                f"Medium.phase: {self.phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
-            )
+        _check_phase("Medium", self.phase)
 
 
 class TurbidMedium(eqx.Module):
@@ -93,10 +90,7 @@ class TurbidMedium(eqx.Module):
     f0: Parameter = parameter("TurbidMedium.f0", default=None, optional=True)
 
     def __check_init__(self) -> None:
-        if not isinstance(self.phase, PhaseFunction):
-            raise ValueError(
-                f"TurbidMedium.phase: {self.phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
-            )
+        _check_phase("TurbidMedium", self.phase)
 
     def as_medium(self) -> Medium:
         """The same medium by optical depth and albedo; ValueError for a concrete depth above 1e4."""
@@ -107,6 +101,11 @@ class TurbidMedium(eqx.Module):
         # of a map of thicknesses the channels lie behind
         depth = (thickness[..., None] if thickness.ndim else thickness) * extinction
         return Medium(depth, 0.0 if is_known(self.mu_s, 0.0) else albedo, self.phase, self.f0)
+
+
+def _check_phase(owner: str, phase: Any) -> None:
+    if not isinstance(phase, PhaseFunction):
+        raise ValueError(f"{owner}.phase: {phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction")
 
 
 class Stack(eqx.Module):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from fits.data.measurements import Measurements
-from fits.data.scans import AT_NORMAL, SAME_ANGLE, incidences, relative_azimuth, scans, signed_angle
+from fits.data.scans import AT_NORMAL, SAME_ANGLE, in_plane, incidences, relative_azimuth, scans, signed_angle
 
 SAME_PLACE = 0.05
 """Degrees within which readings are repeats of one."""
@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Pairs:
+class Agreement:
     """Readings that should be equal, two by two: how many pairs, and how far they are apart: median and 95th percentile
     of |difference| / mean, and the median of the signed one; z: root mean square in standard errors, NaN without sigma.
     """
@@ -58,7 +58,7 @@ class Peak:
     readings: int
 
 
-def reciprocity(data: Measurements) -> Pairs | None:
+def reciprocity(data: Measurements) -> Agreement | None:
     """Pairs in which light and viewer change places, both above the surface; None if there is none.
 
     Where all readings lie on one side of the plane of incidence, those on the other are taken to be the same.
@@ -71,14 +71,14 @@ def reciprocity(data: Measurements) -> Pairs | None:
     return _matched(used, _places(used, turn), _places(used, swapped)[:, [1, 0, 2, 3]], apart)
 
 
-def symmetry(data: Measurements) -> Pairs | None:
+def symmetry(data: Measurements) -> Agreement | None:
     """Pairs on either side of the plane of incidence; None if there is none."""
     used = _above(data)
     turn = relative_azimuth(used)
     return _matched(used, _places(used, turn), _places(used, -turn), _off_plane(turn) & ~_upright(used))
 
 
-def repeats(data: Measurements) -> Pairs | None:
+def repeats(data: Measurements) -> Agreement | None:
     """Readings that were taken again, each beside the one before it; None if there is none."""
     used = data.used()
     key = np.round(np.column_stack([used.wi, used.wo]) / np.radians(SAME_PLACE)).astype(np.int64)
@@ -115,7 +115,7 @@ def peaks(data: Measurements) -> list[Peak]:
     """Of each scan that crosses the mirror direction of its light."""
     used = _above(data)
     angle, found = signed_angle(used), []
-    flat = np.abs(np.sin(np.radians(relative_azimuth(used)))) * np.sin(np.radians(used.theta_o)) < 1e-2
+    flat = in_plane(used)
     for rows in scans(used):
         rows = rows[flat[rows]]
         mirror = float(used.theta_i[rows[0]]) if rows.size else 0.0
@@ -160,7 +160,7 @@ def _places(used: Measurements, turn: Floats) -> Floats:
     return np.column_stack([used.theta_i, used.theta_o, *around])
 
 
-def _matched(used: Measurements, places: Floats, wanted: Floats, which: NDArray[np.bool_]) -> Pairs | None:
+def _matched(used: Measurements, places: Floats, wanted: Floats, which: NDArray[np.bool_]) -> Agreement | None:
     """Each of `which` (N,) with the reading whose place is nearest to where it is `wanted`; every pair once."""
     rows = np.flatnonzero(which)
     if rows.size == 0:
@@ -176,7 +176,7 @@ def _matched(used: Measurements, places: Floats, wanted: Floats, which: NDArray[
     return _apart(used, pairs[:, 0], pairs[:, 1])
 
 
-def _apart(used: Measurements, first: NDArray[np.int64], second: NDArray[np.int64]) -> Pairs | None:
+def _apart(used: Measurements, first: NDArray[np.int64], second: NDArray[np.int64]) -> Agreement | None:
     if first.size == 0:
         return None
     one, other = used.values[first], used.values[second]
@@ -190,4 +190,4 @@ def _apart(used: Measurements, first: NDArray[np.int64], second: NDArray[np.int6
         spread = np.hypot(used.sigma[first], used.sigma[second])
         z = float(np.sqrt(np.mean(((other - one)[spread > 0.0] / spread[spread > 0.0]) ** 2)))
     size = np.abs(relative)
-    return Pairs(first.size, float(np.median(size)), float(np.quantile(size, 0.95)), float(np.median(relative)), z)
+    return Agreement(first.size, float(np.median(size)), float(np.quantile(size, 0.95)), float(np.median(relative)), z)

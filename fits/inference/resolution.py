@@ -110,20 +110,21 @@ def resolutions(problem: Problem) -> Resolutions | None:
     albedo of 0 stays with one.
     """
     transport, model = problem.transport, problem.model
+    directions = model.known if model.optics is None else model.optics.known
     if not isinstance(transport, lj.AddingDoubling | str):
         return None
 
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
         layers = [layer for part in stacks_of(stack) for layer in part.layers]
-        return lj.choose_transport(stack, transport, known=model.known), any(map(is_tilted, layers))
+        return lj.choose_transport(stack, transport, known=directions), any(map(is_tilted, layers))
 
     start = jnp.asarray(problem.start)
     kind, tilted = eqx.filter_eval_shape(traced, start)
     if not isinstance(kind, lj.AddingDoubling) or kind.orders == "first":
         return None
     given = replace(kind, nodes=None, modes=None, ordinates=None) if isinstance(transport, str) else transport
-    chosen = lj.choose_transport(model.build(start).stack, given, known=model.known)
+    chosen = lj.choose_transport(model.build(start).stack, given, known=directions)
     assert isinstance(given, lj.AddingDoubling)
     assert isinstance(chosen, lj.AddingDoubling)
     return Resolutions(given, chosen, tilted)

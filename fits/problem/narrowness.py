@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.data.geometry import TANGENT_COSINE
 from fits.problem.parameters import is_free
 from layerjax.mixture import stacks_of
 
@@ -28,14 +29,16 @@ def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Float
     GGX facets of width alpha whose half vector lies at tangent t change by at most 2 r^2 / (t^2 + alpha^2) over a disc
     of radius r, half of that of the cones over the cosine of the difference angle; what faces elsewhere (particles,
     tilted flakes) counts as if it were met at its peak, light that passes as narrow. Cosines change by r^2 / (2 cos)^2.
+    In the tangent plane there is nothing to take the mean of.
 
     Args:
         source, detector: full angles of the cones, degrees.
         stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks all may be narrow.
         wi, wo: (N, 3).
     """
+    seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
     if not isinstance(stack, lj.Stack | lj.Mixture):
-        return np.ones(len(wi), bool)
+        return seen
     radii = np.radians(0.5 * source), np.radians(0.5 * detector)
     facets, others = _narrowest(stack)
     half = wi + wo
@@ -44,7 +47,7 @@ def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Float
     nearest = np.maximum(np.tan(np.minimum(tilt, STEEPEST)) - np.sqrt(square), 0.0)
     lobe = 2.0 * square / (nearest**2 + facets**2) + 2.0 * square / others**2
     steep = [0.25 * (r / np.maximum(np.abs(w[:, 2]), r)) ** 2 for r, w in zip(radii, (wi, wo), strict=True) if r > 0.0]
-    return (np.maximum(lobe, sum(steep)) > SHIFT) | (wi[:, 2] * wo[:, 2] < 0.0)
+    return seen & ((np.maximum(lobe, sum(steep)) > SHIFT) | (wi[:, 2] * wo[:, 2] < 0.0))
 
 
 def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING
 
-from fits.data.checks import Energy, Pairs, Peak, energies, peaks, reciprocity, repeats, symmetry
+from fits.data.checks import Agreement, Energy, Peak, energies, peaks, reciprocity, repeats, symmetry
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -26,7 +26,7 @@ def data_statements(data: "Measurements") -> list[str]:
     ]
 
 
-def _reciprocity(found: Pairs | None) -> str:
+def _reciprocity(found: Agreement | None) -> str:
     if found is None:
         return "Reciprocity: no two readings have light and viewer the other way round, it cannot be tested."
     return (
@@ -35,20 +35,20 @@ def _reciprocity(found: Pairs | None) -> str:
     )
 
 
-def _symmetry(found: Pairs | None) -> str:
+def _symmetry(found: Agreement | None) -> str:
     if found is None:
         return "Symmetry: no readings lie on both sides of the plane of incidence, it cannot be tested."
     return f"Symmetry: {found.count:,} pairs lie on either side of the plane of incidence; {_apart(found)}."
 
 
-def _repeats(found: Pairs | None) -> str:
+def _repeats(found: Agreement | None) -> str:
     if found is None:
         return "Repeats: no reading was taken twice; the noise has to come from the file's sigma or from the fit."
     noise = 100.0 * found.median / (0.6745 * math.sqrt(2.0))
     return f"Repeats: {found.count:,} readings were taken again; {_apart(found)}: a noise of about {noise:.2g} %."
 
 
-def _apart(found: Pairs) -> str:
+def _apart(found: Agreement) -> str:
     words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.most:.2g} %)"
     return words if math.isnan(found.z) else f"{words}, {found.z:.2g} of their standard errors"
 

@@ -65,6 +65,14 @@ def test_means_are_taken_only_where_a_lobe_may_be_narrow() -> None:
     assert np.all(counts[1][(tilt > 30.0) & ~steep] == 1)
 
 
+def test_readings_in_the_tangent_plane_are_dark() -> None:
+    """As they are without an aperture: a mean would be divided by a cosine of nothing."""
+    geometry = fits.slices([30.0], [80.0, 90.0])
+    found = problem(Instrument(source=1.0, detector=2.0), geometry=geometry).predict([0.3])
+    assert np.isfinite(found).all()
+    assert found[1, 0] == 0.0
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_a_sample_that_leans_is_seen_at_other_angles(free: bool) -> None:
     lean = 1.5
