@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels
-from layerjax._numerics import at_least
+from layerjax._numerics import at_least, at_most
 from layerjax.channels import Channels, each
 
 Orders = tuple[Channels, ...]
@@ -25,6 +25,12 @@ LEAST_ESCAPE = 1e-6
 
 LEAST_ENERGY = 1e-12
 """Energy below which a mean of variances is not formed: squares of it are divided by in derivatives."""
+
+MOST_VARIANCE = 1e8
+"""Stands for all larger variances outside: a roughness of 1 but for 1e-8. Grazing light multiplies them without end."""
+
+MOST_JACOBIAN = 1e15
+"""Stands for all larger ones: the narrowest lobe inside has become the widest outside."""
 
 
 class Element(NamedTuple):
@@ -83,15 +89,16 @@ def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
     rr = each(lambda turned: turned / at_least(1.0 - turned, LEAST_ESCAPE), whole(between))
     turns = each(lambda rr, w, s: rr * (w + s), rr, element.widening, above.s_ri)
     variance = each(  # Eq. (36)
-        lambda s_ti, j, s_t0, w, turns: s_ti + j * (s_t0 + w + turns),
+        lambda s_ti, j, s_t0, w, turns: at_most(s_ti + j * (s_t0 + w + turns), MOST_VARIANCE),
         above.s_ti, above.jacobian, above.s_t0, element.widening, turns,
     )  # fmt: skip
     s_t0 = each(  # Eqs. (47-49)
         lambda j, s, turns, d: (s + turns) / j + d, element.jacobian, above.s_t0, turns, element.down
     )
     s_ti = each(  # Eq. (50)
-        lambda j, up, turns, s: j * (up + turns) + s, above.jacobian, element.up, turns, above.s_ti
-    )
+        lambda j, up, turns, s: at_most(j * (up + turns) + s, MOST_VARIANCE),
+        above.jacobian, element.up, turns, above.s_ti,
+    )  # fmt: skip
     back = times(element.t21, above.ri, element.t12, inverse)
     through = each(
         lambda d, j, up, s, turns: d + (up + s + turns) / j,
@@ -105,7 +112,7 @@ def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
         s_t0=s_t0,
         s_ri=s_ri,
         s_ti=s_ti,
-        jacobian=channels.times(above.jacobian, element.jacobian),
+        jacobian=each(lambda j, own: at_most(j * own, MOST_JACOBIAN), above.jacobian, element.jacobian),
     )
 
 
