@@ -71,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     compared = commands.choices["error-vs-time"]
     families = sorted({path.parent.name for path in (Path(__file__).parent / "suite").glob("*/*.toml")})
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
+    compared.add_argument("--truths", type=Path, metavar="DIR", help="results whose truths the models are held against")
     compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
     calibrated = commands.choices["calibration"]
     calibrated.add_argument("--repeats", type=int, metavar="N", help="how many there are to be in all")
@@ -108,7 +109,7 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
     if given.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
 
-        options |= {"families": given.families, "models": named(given.models)}
+        options |= {"families": given.families, "models": named(given.models), "truths": given.truths}
     if given.benchmark == "calibration":
         from layerjax import AddingDoubling
 

@@ -80,14 +80,15 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     size = Size(batch=32, walked_opaque=5, walked_transmitting=8, rounds=1)
     models = [Model("single scattering", MODELS[0].steps), Model("solver", {"8": solver}), Model("walk", {"256": walk})]
 
-    def study(name: str, family: str, stack: lj.Stack) -> tuple[str, tuple[Path, ...]]:
-        case = Case(name, family, "here", "A remark.", stack)
+    coated = Case("coat", "plastics_and_paints", "here", "A remark.", coat)
+
+    def study(case: Case) -> tuple[str, tuple[Path, ...]]:
         return error_vs_time.study(
             directory=directory, cases=[case], models=models, references=references, size=size, resume=True
         )
 
-    study("thin_haze", "transmitting_slabs", haze)
-    text, paths = study("coat", "plastics_and_paints", coat)
+    study(Case("thin_haze", "transmitting_slabs", "here", "A remark.", haze))
+    text, paths = study(coated)
     assert sorted(paths) == sorted(directory.iterdir())  # and no temporary file is left
     content = json.loads((directory / "error-vs-time.json").read_text())
     assert (directory / "error-vs-time.md").read_text() == text
@@ -105,12 +106,22 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     before = rows["coat", "walk"]
     models.append(Model("called", {"8": solver}, called=True))
     models.append(Model("coarse", {"5": solver.coarser()}))  # its programs are there, for the error of the truth
-    study("coat", "plastics_and_paints", coat)  # a model that joins: the rest stands as it was
+    study(coated)  # a model that joins: the rest stands as it was
     content = json.loads((directory / "error-vs-time.json").read_text())
     rows = {(row["stack"], row["model"]): row for row in content["rows"]}
     assert rows["coat", "walk"] == before
     assert rows["coat", "called"]["l2"] < 1e-12  # the truth is called, too
     assert rows["coat", "called"]["prepare_seconds"] > 0
     assert 0 < rows["coat", "coarse"]["l2"] < 0.1
+    again = tmp_path / "again"
+    kept = error_vs_time.study(
+        directory=again, cases=[coated], models=models, references=references, size=size, truths=directory
+    )
+    assert sorted(kept[1]) == sorted(again.iterdir())
+    anew = json.loads((again / "error-vs-time.json").read_text())
+    assert [judgement["stack"] for judgement in anew["stacks"]] == ["coat"]  # of the case that was measured
+    judged = {judgement["stack"]: judgement for judgement in content["stacks"]}
+    assert anew["stacks"][0] == judged["coat"]  # same seeds, same truth
+    assert {row["model"] for row in anew["rows"]} == {row["model"] for row in content["rows"] if row["stack"] == "coat"}
     with pytest.raises(ValueError, match="measured with other settings"):
         error_vs_time.study(directory=directory, cases=[], models=models, references=references, resume=True)

@@ -26,11 +26,13 @@ class Model:
     """A way of solving a stack, at one resolution or at several, from coarse to fine, each with a label.
 
     called: whether the stack itself is evaluated, so that its directions are known, in place of a prepared one.
+    albedos: whether they are compared too.
     """
 
     name: str
     steps: Mapping[str, lj.Transport]
     called: bool = False
+    albedos: bool = True
 
 
 MODELS = (
@@ -52,6 +54,7 @@ MODELS = (
         "solver, directions known",
         {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (6, 12, 24)},
         called=True,
+        albedos=False,  # of all directions: by tables, as above
     ),
     Model("solver as it chooses", {"default": lj.AddingDoubling()}, called=True),
     Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14)}),
@@ -91,7 +94,7 @@ class Run:
     step: str
     indices: NDArray[np.intp]
     values: NDArray[np.float64]
-    albedo: NDArray[np.float64]
+    albedo: NDArray[np.float64] | None
     nanoseconds_per_value: float
     prepare_seconds: float
     compile_seconds: float
@@ -101,7 +104,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Row:
-    """One model at one resolution on one stack. Errors are None where a value was not finite."""
+    """One model at one resolution on one stack. Errors are None where a value was not finite or is not compared."""
 
     stack: str
     family: str
@@ -156,13 +159,13 @@ def run(case: Case, model: Model, size: Size, programs: Programs) -> list[Run]:
         if not supports(transport, case.stack):
             break
         measure = _called if model.called else _prepared
-        runs.append(measure(case, model.name, label, transport, size, programs))
+        runs.append(measure(case, model, label, transport, size, programs))
         if STEP * runs[-1].seconds > size.longest:
             break
     return runs
 
 
-def _prepared(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+def _prepared(case: Case, model: Model, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
     """Of a stack that is prepared once."""
     directions = case.directions
     if transport.random:
@@ -183,14 +186,14 @@ def _prepared(case: Case, name: str, label: str, transport: lj.Transport, size: 
     values, evaluating, seconds = _first_and_again(evaluate, size.rounds)
     compiling = max(preparing - prepare_seconds, 0.0) + max(evaluating - seconds, 0.0)
     compile_seconds, counted = programs.of(
-        _structure(case.stack, label, name, len(turns)), compiling, lambda: _operations(prepared, wi, wo, key)
+        _structure(case.stack, label, model.name, len(turns)), compiling, lambda: _operations(prepared, wi, wo, key)
     )
     return Run(
-        model=name,
+        model=model.name,
         step=label,
         indices=indices,
         values=np.asarray(values)[: len(indices)],
-        albedo=albedos(prepared, directions, transport, key),
+        albedo=albedos(prepared, directions, transport, key) if model.albedos else None,
         nanoseconds_per_value=1e9 * seconds / len(turns),
         prepare_seconds=prepare_seconds,
         compile_seconds=compile_seconds,
@@ -199,7 +202,7 @@ def _prepared(case: Case, name: str, label: str, transport: lj.Transport, size: 
     )
 
 
-def _called(case: Case, name: str, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
+def _called(case: Case, model: Model, label: str, transport: lj.Transport, size: Size, programs: Programs) -> Run:
     """Of a stack that is evaluated as it is: once it costs what a call for its own pairs does."""
     directions = case.directions
     indices, turns = _in_turn(directions, size)
@@ -211,7 +214,7 @@ def _called(case: Case, name: str, label: str, transport: lj.Transport, size: Si
     _, _, many = _first_and_again(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
     arrays, others = eqx.partition(case.stack, eqx.is_array_like)
     compile_seconds, counted = programs.of(
-        _structure(case.stack, label, name, len(indices)),
+        _structure(case.stack, label, model.name, len(indices)),
         max(calling - few, 0.0),
         lambda: operations.total(
             lambda arrays: lj.evaluate(
@@ -221,11 +224,11 @@ def _called(case: Case, name: str, label: str, transport: lj.Transport, size: Si
         ),
     )
     return Run(
-        model=name,
+        model=model.name,
         step=label,
         indices=indices,
         values=np.asarray(values),
-        albedo=albedos(case.stack, directions, transport),
+        albedo=albedos(case.stack, directions, transport) if model.albedos else None,
         nanoseconds_per_value=1e9 * max(many - few, 0.0) / (len(turns) - len(indices)),
         prepare_seconds=few,
         compile_seconds=compile_seconds,
@@ -253,7 +256,7 @@ def row(case: Case, run: Run, truth: Truth, limit: float) -> Row:
         pairs=len(run.indices),
         l2=l2,
         worst=_finite(worst(error, scale(values, truth.albedo, directions))),
-        albedo=_finite(float(np.max(np.abs(run.albedo - truth.albedo)))),
+        albedo=None if run.albedo is None else _finite(float(np.max(np.abs(run.albedo - truth.albedo)))),
         nanoseconds_per_value=run.nanoseconds_per_value,
         prepare_seconds=run.prepare_seconds,
         compile_seconds=run.compile_seconds,

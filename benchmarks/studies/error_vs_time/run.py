@@ -13,7 +13,16 @@ from benchmarks.measuring.writing import DIRECTORY, rounded, write
 from benchmarks.studies.error_vs_time import pictures as error_pictures
 from benchmarks.studies.error_vs_time import tables as error_tables
 from benchmarks.studies.error_vs_time.models import MODELS, Model, Programs, Row, Size, row, run, supports
-from benchmarks.studies.error_vs_time.truth import REFERENCES, Judged, References, Truth, judge, pack, unpack
+from benchmarks.studies.error_vs_time.truth import (
+    REFERENCES,
+    Judged,
+    References,
+    Truth,
+    agree_anew,
+    judge,
+    pack,
+    unpack,
+)
 from benchmarks.suite import cases as suite
 from benchmarks.suite.cases import Case
 from fits._files import write_bytes
@@ -52,12 +61,16 @@ class Setup:
 
 @dataclass(frozen=True)
 class Held:
-    """What is measured so far. judged, truths: by stack; rows: of every model; untold: stacks without a truth."""
+    """What is measured so far. judged, truths: by stack; rows: of every model; untold: stacks without a truth.
+
+    kept: truths of another run, by stack, for the models to be measured against anew.
+    """
 
     judged: dict[str, Judged] = field(default_factory=dict)
     truths: dict[str, Truth] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
     untold: list[str] = field(default_factory=list)
+    kept: dict[str, tuple[Judged, Truth]] = field(default_factory=dict)
 
 
 def study(
@@ -66,6 +79,7 @@ def study(
     directory: Path = DIRECTORY,
     families: Sequence[str] | None = None,
     resume: bool = False,
+    truths: Path | None = None,
     models: Sequence[Model] = MODELS,
     cases: Sequence[Case] | None = None,
     references: References = REFERENCES,
@@ -78,6 +92,8 @@ def study(
         families: keys of `suite.FAMILIES`; all if None.
         resume: keep what the directory holds, measured with the same settings, and measure what it lacks: stacks, or a
             new model. Every stack is written as soon as it is measured: an interrupted run goes on from there.
+        truths: a directory of results whose truths stand for stacks that are not measured yet; the models, and the
+            walk that the default solver is compared with, are run anew.
         models: what is compared.
         cases: stacks instead of those of the suite.
 
@@ -89,6 +105,9 @@ def study(
     size = size or (QUICK if quick else Size())
     setup = Setup(directory, quick, models, references, size, environment.describe())
     held = _held(directory, setup.settings) if resume else Held()
+    if truths is not None:
+        other = _held(truths, setup.settings)
+        held.kept.update({name: (judged, other.truths[name]) for name, judged in other.judged.items()})
     programs = Programs()
     for index, case in enumerate(cases, start=1):
         keep_within()
@@ -119,8 +138,11 @@ def _measure(case: Case, setup: Setup, held: Held, programs: Programs) -> bool:
     lacking = [model for model in setup.models if model.name not in done]
     runs = [found for model in lacking for found in run(case, model, setup.size, programs)]
     if case.name not in held.judged:
-        held.judged[case.name], held.truths[case.name] = judge(
-            case, setup.references, setup.size.walked(case), setup.size.longest
+        longest, kept = setup.size.longest, held.kept.get(case.name)
+        held.judged[case.name], held.truths[case.name] = (
+            judge(case, setup.references, setup.size.walked(case), longest)
+            if kept is None
+            else agree_anew(case, setup.references, *kept, longest)
         )
     elif not runs:
         return False

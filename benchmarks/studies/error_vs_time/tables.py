@@ -31,7 +31,7 @@ compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {t
 is the first call less a later one, of both; stacks that differ in numbers alone share it. *operations* counts those of
 the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are left out.
 
-The truth is {truth}. Its uncertainty is its distance from its next coarser resolution,
+The truth is {truth}, solved {dates}. Its uncertainty is its distance from its next coarser resolution,
 and {check} must not find it further off than noise explains: the larger of the two is its limit.
 An error below it is printed as `<=` the limit: there the truth, not the model, is measured.
 
@@ -77,6 +77,7 @@ def markdown(
         values=VALUES,
         longest=size.longest,
         truth=_name(references.truth),
+        dates=_dates(judged),
         check=_name(references.check),
         solver=_name(references.solver),
         walk=_name(references.walk),
@@ -185,6 +186,12 @@ def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
         if lines:
             parts.append(f"### {title.capitalize()}, stack by stack\n\n{table(header, lines)}")
     return "\n".join(parts)
+
+
+def _dates(judged: Sequence[Judged]) -> str:
+    """When the truths were solved: results may keep those of runs before."""
+    dates = sorted({judgement.date for judgement in judged})
+    return f"{dates[0]} to {dates[-1]}" if len(dates) > 1 else "".join(dates)
 
 
 def _name(transport: lj.Transport) -> str:

@@ -128,16 +128,8 @@ def judge(case: Case, references: References, walked: int, longest: float = np.i
     directions = case.directions
     truth = reference(case.stack, directions, references.truth)
     indices = directions.some(walked)
-    few = directions.take(indices)
-
-    def against(values: Values, walk: lj.Transport, run: int) -> tuple[Check, lj.Transport]:
-        walk = affordable(walk, case.stack, few, longest)
-        estimates, errors = lj.evaluate_with_error(case.stack, few.wi, few.wo, walk, key=key_of(case.name, run))
-        return compare(values, np.asarray(estimates), np.asarray(errors), truth.albedo, few), walk
-
-    checked, _ = against(truth.values[indices], references.check, 0)
-    default = np.asarray(lj.evaluate(case.stack, directions.wi, directions.wo, references.solver))
-    agreement, default_walk = against(default[indices], references.walk, 1)
+    checked, _ = _walked(case, references.check, 0, truth.values[indices], truth, indices, longest)
+    agreement, paths = _agreement(case, references, truth, indices, longest)
     return Judged(
         stack=case.name,
         family=case.family,
@@ -154,11 +146,47 @@ def judge(case: Case, references: References, walked: int, longest: float = np.i
         compared=agreement.z.size,
         failures=agreement.failures,
         worst=agreement.worst,
-        paths=getattr(default_walk, "paths", 0),
+        paths=paths,
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         seconds=time.perf_counter() - began,
         cause=case.differs,
     ), truth
+
+
+def agree_anew(
+    case: Case, references: References, judged: Judged, truth: Truth, longest: float = np.inf
+) -> tuple[Judged, Truth]:
+    """What is known of a truth, with the default solver set against the default walk once more."""
+    indices = case.directions.some(judged.walked)
+    agreement, paths = _agreement(case, references, truth, indices, longest)
+    return dataclasses.replace(
+        judged, failures=agreement.failures, worst=agreement.worst, paths=paths, cause=case.differs
+    ), truth
+
+
+def _agreement(
+    case: Case, references: References, truth: Truth, indices: NDArray[np.intp], longest: float
+) -> tuple[Check, int]:
+    """The default solver against the default walk, at some pairs; and the paths that the walk had."""
+    values = np.asarray(lj.evaluate(case.stack, case.directions.wi, case.directions.wo, references.solver))
+    agreement, walk = _walked(case, references.walk, 1, values[indices], truth, indices, longest)
+    return agreement, getattr(walk, "paths", 0)
+
+
+def _walked(
+    case: Case,
+    walk: lj.Transport,
+    run: int,
+    values: Values,
+    truth: Truth,
+    indices: NDArray[np.intp],
+    longest: float,
+) -> tuple[Check, lj.Transport]:
+    """What a walk, with as many paths as time allows, says of values at some pairs."""
+    few = case.directions.take(indices)
+    walk = affordable(walk, case.stack, few, longest)
+    estimates, errors = lj.evaluate_with_error(case.stack, few.wi, few.wo, walk, key=key_of(case.name, run))
+    return compare(values, np.asarray(estimates), np.asarray(errors), truth.albedo, few), walk
 
 
 def affordable(walk: lj.Transport, stack: lj.Stack, directions: Directions, longest: float) -> lj.Transport:
