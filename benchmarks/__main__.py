@@ -5,8 +5,9 @@ beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe
 ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
 coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``unseen`` (how well
 stacks foretell readings of real coatings that were not fitted), ``wrong-stacks`` (whether bands hold where a simulated
-material is fitted by another), ``structures`` (whether a search finds the stack behind simulated data) and
-``side-by-side`` (which transport when: a page of docs from the results of error-vs-time)."""
+material is fitted by another), ``structures`` (whether a search finds the stack behind simulated data),
+``accelerator`` (a GPU beside the processor) and ``side-by-side`` (which transport when: a page of docs from the results
+of error-vs-time)."""
 
 import argparse
 import importlib
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
-         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "structures",
+         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "structures", "accelerator",
          "side-by-side")  # fmt: skip
 
 POSTERIORS = ("haze", "errors", "banana", "degenerate", "bounded")
@@ -71,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     compared = commands.choices["error-vs-time"]
     families = sorted({path.parent.name for path in (Path(__file__).parent / "suite").glob("*/*.toml")})
     compared.add_argument("--families", nargs="+", choices=families, help="of benchmarks/suite (default: all)")
+    compared.add_argument("--stacks", nargs="+", metavar="STACK", help="of those families (default: all)")
     compared.add_argument("--truths", type=Path, metavar="DIR", help="results whose truths the models are held against")
     compared.add_argument("--models", nargs="+", metavar="MODEL", help="names as in the tables (default: all)")
     calibrated = commands.choices["calibration"]
@@ -108,8 +110,11 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
         options["resume"] = given.resume
     if given.benchmark == "error-vs-time":
         from benchmarks.studies.error_vs_time.models import named
+        from benchmarks.suite.cases import load
 
-        options |= {"families": given.families, "models": named(given.models), "truths": given.truths}
+        load(given.families, given.stacks)  # names that are none are told here
+        options |= {name: getattr(given, name) for name in ("families", "stacks", "truths")}
+        options["models"] = named(given.models)
     if given.benchmark == "calibration":
         from layerjax import AddingDoubling
 

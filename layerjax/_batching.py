@@ -1,4 +1,7 @@
-"""Large batches of directions in chunks that fit the cache, on the way there and back."""
+"""Large batches of directions in chunks that fit the cache, on the way there and back.
+
+A processor's cache, that is: on a GPU, which a chunk has to fill, chunks are larger.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,11 +18,21 @@ from layerjax.directions import split
 CHUNK_BYTES = 20_000
 """Size of one component of a chunk: 5,000 pairs in float32, 2,500 in float64."""
 
+ROOM = 400
+"""Times as large are chunks where there is no processor's cache to stay in: what memory holds, if all is kept."""
+
 BLOCK_CHUNKS = 4
 """Chunks that are transposed together."""
 
 LANES = 16
 """Rows of a chunk are a multiple of this: the widest vector of a processor, in float32."""
+
+
+def room() -> int:
+    """Times as much as on a processor that a chunk may hold, on the device that a program is traced for."""
+    chosen = jax.default_device.value
+    platform = jax.default_backend() if chosen is None else getattr(chosen, "platform", chosen)
+    return 1 if platform == "cpu" else ROOM
 
 
 def even_chunks(count: int, chunks: int) -> tuple[int, int]:
@@ -63,7 +76,7 @@ def in_chunks(function: Callable[..., tuple[Array, ...]], *inputs: Array) -> Arr
     """
     batch = jnp.broadcast_shapes(*(array.shape for array in inputs))[:-1]
     pairs = math.prod(batch)
-    chunk = CHUNK_BYTES // inputs[0].dtype.itemsize
+    chunk = room() * CHUNK_BYTES // inputs[0].dtype.itemsize
     if pairs <= 2 * chunk:
         return jnp.stack([jnp.broadcast_to(result, batch) for result in function(*map(split, inputs))], axis=-1)
     flat = [jnp.broadcast_to(array, (*batch, 3)).reshape(pairs, 3) for array in inputs]

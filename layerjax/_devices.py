@@ -23,10 +23,22 @@ ROWS = "rows"
 _in_use: ContextVar[int] = ContextVar("devices", default=1)  # by the program that this thread is tracing
 
 
+def exact_products(function: Callable[P, T]) -> Callable[P, T]:
+    """The function with matrix products of float32 numbers in float32: GPUs may round factors to eleven bits."""
+
+    @wraps(function)
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        with jax.default_matmul_precision("highest"):
+            return function(*arguments, **options)
+
+    return call
+
+
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
     """The function compiled, as by `eqx.filter_jit`, with what it hands to `over_devices` split over all of them."""
 
     @eqx.filter_jit
+    @exact_products
     def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
         before = _in_use.set(devices)
         try:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._batching import even_chunks
+from layerjax._batching import even_chunks, room
 from layerjax._devices import compiled, over_devices
 from layerjax._shapes import Shape, axes_of_map
 from layerjax.directions import join, split
@@ -206,7 +206,7 @@ def _along(
 ) -> Any:
     """function(stack, *directions, key) of every texel, each with a key of its own; see `each_texel`."""
     pairs = max(1, math.prod(at.ahead))
-    together = max(1, transport.together(stack) // pairs) if together is None else together
+    together = max(1, room() * transport.together(stack) // pairs) if together is None else together
     keys = [] if key is None else [jax.random.split(key, math.prod(at.shape))]
     if at.shared:
         parts: Sequence[Array] = []
@@ -227,4 +227,5 @@ def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: A
     def one(stack: Stack, *own: Array) -> Array:
         return function(stack, own[0] if own else at.spread(w), *options)
 
-    return at.gathered(each_texel(one, stack, at, own, together=max(1, TEXELS // max(1, math.prod(at.ahead)))))
+    together = max(1, room() * TEXELS // max(1, math.prod(at.ahead)))
+    return at.gathered(each_texel(one, stack, at, own, together))

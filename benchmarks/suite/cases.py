@@ -105,18 +105,22 @@ class Case:
         )
 
 
-def load(families: Sequence[str] | None = None) -> list[Case]:
-    """The stacks of these families (all if None), in the order of `FAMILIES` and of their names.
+def load(families: Sequence[str] | None = None, stacks: Sequence[str] | None = None) -> list[Case]:
+    """The stacks of these families and names (all if None), in the order of `FAMILIES` and of their names.
 
     Raises:
-        ValueError: a family that is none, or a file that describes no stack, named.
+        ValueError: a family or a stack that is none, or a file that describes no stack, named.
     """
     chosen = list(FAMILIES) if families is None else families
     for family in chosen:
         if family not in FAMILIES:
             raise ValueError(f"family {family!r} is not one of {', '.join(FAMILIES)}")
     ordered = [family for family in FAMILIES if family in chosen]
-    return [_read(path) for family in ordered for path in sorted((DIRECTORY / family).glob("*.toml"))]
+    paths = [path for family in ordered for path in sorted((DIRECTORY / family).glob("*.toml"))]
+    for name in stacks or ():
+        if name not in {path.stem for path in paths}:
+            raise ValueError(f"stack {name!r} is not one of {', '.join(path.stem for path in paths)}")
+    return [_read(path) for path in paths if stacks is None or path.stem in stacks]
 
 
 def _read(path: Path) -> Case:

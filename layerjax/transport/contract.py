@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._batching import in_chunks
+from layerjax._batching import in_chunks, room
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
@@ -175,7 +175,7 @@ class DeterministicTransport(Transport):
         batch = wi.shape[:-1]
         if 0 in batch:
             return (jnp.zeros((*batch, channels), wi.dtype),) * 2
-        near, far = jax.lax.map(one, wi.reshape(-1, 3))
+        near, far = jax.lax.map(one, wi.reshape(-1, 3), batch_size=room() if room() > 1 else None)
         return near.reshape(*batch, -1), far.reshape(*batch, -1)
 
 

@@ -64,7 +64,7 @@ def test_models_are_registered_by_name() -> None:
 
 
 def test_bad_usage_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["--families", "paints"], ["--models", "walk"]):
+    for arguments in (["--families", "paints"], ["--models", "walk"], ["--stacks", "sond"]):
         with pytest.raises(SystemExit):
             __main__.main(["error-vs-time", *arguments])
         assert len(capsys.readouterr().err.strip().splitlines()[-1:]) == 1

@@ -97,14 +97,18 @@ class Run:
     albedo: NDArray[np.float64] | None
     nanoseconds_per_value: float
     prepare_seconds: float
-    compile_seconds: float
+    compile_seconds: float | None
     operations: int
     seconds: float
 
 
 @dataclass(frozen=True)
 class Row:
-    """One model at one resolution on one stack. Errors are None where a value was not finite or is not compared."""
+    """One model at one resolution on one stack.
+
+    Errors are None where a value was not finite or is not compared, compile_seconds where compiled programs were read
+    from JAX's cache on disk.
+    """
 
     stack: str
     family: str
@@ -116,7 +120,7 @@ class Row:
     albedo: float | None
     nanoseconds_per_value: float
     prepare_seconds: float
-    compile_seconds: float
+    compile_seconds: float | None
     operations: int
     truth_limits: bool
 
@@ -134,12 +138,13 @@ class Programs:
     """Compile times and operation counts, by structure: stacks that differ in numbers alone share their programs."""
 
     def __init__(self) -> None:
-        self._known: dict[Any, tuple[float, int]] = {}
+        self._known: dict[Any, tuple[float | None, int]] = {}
 
-    def of(self, key: Any, seconds: float, count: Callable[[], int]) -> tuple[float, int]:
+    def of(self, key: Any, seconds: float, count: Callable[[], int]) -> tuple[float | None, int]:
         """The figures of this structure; those given, if it is the first time that it is met."""
         if key not in self._known:
-            self._known[key] = (seconds, count())
+            cached = getattr(jax.config, "jax_compilation_cache_dir", None) is not None
+            self._known[key] = (None if cached else max(seconds, 0.0), count())
         return self._known[key]
 
 
@@ -215,7 +220,7 @@ def _called(case: Case, model: Model, label: str, transport: lj.Transport, size:
     arrays, others = eqx.partition(case.stack, eqx.is_array_like)
     compile_seconds, counted = programs.of(
         _structure(case.stack, label, model.name, len(indices)),
-        max(calling - few, 0.0),
+        calling - few,
         lambda: operations.total(
             lambda arrays: lj.evaluate(
                 eqx.combine(arrays, others), directions.wi, directions.wo, lj.choose_transport(case.stack, transport)

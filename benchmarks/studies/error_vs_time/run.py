@@ -78,6 +78,7 @@ def study(
     report: Callable[[str], None] = lambda line: None,
     directory: Path = DIRECTORY,
     families: Sequence[str] | None = None,
+    stacks: Sequence[str] | None = None,
     resume: bool = False,
     truths: Path | None = None,
     models: Sequence[Model] = MODELS,
@@ -90,6 +91,7 @@ def study(
     Args:
         quick: some of the stacks, one repeat, short ladders: a look, no result to quote.
         families: keys of `suite.FAMILIES`; all if None.
+        stacks: names; all of the families if None.
         resume: keep what the directory holds, measured with the same settings, and measure what it lacks: stacks, or a
             new model. Every stack is written as soon as it is measured: an interrupted run goes on from there.
         truths: a directory of results whose truths stand for stacks that are not measured yet; the models, and the
@@ -101,7 +103,7 @@ def study(
         ValueError: a family that there is not, or results to resume that were measured with other settings.
     """
     if cases is None:
-        cases = suite.load(families)[:: QUICK_STEP if quick else 1]
+        cases = suite.load(families, stacks)[:: QUICK_STEP if quick else 1]
     size = size or (QUICK if quick else Size())
     setup = Setup(directory, quick, models, references, size, environment.describe())
     held = _held(directory, setup.settings) if resume else Held()

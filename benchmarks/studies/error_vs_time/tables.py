@@ -28,7 +28,8 @@ TEXT = """\
 A value is a pair of directions with all its channels. *ns a value* is the median of up to {rounds} repeats, everything
 compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {transmitting} if light passes);
 *prepare* is what a stack costs once, and *all, ns* is both when {values:,} values of a stack are asked for. *compile*
-is the first call less a later one, of both; stacks that differ in numbers alone share it. *operations* counts those of
+is the first call less a later one, of both, of stacks whose programs no cache on disk held; stacks that differ in
+numbers alone share it. *operations* counts those of
 the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are left out.
 
 The truth is {truth}, solved {dates}. Its uncertainty is its distance from its next coarser resolution,
@@ -133,7 +134,7 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
                     figure(_median(row.nanoseconds_per_value for row in found)),
                     figure(1e3 * _median(row.prepare_seconds for row in found)),
                     figure(_median(map(amortised, found))),
-                    figure(_median(row.compile_seconds for row in found), digits=2),
+                    _compile([row.compile_seconds for row in found]),
                     f"{np.median([row.operations for row in found]):,.0f}",
                 ]
             )
@@ -203,6 +204,11 @@ def _short(name: str) -> str:
     """The initials of a model whose name has several words."""
     words = name.replace("-", " ").split()
     return "".join(word[0].upper() for word in words) if len(words) > 1 else name
+
+
+def _compile(seconds: Sequence[float | None]) -> str:
+    known = [value for value in seconds if value is not None]
+    return figure(_median(known) if known else None, digits=2)
 
 
 def _percent(value: float) -> str:

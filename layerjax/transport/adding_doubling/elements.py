@@ -7,7 +7,7 @@ product with them: no program has to be run backwards through quadratures.
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -46,9 +46,19 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
                 array = next(shapes)
                 part, left = left[: array.size], left[array.size :]
                 filled[place] = jnp.stack(part).reshape(array.shape) if array.ndim else part[0]
-        return function(jax.tree.unflatten(structure, filled), constants)
+        return _tied(function(jax.tree.unflatten(structure, filled), constants), scalars)
 
     return _of_scalars(of_scalars, scalars, constants)
+
+
+def _tied(found: Any, scalars: Scalars) -> Any:
+    """What was found, all of it a function of the scalars in form, at no cost.
+
+    Under `vmap` an output of a custom derivative that does not depend on them would have no batch as a value and one
+    as soon as it is differentiated, and programs that are batched before that are then given the wrong shape.
+    """
+    is_number = reduce(jnp.logical_and, (scalar == scalar for scalar in scalars), jnp.asarray(True))
+    return jax.tree.map(lambda leaf: jnp.where(is_number, leaf, leaf), found)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._devices import exact_products
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
@@ -267,6 +268,7 @@ def _is_traced(tree: Any) -> bool:
 
 
 @eqx.filter_jit
+@exact_products
 def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
     grid, whole, rest = solve(stack, plan)
     met = partial(interaction_probability, first)
@@ -274,6 +276,7 @@ def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
 
 
 @eqx.filter_jit
+@exact_products
 def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
     grid, _, rest = solve(stack, plan, known)
     return between(rest, known, grid.regions[-1].ior, stack.base is not None)

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._devices import exact_products
 from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick, select, times
 from layerjax.directions import Vector, sanitised
@@ -86,6 +87,7 @@ def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> Diffu
 
 
 @eqx.filter_jit
+@exact_products
 def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseBase:
     grid, whole, _ = solve(bare, plan)
     top, bottom = grid.regions[0], grid.regions[-1]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._devices import exact_products
 from layerjax._numerics import at_least, horizon, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick
 from layerjax.directions import Vector, sanitised
@@ -63,6 +64,7 @@ def why_no_lobe(stack: Stack, names: Sequence[str]) -> str | None:
 
 
 @eqx.filter_jit
+@exact_products
 def make_diffuse_lobe(stack: Stack) -> DiffuseLobe:
     """The lobe of a simplified stack for which `why_no_lobe` finds nothing."""
     assert isinstance(stack.base, Lambertian)
