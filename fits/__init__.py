@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from fits.inference.sampling import sample as sample
     from fits.problem.correlated import Correlated as Correlated
     from fits.problem.instrument import Instrument as Instrument
+    from fits.problem.joint import Joint as Joint
     from fits.problem.likelihood import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
@@ -68,6 +69,7 @@ _HOMES = {
     "Combination": "inference.identifiability",
     "Correlated": "problem.correlated",
     "Instrument": "problem.instrument",
+    "Joint": "problem.joint",
     "Noise": "problem.likelihood",
     "Measurements": "data.measurements",
     "fit": "inference.optimise",

@@ -14,9 +14,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.inference.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
-from fits.problem.likelihood import total_sigma
 from fits.problem.model import Model
-from fits.problem.problem import Problem
+from fits.problem.posed import Posed
 
 PROMISE = 1e-8
 """A likelihood fit has converged when a full step promises less than this in the log-posterior: 1e-4 standard
@@ -95,9 +94,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
             jnp.arange(2.0),
         )
     if likelihood and model.varying:
-        parts = model.build(model.box.from_unit(start))
-        typical = jnp.mean(jnp.abs(model.values))  # a tenth of it keeps readings near 0 from outweighing all others
-        held = total_sigma(jnp.abs(model.values) + 0.1 * typical, model.variance, parts.relative, parts.floor)
+        held = model.near_sigma(model.box.from_unit(start))
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
     _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
@@ -111,12 +108,12 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
     )
 
 
-def descent(problem: Problem, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
+def descent(problem: Posed, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
     found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(promise))
     return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
 
 
-def here(problem: Problem, unit: Floats) -> Descent:
+def here(problem: Posed, unit: Floats) -> Descent:
     """What is known at a point (P,) of the unit box; its vector is this point."""
     return descent(problem, unit, False, 1)

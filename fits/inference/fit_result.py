@@ -1,7 +1,7 @@
 """The outcome of a fit: values, how far to trust them, and what else would explain the data."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.inference.identifiability import Combination
-from fits.problem.model import Model
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -77,6 +76,8 @@ class Fit:
         resolution: of the transport, in words; None where it has none. `problem` holds it.
         alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
             that rule (see `Noise`); else None.
+        alone_parts: of a `Joint`, the same by the names of measurements.
+        within: of one measurement of a `Joint`, the fit of all of them, and its name there.
     """
 
     problem: Problem
@@ -98,6 +99,43 @@ class Fit:
     numerical_error: float | None = None
     resolution: str | None = None
     alone: Alone | None = None
+    alone_parts: Mapping[str, Alone] = field(default_factory=dict)
+    within: "tuple[Fit, str] | None" = None
+
+    def part(self, name: str = "") -> "Fit":
+        """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
+
+        Raises:
+            ValueError: a name that no measurement has.
+        """
+        problem = self.problem.problems.get(name)
+        if problem is None:
+            raise ValueError(f"part {name!r} is not one of {', '.join(self.problem.problems)}")
+        if problem is self.problem:
+            return self
+        own = list(self.problem.places(name))
+        called = {self.problem.names[place]: plain for place, plain in zip(own, problem.names, strict=True)}
+
+        def minimum(one: Minimum) -> Minimum:
+            values = {plain: one.values[whole] for whole, plain in called.items()}
+            return replace(one, values=values, stack=one.stack[name])
+
+        found = replace(
+            self,
+            problem=problem,
+            vector=self.vector[own],
+            errors=self.errors[own],
+            covariance=self.covariance[np.ix_(own, own)],
+            at_bound=_called(self.at_bound, called),
+            without_influence=_called(self.without_influence, called),
+            unresolved=tuple(one.called(called) for one in self.unresolved if set(one.weights) & set(called)),
+            minima=tuple(map(minimum, self.minima)),
+            alternatives=tuple(map(minimum, self.alternatives)),
+            alone=self.alone_parts.get(name),
+            within=(self, name),
+        )
+        vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
+        return found
 
     @property
     def values(self) -> dict[str, float]:
@@ -141,12 +179,12 @@ class Fit:
 
         With correlated noise, what is left of it beside the errors that readings share.
         """
-        return np.asarray(self.problem.call(Model.unshared_at, self.vector, self.predicted), float)
+        return np.asarray(self.problem.call("unshared_at", self.vector, self.predicted), float)
 
     @cached_property
     def chi_square(self) -> float:
         """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
-        return float(self.problem.call(Model.chi_square_at, self.vector, self.predicted))
+        return float(self.problem.call("chi_square_at", self.vector, self.predicted))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -163,7 +201,7 @@ class Fit:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
         if not self.is_posterior:
             return float("nan")
-        return float(self.problem.call(Model.log_likelihood_at, self.vector, self.predicted))
+        return float(self.problem.call("log_likelihood_at", self.vector, self.predicted))
 
     @property
     def correlation(self) -> Floats:
@@ -171,3 +209,8 @@ class Fit:
         spread = np.sqrt(np.diagonal(self.covariance))
         spread = np.where(spread > 0, spread, np.nan)
         return self.covariance / np.outer(spread, spread)
+
+
+def _called(names: tuple[str, ...], called: Mapping[str, str]) -> tuple[str, ...]:
+    """Those of the names that are known, as they are called elsewhere."""
+    return tuple(called[name] for name in names if name in called)

@@ -7,7 +7,8 @@ direction turns.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,13 @@ class Combination:
     error: float
     weights: dict[str, float]
     alone: dict[str, float]
+
+    def called(self, names: Mapping[str, str]) -> "Combination":
+        """Of those of its members that have names elsewhere, under these."""
+        weights, alone = (
+            {names[name]: value for name, value in part.items() if name in names} for part in (self.weights, self.alone)
+        )
+        return replace(self, weights=weights, alone=alone)
 
     @property
     def open(self) -> bool:

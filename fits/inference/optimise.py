@@ -1,8 +1,10 @@
 """Fitting: many starts through one compiled program, then what the best minimum is worth."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from types import MappingProxyType
+from typing import Any, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +18,15 @@ from fits.inference.identifiability import OPEN_BEYOND
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.refinement import Accuracy, refined
 from fits.inference.resolution import resolutions
-from fits.inference.shared_errors import alone, are_shared, left_open, points
+from fits.inference.shared_errors import alone, counting, points, sharing
 from fits.inference.starts import End, Solver, race, rough_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
 from fits.problem.instrument import Instrument
+from fits.problem.joint import Joint
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
+from fits.problem.posed import Posed
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
@@ -38,7 +42,7 @@ SAME_COST = 1e-3
 
 def fit(
     stack: Any,
-    data: Measurements,
+    data: Measurements | None = None,
     *,
     transport: Transport = "auto",
     noise: Noise | None = None,
@@ -54,7 +58,7 @@ def fit(
     """Find the parameters of `stack` that explain `data` best, and how well the data determine them.
 
     Args:
-        stack: holds `Free` where a number is to be fitted.
+        stack: holds `Free` where a number is to be fitted; or a `Joint` of problems, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport, noise, scale, objective, instrument: see `Problem`. A resolution that the transport leaves open is
             chosen: coarse for the starts, at the end so fine that the numerical error of the model stays below a tenth
@@ -71,12 +75,20 @@ def fit(
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
-    problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
+    if isinstance(stack, Joint):
+        for name, given in (("data", data), ("noise", noise), ("scale", scale), ("instrument", instrument)):
+            if given is not None:
+                raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
+        problem: Posed = stack
+    elif data is None:
+        raise ValueError("data is None; it must be the measurements that the stack should explain")
+    else:
+        problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
     return fit_problem(problem, starts=starts, seed=seed, solver=solver, progress=progress, checkpoint=checkpoint)
 
 
 def fit_problem(
-    problem: Problem,
+    problem: Posed,
     *,
     starts: int = 32,
     seed: int = 0,
@@ -88,7 +100,7 @@ def fit_problem(
     """Find the best parameters of a problem that is already put together, as `fit` does.
 
     Args:
-        problem: what is fitted to what.
+        problem: what is fitted to what: a `Problem`, or a `Joint` of several.
         starts, seed, solver, progress, checkpoint: see `fit`.
         refine: False: stay at the resolution of the starts, do not ask for its error, follow only those that are
             lowest after a few steps, and find the minimum roughly.
@@ -103,7 +115,7 @@ def fit_problem(
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or _silent
     found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
-    if not left_open(problem) or not are_shared(alone(found)):
+    if not sharing(found):
         return found
     return fit_again(
         problem,
@@ -118,7 +130,7 @@ def fit_problem(
 
 
 def fit_again(
-    problem: Problem,
+    problem: Posed,
     found: Fit,
     *,
     starts: int = 32,
@@ -129,7 +141,8 @@ def fit_again(
     refine: bool = True,
 ) -> Fit:
     """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
-    shared = replace(problem, noise=replace(problem.noise, correlated=True))
+    without = sharing(found) or {name: alone(found.part(name)) for name in problem.problems}
+    shared = problem.with_problems({name: counting(problem.problems[name]) for name in without})
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or _silent
 
@@ -137,14 +150,14 @@ def fit_again(
         progress(f"{stage} with shared errors", done, total, info)
 
     places = points(shared, found, starts, seed)
-    return _found(shared, places, solver, report, checkpoint, settings, alone(found), refine)
+    return _found(shared, places, solver, report, checkpoint, settings, without, refine)
 
 
 def refit(problem: Problem, vector: Floats) -> Fit:
     """The fit of a problem whose optimum is near this vector (P,), roughly, at the resolution that the problem has."""
     end = rough_end(problem, unit_of(problem, vector), fresh=False)
     best = optimum(problem, [end], "least_squares", check=False, promise=ROUGHLY)
-    return _fit_of(best, None, {"starts": 1}, None)
+    return _fit_of(best, None, {"starts": 1}, {})
 
 
 def again(checkpoint: str | Path) -> Path:
@@ -153,35 +166,37 @@ def again(checkpoint: str | Path) -> Path:
 
 
 def _found(
-    problem: Problem,
+    problem: Posed,
     places: Floats,
     solver: Solver,
     progress: Progress,
     checkpoint: str | Path | None,
     settings: dict[str, int | str],
-    without: Alone | None = None,
+    without: Mapping[str, Alone] = MappingProxyType({}),
     refine: bool = True,
 ) -> Fit:
     """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
-    known = resolutions(problem)
-    if known is not None and known.open:
-        problem = replace(problem, transport=known.far)
+    known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
+    coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
+    problem = problem.with_problems(coarse)
     racing = not refine and solver == "least_squares"
     ends = race(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
     best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
-    if known is not None and refine:
+    if known and refine:
         best, accuracy = refined(best, known, solver, progress)
     return _fit_of(best, accuracy, settings, without)
 
 
-def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Alone | None) -> Fit:
+def _fit_of(
+    at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Mapping[str, Alone]
+) -> Fit:
     """The fit of an optimum, with what is to be said of it."""
     problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, ended = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
     as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * at.excess)
     result = Fit(
-        problem=problem,
+        problem=cast(Problem, problem),  # or a `Joint`, of whose measurements `Fit.part` tells
         vector=lowest.vector,
         errors=found.standard_errors,
         covariance=found.covariance,
@@ -199,7 +214,8 @@ def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | st
         ended=ended,
         numerical_error=None if accuracy is None else accuracy.error,
         resolution=None if accuracy is None else accuracy.resolution,
-        alone=without,
+        alone=without.get(""),
+        alone_parts={name: one for name, one in without.items() if name},
     )
     notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
     notes += [] if accuracy is None else [accuracy.words]
@@ -210,7 +226,7 @@ def _fit_of(at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | st
 
 
 def _ends(
-    problem: Problem, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
+    problem: Posed, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
 ) -> list[End]:
     """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
     if checkpoint is None:
@@ -222,7 +238,7 @@ def _ends(
 
 
 def _minima(
-    problem: Problem, ends: list[End], best: int, found: Uncertainty, same_cost: float
+    problem: Posed, ends: list[End], best: int, found: Uncertainty, same_cost: float
 ) -> tuple[tuple[Minimum, ...], dict[str, int]]:
     """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
     cost = np.array([end.cost for end in ends])

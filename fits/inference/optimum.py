@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from fits.inference.descent import PROMISE, ROUGHLY, here
 from fits.inference.starts import End, Solver, least_squares_end, polished, unit_of
 from fits.inference.uncertainty import Uncertainty, uncertainty
-from fits.problem.model import Model
-from fits.problem.problem import Problem
+from fits.problem.posed import Posed
 
 EQUALLY_WELL = 2.0
 """Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
@@ -25,7 +24,7 @@ class Optimum(NamedTuple):
     differences in cost count in, see `EQUALLY_WELL`.
     """
 
-    problem: Problem
+    problem: Posed
     ends: list[End]
     best: int
     found: Uncertainty
@@ -40,7 +39,7 @@ class Optimum(NamedTuple):
 
 
 def optimum(
-    problem: Problem, ends: list[End], solver: Solver, *, check: bool = True, promise: float = PROMISE
+    problem: Posed, ends: list[End], solver: Solver, *, check: bool = True, promise: float = PROMISE
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
@@ -62,22 +61,22 @@ def optimum(
     return Optimum(problem, ends, best, found, improved, predicted, _excess(problem, lowest, predicted))
 
 
-def _followed(problem: Problem, end: End, promise: float) -> End:
+def _followed(problem: Posed, end: End, promise: float) -> End:
     """The end, closer to its minimum."""
     closer = least_squares_end(problem, unit_of(problem, end.vector), False, promise)
     return closer._replace(steps=end.steps + closer.steps) if closer.cost <= end.cost else end
 
 
-def _on_bounds(problem: Problem, vector: Floats, held: NDArray[np.bool_]) -> Floats:
+def _on_bounds(problem: Posed, vector: Floats, held: NDArray[np.bool_]) -> Floats:
     """Exact bounds where the solver ended on them."""
     nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
     return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
 
 
-def _excess(problem: Problem, lowest: End, predicted: Floats) -> float:
+def _excess(problem: Posed, lowest: End, predicted: Floats) -> float:
     """The reduced chi-square where it is above 1; of a named objective, the residual variance."""
     freedom = problem.count - len(lowest.vector)
     if problem.objective != "likelihood":
         return 2.0 * lowest.cost / max(freedom, 1)
-    chi_square = float(problem.call(Model.chi_square_at, lowest.vector, predicted))
+    chi_square = float(problem.call("chi_square_at", lowest.vector, predicted))
     return max(1.0, chi_square / freedom if freedom > 0 else 1.0)

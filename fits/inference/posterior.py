@@ -1,7 +1,7 @@
 """What a chain of samples says about the parameters of a fit: estimates, predictions, and how far to trust them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -48,6 +48,12 @@ class Posterior:
     allow_short: bool = False
     status: str = ""
     divergences: int = 0
+
+    def part(self, name: str) -> "Posterior":
+        """What the posterior of a `Joint` says of one measurement. ValueError for a name that none has."""
+        fit = self.fit.part(name)
+        own = list(self.fit.problem.places(name))
+        return replace(self, fit=fit, chain=self.chain[..., own], autocorrelation_time=self.autocorrelation_time[own])
 
     @property
     def names(self) -> tuple[str, ...]:

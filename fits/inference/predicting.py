@@ -100,6 +100,10 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
 
 def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the shape of their weights."""
+    if isinstance(of, Fit) and of.within is not None:  # what other measurements say of its parameters counts too
+        whole, name = of.within
+        vectors, shape = _vectors(whole, draws, generator)
+        return vectors[:, list(whole.problem.places(name))], shape
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))

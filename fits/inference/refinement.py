@@ -4,6 +4,7 @@ Programs of a finer resolution take seconds to compile: which one is needed is f
 minima that may be the best or as good as it are fitted again.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,8 +14,7 @@ import layerjax as lj
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.resolution import ENOUGH, Resolutions, Values
 from fits.inference.starts import End, Solver, bounded_end, rough_end, unit_of
-from fits.problem.model import Model
-from fits.problem.problem import Problem
+from fits.problem.posed import Posed
 from fits.progress import Progress
 
 ALIKE = 0.01
@@ -35,19 +35,43 @@ class Accuracy(NamedTuple):
     words: str
 
 
-def refined(at: Optimum, known: Resolutions, solver: Solver, progress: Progress) -> tuple[Optimum, Accuracy]:
-    """The optimum at the resolution that the noise asks for; at the given one where one is given."""
-    own = at.problem.transport if known.open else known.chosen
+def refined(
+    at: Optimum, known: Mapping[str, Resolutions], solver: Solver, progress: Progress
+) -> tuple[Optimum, Accuracy]:
+    """The optimum at the resolution that the noise of each measurement asks for; at the given one where one is given.
+
+    known: of those measurements whose transport has one, by name.
+    """
+    own = {name: at.problem.problems[name].transport if one.open else one.chosen for name, one in known.items()}
     while True:
-        assert isinstance(own, lj.AddingDoubling)
-        values = Values(at.problem, own, at.lowest.vector, at.predicted)
-        needed, error, finest = _needed(known, own, values, progress)
+        shares, needed, found = at.problem.shares(at.predicted), dict(own), {}
+        for name, one in known.items():
+            vector = at.lowest.vector[list(at.problem.places(name))]
+            values = Values(at.problem.problems[name], own[name], vector, shares[name])
+            needed[name], error, finest = _needed(one, own[name], values, progress)
+            found[name] = _accuracy(one, own[name], error, finest)
         if needed == own:
-            return at, _accuracy(known, own, error, finest)
-        problem, own = replace(at.problem, transport=needed), needed
-        ends = _fitted_again(at, problem, solver, known.in_words(needed), progress)
+            return at, _together(found)
+        own = needed
+        changed = {
+            name: replace(at.problem.problems[name], transport=own[name]) for name, one in known.items() if one.open
+        }
+        problem = at.problem.with_problems(changed)
+        words = _listed({name: one.in_words(own[name]) for name, one in known.items()})
+        ends = _fitted_again(at, problem, solver, words, progress)
         again = optimum(problem, ends, solver, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
+
+
+def _together(found: Mapping[str, Accuracy]) -> Accuracy:
+    """What is said of several measurements: the largest error, and the words of each."""
+    resolution = _listed({name: one.resolution for name, one in found.items()})
+    words = _listed({name: one.words for name, one in found.items()})
+    return Accuracy(resolution, float(np.max([one.error for one in found.values()])), words)
+
+
+def _listed(words: Mapping[str, str]) -> str:
+    return "; ".join(f"{name}: {one}" if name else one for name, one in words.items())
 
 
 def _needed(
@@ -85,7 +109,7 @@ def _accuracy(known: Resolutions, own: lj.AddingDoubling, error: float, finest: 
     return Accuracy(resolution, error, f"numerical error of the model: {words}")
 
 
-def _fitted_again(at: Optimum, problem: Problem, solver: Solver, words: str, progress: Progress) -> list[End]:
+def _fitted_again(at: Optimum, problem: Posed, solver: Solver, words: str, progress: Progress) -> list[End]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
     solve = rough_end if solver == "least_squares" else bounded_end
     groups = _alike(at)
@@ -129,7 +153,7 @@ def _alike(at: Optimum) -> list[list[int]]:
     return groups
 
 
-def _cost(problem: Problem, end: End) -> float:
+def _cost(problem: Posed, end: End) -> float:
     """What the end of another resolution costs at the problem's own; infinite where that is not finite."""
-    cost = float(problem.call(Model.cost_at, end.vector, problem.predict(end.vector)))
+    cost = float(problem.call("cost_at", end.vector, problem.predict(end.vector)))
     return cost if np.isfinite(cost) else np.inf

@@ -5,6 +5,7 @@ correlated by more than `LEAST`, and by more than `CLEAR` standard errors, it is
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from fits.data.neighbours import alike, neighbours
 from fits.inference.fit_result import Alone, Fit
 from fits.inference.starts import start_points, unit_of
+from fits.problem.posed import Posed
 from fits.problem.problem import Problem
 
 LEAST, CLEAR = 0.2, 3.0
@@ -45,7 +47,19 @@ def are_shared(found: Alone) -> bool:
     return found.alike > LEAST and found.alike * math.sqrt(found.pairs) > CLEAR
 
 
-def points(problem: Problem, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
+def sharing(fit: Fit) -> dict[str, Alone]:
+    """The measurements of which errors are to be counted that readings share, by the rule, as fitted without."""
+    problems = fit.problem.problems.items()
+    found = {name: alone(fit.part(name)) for name, problem in problems if left_open(problem)}
+    return {name: one for name, one in found.items() if are_shared(one)}
+
+
+def counting(problem: Problem) -> Problem:
+    """The problem with errors that readings share."""
+    return replace(problem, noise=replace(problem.noise, correlated=True))
+
+
+def points(problem: Posed, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
     """Where to start from, (K, P) in the unit box of a problem with shared errors, after a fit without: its minima, and
     some of as many starts as it had.
     """

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import layerjax
 from fits._files import locked, named, write_whole
 from fits.inference.descent import here
-from fits.problem.problem import Problem
+from fits.problem.posed import Posed
 
 Solver = Literal["least_squares", "bounded"]
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ class End(NamedTuple):
 class StartsFile:
     """A context manager: `ends` holds what was done before, by the number of the start, `add` keeps one more."""
 
-    def __init__(self, path: str | Path, problem: Problem, points: Floats, solver: Solver):
+    def __init__(self, path: str | Path, problem: Posed, points: Floats, solver: Solver):
         self.path = Path(path)
         self.ends: dict[int, End] = {}
         self._fit = _identity(problem, points, solver)
@@ -96,7 +96,7 @@ def _checked(line: bytes) -> dict[str, Any] | None:
     return json.loads(text)
 
 
-def _identity(problem: Problem, points: Floats, solver: Solver) -> str:
+def _identity(problem: Posed, points: Floats, solver: Solver) -> str:
     """A fingerprint of everything that the ends of the starts depend on."""
     arrays, static = problem.split_model
     digest = hashlib.sha256(repr((layerjax.__version__, solver, problem.names, static.tree)).encode())

@@ -16,6 +16,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.problem.density import Density
 from fits.problem.instrument import Optics, Setting
 from fits.problem.likelihood import (
     Objective,
@@ -59,7 +60,7 @@ class Parts(NamedTuple):
     correlation: Correlation | None
 
 
-class Model(eqx.Module):
+class Model(Density):
     """Pure functions of the physical vector (P,): predictions, residuals and log-densities over the used samples.
 
     Arrays are traced by `jax.jit`, the rest is static.
@@ -183,7 +184,17 @@ class Model(eqx.Module):
 
     def cost_at(self, vector: Array, predicted: Array) -> Array:
         """Half the sum of squared residuals with these parameters and what they predict, (N, C)."""
-        return half_squares(self._residuals(vector, predicted, self._noise_at(vector, predicted)))
+        return half_squares(self.residuals_at(vector, predicted))
+
+    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
+        """`residuals`, with these parameters and what they predict, (N, C)."""
+        return self._residuals(vector, predicted, self._noise_at(vector, predicted))
+
+    def near_sigma(self, vector: Array) -> Array:
+        """A scale of the noise, (N, C), in 1/sr, with these parameters, that no reading near 0 stands out by."""
+        parts = self.build(vector)
+        typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps readings near 0 from outweighing all others
+        return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
 
     def residuals(self, vector: Array) -> tuple[Array, ...]:
         """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
@@ -194,7 +205,7 @@ class Model(eqx.Module):
         return self.linear_parts(vector)[0]
 
     def linear_parts(
-        self, vector: Array, first_step: tuple[Array, Array] | None = None
+        self, vector: Array, first_step: tuple[Array, Array] | None = None, others: bool = False
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
         """See `residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
 
@@ -202,9 +213,11 @@ class Model(eqx.Module):
         only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
 
         first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
-        and how much of the errors that readings share counts.
+        and how much of the errors that readings share counts. others: whether derivatives are also by parameters of
+        other models, which nothing depends on here.
         """
-        predicted = self.predict(vector) if self.moving == vector.size else _by_columns(vector, model=self)
+        alone = self.moving == vector.size and not others
+        predicted = self.predict(vector) if alone else _by_columns(vector, model=self)
         sigma = self._noise_at(vector, predicted)
         shared: Array | float = 1.0
         held = sigma
@@ -243,16 +256,6 @@ class Model(eqx.Module):
         squares = jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
         levels = jnp.sum(found.levels) + jnp.sum(jnp.log(sigma))
         return -0.5 * squares - levels - 0.5 * self.values.size * math.log(2.0 * math.pi)
-
-    def log_prior(self, vector: Array) -> Array:
-        """Log-density of the physical vector, -inf outside the bounds."""
-        return self.box.log_prior(vector)
-
-    def log_posterior_unconstrained(self, u: Array) -> Array:
-        """Log-posterior (not normalised) as a density over the unconstrained vector; -inf where undefined."""
-        vector = self.box.constrain(u)
-        total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
-        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
     def _named(self, predicted: Array) -> Array:
         assert self.objective != "likelihood"

@@ -5,10 +5,10 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import equinox as eqx
 import jax
@@ -27,6 +27,7 @@ from fits.problem.levels import Levels, noise_levels
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
+from fits.problem.posed import Assembled, Posed
 from fits.problem.process import Process, make_process
 from layerjax._parameters import plain_name
 from layerjax.stack import with_known
@@ -34,13 +35,8 @@ from layerjax.stack import with_known
 Floats = NDArray[np.float64]
 
 
-def _is_vector(argument: Any) -> bool:
-    """Whether numbers are listed, which make an array; a named tuple holds arrays."""
-    return type(argument) in (list, tuple)
-
-
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Posed):
     """A stack with `Free` leaves, the measurements that it should explain, and how they scatter about it.
 
     Args:
@@ -71,28 +67,8 @@ class Problem:
         _ = self._assembled  # now, so that what does not fit together is refused where it was given
 
     @cached_property
-    def _assembled(self) -> "_Assembled":
+    def _assembled(self) -> Assembled:
         return _assemble(self)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the P parameters: paths such as ``layers[0].thickness``, ``noise.floor`` or ``scale``."""
-        return self._assembled.names
-
-    @property
-    def start(self) -> Floats:
-        """Where the parameters start, (P,)."""
-        return self._assembled.start
-
-    @property
-    def low(self) -> Floats:
-        """Lower bounds of the parameters, (P,)."""
-        return self._assembled.low
-
-    @property
-    def high(self) -> Floats:
-        """Upper bounds of the parameters, (P,)."""
-        return self._assembled.high
 
     @property
     def model(self) -> Model:
@@ -105,17 +81,25 @@ class Problem:
         return {name: _unit(name) for name in self.names}
 
     @property
-    def count(self) -> int:
-        """Number of data: used samples times channels."""
-        return int(self.model.values.size)
+    def problems(self) -> "dict[str, Problem]":
+        """The one measurement, which has no name."""
+        return {"": self}
+
+    def places(self, name: str = "") -> tuple[int, ...]:
+        """All places of the vector."""
+        return tuple(range(len(self.names)))
+
+    def shares(self, predicted: Floats) -> dict[str, Floats]:
+        """All that is predicted."""
+        return {"": predicted}
+
+    def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
+        """What stands in its place."""
+        return changed.get("", self)
 
     def build(self, vector: ArrayLike) -> Parts:
         """Stack, scale and noise levels with the physical vector (P,)."""
-        return jax.tree.map(jnp.asarray, self.model.build(jnp.asarray(vector)))
-
-    def predict(self, vector: ArrayLike) -> Array:
-        """Scaled BSDF of the used samples, (N, C), in 1/sr."""
-        return self.call(Model.predict, vector)
+        return super().build(vector)
 
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
@@ -124,42 +108,11 @@ class Problem:
         arrays, static = eqx.partition(model, eqx.is_array)
         return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
 
-    def residuals(self, vector: ArrayLike) -> Array:
-        """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
-        return jnp.concatenate([part.reshape(-1) for part in self.call(Model.residuals, vector)])
-
-    def log_likelihood(self, vector: ArrayLike) -> Array:
-        """Normalised log-likelihood of the used samples with the physical vector (P,)."""
-        return self.call(Model.log_likelihood, vector)
-
-    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
-        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
-        return self.call(Model.log_likelihood_per_datum, vector)
-
-    def log_prior(self, vector: ArrayLike) -> Array:
-        """Log-density of the physical vector, -inf outside the bounds."""
-        return self.call(Model.log_prior, vector)
-
-    def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
-        """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
-        return self.call(Model.log_posterior_unconstrained, u)
-
     def with_model(self, model: Model) -> "Problem":
         """The problem with other arrays in its model."""
         other = replace(self)
         vars(other)["_assembled"] = self._assembled._replace(model=model)
         return other
-
-    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """`function(model, *arguments)`, compiled once for all problems of this structure."""
-        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
-        return run(function, self.split_model, *arrays)
-
-    @cached_property
-    def split_model(self) -> tuple[Any, Static]:
-        """The model's arrays, and what is static in it wrapped for use as a key."""
-        arrays, static = eqx.partition(self.model, eqx.is_array)
-        return arrays, Static(static)
 
 
 UNITS = {
@@ -175,17 +128,7 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.cor
 """How names begin of what stands in each place of `Parts`."""
 
 
-class _Assembled(NamedTuple):
-    """What follows from a problem as it was given; start, low, high: (P,)."""
-
-    names: tuple[str, ...]
-    start: Floats
-    low: Floats
-    high: Floats
-    model: Model
-
-
-def _assemble(problem: Problem) -> _Assembled:
+def _assemble(problem: Problem) -> Assembled:
     _require_known(problem.objective, problem.scale)
     used = problem.data.used()
     if not used.values.size:
@@ -204,7 +147,7 @@ def _assemble(problem: Problem) -> _Assembled:
     model = _model(problem, used, levels, template, Box.of(free), process, names)
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
     _require_same_channels(model, start, used)
-    return _Assembled(names, start, low, high, model)
+    return Assembled(names, start, low, high, model)
 
 
 def _require_known(objective: str, scale: Any) -> None:

@@ -11,7 +11,6 @@ from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
 from fits.inference.limits import instrument_limits
 from fits.inference.resolution import ENOUGH
-from fits.problem.model import Model
 from fits.reporting.diagnostics import ResidualStructure
 
 if TYPE_CHECKING:
@@ -136,7 +135,7 @@ def shared_errors(fit: "Fit") -> list[str]:
     at = fit.problem.build(fit.vector).correlation
     if at is None:
         return []
-    scatter = float(np.sum(np.square(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted))))
+    scatter = float(np.sum(np.square(fit.problem.call("offsets_at", fit.vector, fit.predicted))))
     share = 1.0 - float(np.sum(fit.residuals**2)) / scatter if scatter > 0.0 else 0.0
     reach = f"{float(at.half):.2g} degrees of the half vector and {float(at.difference):.2g} of the difference"
     along = 100.0 * float(at.amplitude)

@@ -159,11 +159,10 @@ def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
 
 def assumed_sigma(fit: "Fit") -> Floats:
     """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
-    from fits.problem.model import Model
 
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
+    return np.asarray(fit.problem.call("sigma_at", fit.vector, fit.predicted))
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:

@@ -1,0 +1,306 @@
+"""Several measurements with parameters in common: one likelihood, the product of theirs."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
+
+from fits.problem.density import Density
+from fits.problem.likelihood import Objective
+from fits.problem.model import Model, half_squares
+from fits.problem.parameters import Box
+from fits.problem.posed import Assembled, Floats, Posed
+from fits.problem.problem import Problem
+
+
+class JointParts(NamedTuple):
+    """What a vector makes of each measurement, by its name: stacks, and calibration factors."""
+
+    stack: dict[str, Any]
+    scale: dict[str, Any]
+
+
+class JointModel(Density):
+    """Pure functions of the physical vector (P,) over the readings of all measurements, one after the other, (N, 1).
+
+    They are those of `Model`, and stand under the same names.
+
+    Attributes:
+        parts: the models of the measurements.
+        own: for each of them, the places of its parameters in the vector.
+        box: bounds and priors of the P parameters.
+    """
+
+    parts: tuple[Model, ...]
+    box: Box
+    own: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def objective(self) -> Objective:
+        """Measurements are weighed against each other by their noise alone."""
+        return "likelihood"
+
+    @property
+    def values(self) -> Array:
+        """BSDF of all readings, (N, 1), in 1/sr."""
+        return _column([part.values for part in self.parts])
+
+    @property
+    def varying(self) -> bool:
+        """Whether sigma of any measurement depends on the parameters."""
+        return any(part.varying for part in self.parts)
+
+    @property
+    def logarithmic(self) -> tuple[int, ...]:
+        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
+        return (2,) if any(part.logarithmic for part in self.parts) else ()
+
+    @property
+    def rows(self) -> int:
+        """Number of `residuals` without those of the prior."""
+        return sum(part.rows for part in self.parts)
+
+    def vectors(self, vector: Array) -> list[Array]:
+        """The parameters of each measurement."""
+        return [vector[np.array(own)] for own in self.own]
+
+    def predict(self, vector: Array) -> Array:
+        """Scaled BSDF of all readings."""
+        return _column([part.predict(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)])
+
+    def near_sigma(self, vector: Array) -> Array:
+        """See `Model.near_sigma`."""
+        return _column([part.near_sigma(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)])
+
+    def sigma_at(self, vector: Array, predicted: Array) -> Array:
+        """Scale of the noise."""
+        return self._each("sigma_at", vector, predicted)
+
+    def offsets_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Model.offsets_at`."""
+        return self._each("offsets_at", vector, predicted)
+
+    def unshared_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Model.unshared_at`."""
+        return self._each("unshared_at", vector, predicted)
+
+    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
+        """Normalised log-density of each reading; where readings share errors, given all others."""
+        return self._each("log_likelihood_per_datum_at", vector, predicted)
+
+    def log_likelihood_per_datum(self, vector: Array) -> Array:
+        """The same with these parameters."""
+        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+
+    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
+        """Of all measurements."""
+        return jnp.sum(self._each("chi_square_at", vector, predicted))
+
+    def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
+        """Normalised log-likelihood of all readings, from what the parameters predict, (N, 1)."""
+        return jnp.sum(self._each("log_likelihood_at", vector, predicted))
+
+    def log_likelihood(self, vector: Array) -> Array:
+        """Normalised log-likelihood of all readings."""
+        found = [part.log_likelihood(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)]
+        return jnp.sum(jnp.stack(found))
+
+    def cost_at(self, vector: Array, predicted: Array) -> Array:
+        """Half the sum of squared residuals with these parameters and what they predict, (N, 1)."""
+        vectors, shares = self.vectors(vector), self._shares(predicted)
+        found = [part.residuals_at(own, share) for part, own, share in zip(self.parts, vectors, shares, strict=True)]
+        return half_squares(self._gathered(vector, found))
+
+    def residuals(self, vector: Array) -> tuple[Array, ...]:
+        """Arrays whose half sum of squares is minus the log-posterior up to a constant: see `Model.residuals`."""
+        return self.linear_parts(vector)[0]
+
+    def linear_parts(
+        self, vector: Array, first_step: tuple[Array, Array] | None = None
+    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        """See `Model.linear_parts`; each measurement is differentiated by its own parameters alone."""
+        steps: Sequence[tuple[Array, Array] | None] = [None] * len(self.parts)
+        if first_step is not None:
+            held, shared = first_step
+            sigmas = [held] * len(self.parts) if held.size == 1 else self._shares(held)
+            steps = [(sigma, shared) for sigma in sigmas]
+        residuals, predicted, rows = [], [], []
+        for part, own, step in zip(self.parts, self.vectors(vector), steps, strict=True):
+            found, (values, information) = part.linear_parts(own, step, others=True)
+            residuals.append(found)
+            predicted.append(values)
+            rows.append(information)
+        return self._gathered(vector, residuals), (_column(predicted), jnp.concatenate(rows))
+
+    def _gathered(self, vector: Array, found: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
+        """Residuals of the measurements as those of all: data, prior, levels of noise."""
+        levels = [level.reshape(-1) for _, _, *levels in found for level in levels]
+        data = jnp.concatenate([residuals[0].reshape(-1) for residuals in found])
+        return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))
+
+    def _shares(self, column: Array) -> list[Array]:
+        """What of a column (N, 1) belongs to each measurement, in the shape of its values."""
+        shapes = [part.values.shape for part in self.parts]
+        split = jnp.split(column[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        return [share.reshape(shape) for share, shape in zip(split, shapes, strict=True)]
+
+    def _each(self, name: str, vector: Array, predicted: Array) -> Array:
+        vectors, shares = self.vectors(vector), self._shares(predicted)
+        return _column(
+            [getattr(part, name)(own, share) for part, own, share in zip(self.parts, vectors, shares, strict=True)]
+        )
+
+
+class Joint(Posed):
+    """Measurements that are fitted together, each a `Problem` of its own, with parameters in common.
+
+    It stands in the place of a stack and its data: `fits.fit(fits.Joint({...}, shared=[...]))`. What is found of one
+    measurement is `Fit.part(name)`, and `Posterior.part(name)`.
+
+    Args:
+        parts: the problems by name, two or more, each with a likelihood.
+        shared: names of parameters that are one in all problems: ``layers[0].ior``, or how names begin, such as
+            ``layers[0]`` for all that is free in that layer. Start, bounds and priors must agree. The others are named
+            after their problem, ``plane.scale``.
+
+    Raises:
+        ValueError: fewer than two problems, a named objective, a shared name that is not in every problem, or free
+            parameters of one name that differ.
+    """
+
+    objective: Objective = "likelihood"
+
+    def __init__(self, parts: Mapping[str, Problem], shared: Sequence[str] = ()):
+        self.parts, self.shared = dict(parts), tuple([shared] if isinstance(shared, str) else shared)
+        if len(self.parts) < 2:
+            raise ValueError(f"Joint.parts is {list(self.parts)}; it must name at least two problems")
+        for name, problem in self.parts.items():
+            if problem.objective != "likelihood":
+                raise ValueError(f"Joint.parts[{name!r}].objective is {problem.objective!r}; it must be 'likelihood'")
+        _ = self._assembled
+
+    @cached_property
+    def _assembled(self) -> Assembled:
+        common = [name for name in next(iter(self.parts.values())).names if self._is_shared(name)]
+        self._require_common()
+        names, own = list(common), []
+        for part, problem in self.parts.items():
+            places = []
+            for name in problem.names:
+                if not self._is_shared(name):
+                    names.append(f"{part}.{name}")
+                places.append(names.index(name) if self._is_shared(name) else len(names) - 1)
+            own.append(tuple(places))
+        models = tuple(problem.model for problem in self.parts.values())
+        start, low, high = (
+            _gathered(len(names), own, [getattr(problem, bound) for problem in self.parts.values()])
+            for bound in ("start", "low", "high")
+        )
+        box = Box(
+            **{
+                field: jnp.asarray(_gathered(len(names), own, [np.asarray(getattr(m.box, field)) for m in models]))
+                for field in Box.__dataclass_fields__
+            }
+        )
+        return Assembled(tuple(names), start, low, high, JointModel(parts=models, box=box, own=tuple(own)))
+
+    @property
+    def model(self) -> JointModel:
+        """All measurements as pure functions of the physical vector (P,)."""
+        return self._assembled.model
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter; "1" for plain ratios."""
+        found = dict.fromkeys(self.names, "1")
+        for part, problem in self.parts.items():
+            for place, unit in zip(self.places(part), problem.units.values(), strict=True):
+                found[self.names[place]] = unit
+        return found
+
+    def places(self, part: str) -> tuple[int, ...]:
+        """Where the parameters of one measurement stand in the vector."""
+        if part not in self.parts:
+            raise ValueError(f"part {part!r} is not one of {', '.join(self.parts)}")
+        return self.model.own[list(self.parts).index(part)]
+
+    def build(self, vector: ArrayLike) -> JointParts:
+        """Stacks and scales with the physical vector (P,)."""
+        vector = np.asarray(vector)
+        built = {name: problem.build(vector[list(self.places(name))]) for name, problem in self.parts.items()}
+        stacks, scales = ({name: one[k] for name, one in built.items()} for k in range(2))
+        return JointParts(stacks, scales)
+
+    @property
+    def problems(self) -> dict[str, Problem]:
+        """`parts`."""
+        return self.parts
+
+    def shares(self, predicted: Floats) -> dict[str, Floats]:
+        """What `predict` gives of each measurement, in the shape of its data."""
+        shapes = [problem.model.values.shape for problem in self.parts.values()]
+        split = np.split(predicted[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        return {name: part.reshape(shape) for name, part, shape in zip(self.parts, split, shapes, strict=True)}
+
+    def with_problems(self, changed: Mapping[str, Problem]) -> "Joint":
+        """The same with other problems in the place of those of the same names."""
+        return Joint({**self.parts, **changed}, self.shared) if changed else self
+
+    def __getattr__(self, name: str) -> Any:
+        if name in {one.name for one in fields(Problem)}:
+            raise AttributeError(f"Joint has no {name}: each of its parts has one; ask of Fit.part(name)")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def _is_shared(self, name: str) -> bool:
+        return any(name == one or name.startswith((f"{one}.", f"{one}[")) for one in self.shared)
+
+    def _require_common(self) -> None:
+        """Refuse shared names that are not in every problem, or not the same there."""
+        for one in self.shared:
+            sets = {
+                part: {name for name in problem.names if name == one or name.startswith((f"{one}.", f"{one}["))}
+                for part, problem in self.parts.items()
+            }
+            every = set.union(*sets.values())
+            if not every:
+                raise ValueError(f"Joint.shared: no problem has a free parameter {one!r}")
+            for part, names in sets.items():
+                if names != every:
+                    missing = ", ".join(sorted(every - names))
+                    raise ValueError(f"Joint.shared: {missing} is not free in {part!r}; it must be in every problem")
+        first, *others = self.parts.items()
+        for name in filter(self._is_shared, first[1].names):
+            for part, problem in others:
+                if not _same(first[1], problem, name):
+                    raise ValueError(
+                        f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first[0]!r}"
+                    )
+
+
+def _same(one: Problem, other: Problem, name: str) -> bool:
+    """Whether a parameter has the same bounds and prior in both."""
+    i, j = one.names.index(name), other.names.index(name)
+    mine, theirs = one.model.box, other.model.box
+    return all(
+        math.isclose(float(getattr(mine, field)[i]), float(getattr(theirs, field)[j]), rel_tol=1e-12)
+        for field in Box.__dataclass_fields__
+    )
+
+
+def _gathered(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarray]) -> Floats:
+    """What each measurement has of its parameters, at their places in the vector; of shared ones, of the first."""
+    found = np.zeros(count, parts[0].dtype)
+    for places, values in reversed(list(zip(own, parts, strict=True))):
+        found[list(places)] = values
+    return found
+
+
+def _column(parts: Sequence[Array]) -> Array:
+    return jnp.concatenate([part.reshape(-1) for part in parts])[:, None]
