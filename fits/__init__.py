@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
+    from fits.data.totals import Totals as Totals
     from fits.inference.averaging import Average as Average
     from fits.inference.averaging import average as average
     from fits.inference.compare import Comparison as Comparison
@@ -72,6 +73,7 @@ _HOMES = {
     "Joint": "problem.joint",
     "Noise": "problem.likelihood",
     "Measurements": "data.measurements",
+    "Totals": "data.totals",
     "fit": "inference.optimise",
     "Free": "problem.parameters",
     "LogNormal": "problem.parameters",

@@ -11,6 +11,7 @@ from jax import Array
 
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, Source
+from fits.data.totals import Totals
 from fits.inference.fit_result import Fit
 from fits.inference.importance import UNRELIABLE, weighted
 from fits.inference.posterior import Posterior
@@ -86,6 +87,8 @@ def predict(
 
 
 def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
+    if isinstance(fit.problem.data, Totals) or isinstance(at, Totals):
+        raise ValueError("predict: totals are not predicted; it takes a fit of values along directions, and such")
     if isinstance(at, Measurements):
         if len(at.channels) != len(fit.problem.data.channels):
             raise ValueError(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.neighbours import alike, neighbours
+from fits.data.totals import Totals
 from fits.inference.fit_result import Alone, Fit
 from fits.inference.starts import start_points, unit_of
 from fits.problem.posed import Posed
@@ -25,6 +26,8 @@ MOST_STARTS = 8
 def left_open(problem: Problem) -> bool:
     """Whether it is left to the residuals, and could be counted."""
     noise = problem.noise
+    if isinstance(problem.data, Totals):
+        return False  # they have no neighbours
     return noise.correlated is None and noise.tails == "gaussian" and problem.objective == "likelihood"
 
 

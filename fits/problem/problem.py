@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
+from fits.data.totals import Totals
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
 from fits.problem.instrument import Instrument, optics_of, setting_of
@@ -29,6 +30,7 @@ from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.posed import Assembled, Posed
 from fits.problem.process import Process, make_process
+from fits.problem.totalling import Totalling
 from layerjax._parameters import plain_name
 from layerjax.stack import with_known
 
@@ -41,7 +43,8 @@ class Problem(Posed):
 
     Args:
         stack: holds `Free` where a number is to be fitted.
-        data: only its used samples enter.
+        data: only its used samples enter: values of a BSDF, or `Totals`, shares of light (in what follows, in the place
+            of a BSDF in 1/sr).
         transport: a layerjax transport that is not random, "auto" (see `layerjax.prepare`), or any callable
             (stack, wi, wo) -> values, of unit directions (N, 3) and a BSDF (N, C) in 1/sr; the stack may then be any
             pytree. A resolution that it leaves open is what is known while tracing asks for, and for a fit see `fit`.
@@ -130,6 +133,8 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.cor
 
 def _assemble(problem: Problem) -> Assembled:
     _require_known(problem.objective, problem.scale)
+    if isinstance(problem.data, Totals):
+        _refuse_angular_only(problem)
     used = problem.data.used()
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
@@ -201,6 +206,13 @@ def _require_noise(levels: Levels) -> None:
         raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
 
 
+def _refuse_angular_only(problem: Problem) -> None:
+    """What is said of readings along directions, and means nothing of totals."""
+    for name, given in (("instrument", problem.instrument), ("noise.correlated", problem.noise.correlated)):
+        if given:
+            raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
+
+
 def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, ...]) -> None:
     objective = problem.objective
     fitted = [name for name in ("relative", "floor") if is_free(getattr(levels, name))]
@@ -229,7 +241,7 @@ def _model(
         variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
         lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
         degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
-        transport=problem.transport,
+        transport=Totalling.of(used, problem.transport) if isinstance(used, Totals) else problem.transport,
         process=process,
         softness=None if process is None else jnp.asarray(levels.softness(used.values)),
         objective=problem.objective,
@@ -243,6 +255,8 @@ def _model(
 def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
     """What a model holds of readings along these directions, (N, 3) each."""
     follow, given, optics = _uses_known(problem.transport), problem.instrument, None
+    if isinstance(problem.data, Totals):
+        follow = False  # light leaves along all directions
     if given is not None:
         optics = optics_of(given, problem.stack, wi, wo, polar_angles(problem.data), follow)
     return {

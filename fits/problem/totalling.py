@@ -1,0 +1,61 @@
+"""A transport's totals as a forward model: what a sphere takes in of a stack's light, reading by reading."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import layerjax as lj
+from fits.data.totals import Kind, Totals
+from layerjax._shapes import require_single
+from layerjax.stack import simplify
+
+
+class Totalling(eqx.Module):
+    """(stack, wi, wo) -> shares of light (N, C), in the place of a transport's values.
+
+    Attributes:
+        transport: a layerjax transport, or "auto".
+        kinds: of the N readings.
+        asked: rows with different lights, which are solved for.
+        light: the place among these of each reading's.
+    """
+
+    transport: Any = eqx.field(static=True)
+    kinds: tuple[Kind, ...] = eqx.field(static=True)
+    asked: tuple[int, ...] = eqx.field(static=True)
+    light: tuple[int, ...] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, totals: Totals, transport: Any) -> "Totalling":
+        """The totals of these readings, by a transport that is no function of the user's own."""
+        if not isinstance(transport, lj.Transport) and transport != "auto":
+            raise ValueError(f"transport is {transport!r}; totals take a layerjax transport, or 'auto'")
+        _, asked, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)
+        return cls(transport, totals.kinds, tuple(asked.tolist()), tuple(np.ravel(light).tolist()))
+
+    def __call__(self, stack: lj.Stack | lj.Mixture, wi: Array, wo: Array) -> Array:
+        require_single(stack, "inference")
+        lights = jnp.asarray(wi)[np.array(self.asked)]
+        sides: dict[Kind, Array] = {}
+        if not {"reflectance", "transmittance"}.isdisjoint(self.kinds):
+            near, far = lj.albedo(stack, lights, self.transport)
+            sides = {"reflectance": near, "transmittance": far + lj.unscattered(stack, lights)}
+        if "unscattered" in self.kinds:
+            sides["unscattered"] = _unscattered(stack, lights, self.transport)
+        return jnp.stack([sides[kind][place] for kind, place in zip(self.kinds, self.light, strict=True)])
+
+
+def _unscattered(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> Array:
+    """What leaves on the other side of stacks whose media only absorb: interfaces may turn it, media do not."""
+    if isinstance(stack, lj.Mixture):
+        return stack.mean(lambda part, _: _unscattered(part, lights, transport))
+    straight = lj.unscattered(stack, lights)
+    if stack.base is not None or not any(isinstance(layer, lj.Interface) for layer in stack.layers):
+        return straight
+    absorbing = [
+        lj.Medium(layer.thickness, 0.0) if isinstance(layer, lj.Medium) else layer for layer in simplify(stack).layers
+    ]
+    return straight + lj.albedo(lj.Stack(absorbing), lights, transport)[1]
