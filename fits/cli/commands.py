@@ -19,6 +19,7 @@ from fits.cli.predictions import predict as predict
 from fits.cli.setting import use_jax
 from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -311,6 +312,8 @@ def write_report(
 
 def _measurements(arguments: Namespace) -> Measurements:
     data = read(arguments.data, format=arguments.format, quantity=arguments.quantity)
+    if isinstance(data, Totals):
+        raise ValueError(f"{arguments.data}: holds totals, which no command takes; in Python see fits.Joint")
     if arguments.mask_retro is not None:
         data = data.without_retro(arguments.mask_retro)
     if arguments.mask_grazing is not None:

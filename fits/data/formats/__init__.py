@@ -5,12 +5,12 @@
 
 from pathlib import Path
 
-from fits.data.formats import csv, fred, merl, zemax
+from fits.data.formats import csv, fred, merl, totals_csv, zemax
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
 
-FORMATS = ("csv", "merl", "zemax", "fred")
+FORMATS = ("csv", "totals", "merl", "zemax", "fred")
 
 _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
     b"tensor_file": "an RGL tensor file (Dupuy and Jakob)",
@@ -35,7 +35,8 @@ def read(
 
     Args:
         path: the file.
-        format: "csv", "merl", "zemax" or "fred"; None finds out from the content.
+        format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "merl", "zemax" or "fred"; None
+            finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
             FRED files hold "brdf" unless this says otherwise.
@@ -54,6 +55,8 @@ def read(
         raise ValueError(f"{path}: geometry and lookup apply to MERL files only, this is a {kind} file")
     if kind == "csv":
         return csv.read(path, checked)
+    if kind == "totals":
+        return totals_csv.read(path)
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
@@ -87,6 +90,8 @@ def sniff(path: Path) -> str:
         return "fred"
     if zemax.recognises(lines):
         return "zemax"
+    if totals_csv.recognises(first):
+        return "totals"
     if csv.recognises(first) or path.suffix.lower() in (".csv", ".tsv"):
         return "csv"
     seen = f"the first line is {first[:60]!r}" if first else "it holds only comments"

@@ -30,7 +30,7 @@ from fits.data.measurements import QUANTITIES, Measurements, Quantity, Source, c
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
 _NOT_NEGATIVE = (0.0, float("inf"))
-_SUFFIXES = ("_std", "_sigma")
+SUFFIXES = ("_std", "_sigma")
 _QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
     **{quantity: quantity for quantity in QUANTITIES},
     "bsdf": "brdf",
@@ -48,7 +48,7 @@ _FIRST_LINE = "# layerjax measurements"
 
 def recognises(first_line: str) -> bool:
     """Whether the first line that is no comment names the columns we need."""
-    return {"theta_i", "theta_o"} <= {name.strip().strip('"') for name in first_line.split(_delimiter(first_line))}
+    return {"theta_i", "theta_o"} <= {name.strip().strip('"') for name in first_line.split(delimiter_of(first_line))}
 
 
 def read(path: Path, quantity: Quantity | None = None) -> Measurements:
@@ -63,7 +63,7 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     if not rows:
         raise ValueError(f"{path}: the file holds only comments, must have a header line")
     header, body = rows[0], rows[1:]
-    table = _Table(header, body)
+    table = Table(header, body)
     kind, channels = _value_columns(header, table.names, quantity)
     chosen = _QUANTITY_OF[kind]
 
@@ -148,12 +148,12 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
     write_text(path, text.getvalue(), force)
 
 
-class _Table:
+class Table:
     """The cells below a header line; columns are parsed when asked for, so that unused ones may hold anything."""
 
     def __init__(self, header: Line, body: list[Line]) -> None:
         self.header, self.body = header, body
-        delimiter = _delimiter(header.text)
+        delimiter = delimiter_of(header.text)
         self.names = [name.strip() for name in _cells(header, delimiter)]
         for position, name in enumerate(self.names):
             if name in self.names[:position]:
@@ -188,7 +188,8 @@ def _cells(line: Line, delimiter: str) -> list[str]:
         raise line.error(f"not a line of CSV ({error})") from None
 
 
-def _delimiter(header: str) -> str:
+def delimiter_of(header: str) -> str:
+    """What divides the cells of a header line."""
     return max(",;\t", key=header.count)
 
 
@@ -197,7 +198,7 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
     found: dict[str, dict[str, str]] = {}
     for name in names:
         kind, channel = _kind_and_channel(name)
-        if kind is not None and not name.endswith(_SUFFIXES):
+        if kind is not None and not name.endswith(SUFFIXES):
             found.setdefault(kind, {})[channel] = name
     if not found:
         allowed = ", ".join(_QUANTITY_OF)
@@ -236,7 +237,7 @@ def _names_to_write(channels: tuple[str, ...]) -> list[str]:
     columns = [f"brdf_{channel}" for channel in channels]
     for channel, column in zip(channels, columns, strict=True):
         one_line = len(column.splitlines()) == 1 and column == column.strip()
-        if not one_line or column.endswith(_SUFFIXES) or _kind_and_channel(column) != ("brdf", channel):
+        if not one_line or column.endswith(SUFFIXES) or _kind_and_channel(column) != ("brdf", channel):
             raise ValueError(
                 f"channel {channel!r} cannot be written: its column would be read as another; give it another name"
             )
@@ -250,10 +251,10 @@ def _named(columns: list[str]) -> str:
 
 
 def _spread_column(names: list[str], column: str) -> str | None:
-    return next((column + suffix for suffix in _SUFFIXES if column + suffix in names), None)
+    return next((column + suffix for suffix in SUFFIXES if column + suffix in names), None)
 
 
-def _sigma(table: _Table, columns: list[str | None], used: np.ndarray, notes: list[str]) -> Floats | None:
+def _sigma(table: Table, columns: list[str | None], used: np.ndarray, notes: list[str]) -> Floats | None:
     """Standard deviations (N, C) in the file's quantity, NaN where unknown; None where nothing is known at all."""
     if not any(columns):
         return None

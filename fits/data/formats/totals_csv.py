@@ -1,0 +1,94 @@
+"""CSV with totals: what a sphere, or a detector behind the sample, read at each angle of incidence.
+
+Columns                      meaning
+theta_i                      polar angle of the light in degrees, [0, 90)
+total_reflectance            all that leaves on the side of the light, as a share of it
+total_transmittance          all that leaves on the other side, what passes straight included
+unscattered_transmittance    of this, what no medium has scattered
+<that column>_std | _sigma   its standard deviation (all of a kind, or none)
+
+One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read.
+"""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fits.data.formats._text import content, read_lines
+from fits.data.formats.csv import SUFFIXES, Table, delimiter_of
+from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
+from fits.data.measurements import Source, channel_names
+from fits.data.totals import KINDS, Kind, Totals
+
+COLUMNS: dict[Kind, str] = {
+    "reflectance": "total_reflectance",
+    "transmittance": "total_transmittance",
+    "unscattered": "unscattered_transmittance",
+}
+_SHARE, _ANGLE, _POSITIVE = (0.0, np.inf), (0.0, np.nextafter(90.0, 0.0)), (np.nextafter(0.0, 1.0), np.inf)
+
+
+def recognises(first_line: str) -> bool:
+    """Whether the first line that is no comment names a column of totals."""
+    names = [name.strip().strip('"') for name in first_line.split(delimiter_of(first_line))]
+    return any(name.startswith(tuple(COLUMNS.values())) for name in names)
+
+
+def read(path: Path) -> Totals:
+    """Read a CSV of totals. Without any column of standard deviations sigma is None.
+
+    Raises:
+        ValueError: on one line, which names file, line, column, value and allowed range.
+    """
+    lines = content(read_lines(path))
+    header, body = lines[0], lines[1:]
+    table = Table(header, body)
+    angles = table.column("theta_i", _ANGLE)
+    light = direction(angles, np.full(len(angles), LIGHT_AZIMUTH))
+    named = {kind: columns for kind in KINDS if (columns := _channels(table.names, COLUMNS[kind]))}
+    channels = tuple(next(iter(named.values())))
+    wi, wo, values, sigma, kinds = [], [], [], [], []
+    known = {"theta_i"}
+    for kind, columns in named.items():
+        if tuple(columns) != channels:
+            raise header.error(f"channels {', '.join(columns)}: every kind must have the same, {', '.join(channels)}")
+        spreads = [name + suffix for name in columns.values() for suffix in SUFFIXES if name + suffix in table.names]
+        part = _numbers(table, columns.values(), _SHARE)
+        given = ~np.isnan(part).any(axis=1)
+        if spreads:
+            if len(spreads) != len(columns):
+                raise header.error(f"{', '.join(spreads)}: every channel must have one standard deviation, or none")
+            sigma.append(_numbers(table, spreads, _POSITIVE)[given])
+        wi.append(light[given])
+        wo.append(light[given] * (-1, -1, 1 if kind == "reflectance" else -1))
+        values.append(part[given])
+        kinds += [kind] * int(given.sum())
+        known |= {*columns.values(), *spreads}
+    if sigma and len(sigma) != len(named):
+        raise header.error("only some kinds have standard deviations: all must, or none")
+    ignored = [name for name in table.names if name not in known]
+    totals = Totals(
+        wi=np.concatenate(wi),
+        wo=np.concatenate(wo),
+        values=np.concatenate(values),
+        sigma=np.concatenate(sigma) if sigma else None,
+        mask=np.ones(len(kinds), bool),
+        channels=channels,
+        kinds=tuple(kinds),
+    )
+    notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
+    return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.beyond())))
+
+
+def _channels(names: list[str], column: str) -> dict[str, str]:
+    """Channel -> column, of those columns that begin with one."""
+    own = [name for name in names if name == column or name.startswith(f"{column}_")]
+    own = [name for name in own if not name.endswith(SUFFIXES)]
+    return {name.removeprefix(column).removeprefix("_") or channel_names(1)[0]: name for name in own}
+
+
+def _numbers(table: Table, names: Iterable[str], allowed: tuple[float, float]) -> Floats:
+    """The columns (N, C), NaN where a cell is empty."""
+    return np.stack([table.column(name, allowed, empty=np.nan) for name in names], axis=-1)

@@ -1,0 +1,59 @@
+"""Totals as columns of a CSV: read as they stand, refused on one line."""
+
+import numpy as np
+import pytest
+
+from fits.data.formats import read
+from fits.data.totals import Totals
+
+HEADER = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"
+
+
+def written(tmp_path, *lines):
+    path = tmp_path / "slab.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_every_cell_is_a_reading(tmp_path):
+    found = read(written(tmp_path, "# a slab", HEADER + ",operator", "0,0.3,0.01,0.5,0.02,me", "60,0.4,0.01,,,me"))
+    assert isinstance(found, Totals)
+    assert found.kinds == ("reflectance", "reflectance", "transmittance")
+    np.testing.assert_allclose(found.values[:, 0], [0.3, 0.4, 0.5])
+    np.testing.assert_allclose(found.sigma[:, 0], [0.01, 0.01, 0.02])
+    np.testing.assert_allclose(found.theta_i, [0.0, 60.0, 0.0], atol=1e-9)
+    assert found.wo[:, 2].tolist() == pytest.approx([1.0, 0.5, -1.0])
+    assert found.source.notes == ("columns not used: operator",)
+
+
+def test_channels_and_unscattered_light(tmp_path):
+    names = "theta_i,unscattered_transmittance_red,unscattered_transmittance_blue"
+    found = read(written(tmp_path, names, "0,0.3,0.1"))
+    assert found.channels == ("red", "blue")
+    assert found.kinds == ("unscattered",)
+    assert found.sigma is None
+
+
+def test_more_than_all_the_light_is_noted(tmp_path):
+    found = read(written(tmp_path, HEADER, "0,0.7,0.01,0.5,0.02"))
+    assert "1.2 together" in found.source.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ((HEADER, "90,0.3,0.01,0.5,0.02"), "line 2, column 'theta_i': 90 is not allowed"),
+        ((HEADER, "0,-0.3,0.01,0.5,0.02"), "column 'total_reflectance': -0.3 is not allowed"),
+        ((HEADER, "0,0.3,0,0.5,0.02"), "column 'total_reflectance_std': 0 is not allowed"),
+        ((HEADER, "0,x,0.1,0.5,0.02"), "'x' is not a number"),
+        ((HEADER,), "no samples below the header"),
+        (("total_reflectance", "0.3"), "no column 'theta_i'"),
+        (("theta_i,total_reflectance,total_reflectance_std,total_transmittance", "0,0.3,0.1,0.2"), "only some kinds"),
+        (("theta_i,total_reflectance_a,total_transmittance_b", "0,0.3,0.1"), "every kind must have the same"),
+    ],
+)
+def test_bad_files_are_refused_on_one_line(tmp_path, lines, words):
+    with pytest.raises(ValueError, match=words) as refused:
+        read(written(tmp_path, *lines))
+    assert "\n" not in str(refused.value)
+    assert "slab.csv" in str(refused.value)
