@@ -10,6 +10,8 @@ from fits._lazy import names_from
 if TYPE_CHECKING:
     from fits.data.formats import read as read
     from fits.data.formats.csv import write_csv as write_csv
+    from fits.data.formats.rxt import Slab as Slab
+    from fits.data.formats.rxt import read_slab as read_slab
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
@@ -65,6 +67,8 @@ _HOMES = {
     "Foresight": "inference.foresight",
     "read": "data.formats",
     "write_csv": "data.formats.csv",
+    "read_slab": "data.formats.rxt",
+    "Slab": "data.formats.rxt",
     "Geometry": "data.geometry",
     "slices": "data.geometry",
     "Combination": "inference.identifiability",
