@@ -92,6 +92,14 @@ def test_bad_files_are_refused_on_one_line(tmp_path, text, words):
     assert "\n" not in str(refused.value)
 
 
+def test_rows_by_their_wavelengths(tmp_path):
+    path = written(tmp_path, BARE + "L r n\n800 0.3 1.3\n900 0.2 1.5")
+    slab = read_slab(path, wavelengths=(850, 950))
+    assert (slab.ior, slab.totals.values.tolist()) == (1.5, [[0.2]])
+    with pytest.raises(ValueError, match=r"no row lies in \[100, 200\] nm; they go from 800 to 900"):
+        read_slab(path, wavelengths=(100, 200))
+
+
 def test_spheres_whose_readings_are_corrected(tmp_path):
     slab = read_slab(written(tmp_path, SAMPLE.format(spheres=1) + "1\n0.3"), corrected=True)
     assert slab.totals.values[0, 0] == 0.3
