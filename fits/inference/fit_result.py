@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.data.totals import Totals
 from fits.inference.identifiability import Combination
 from fits.problem.problem import Problem
 
@@ -136,6 +137,18 @@ class Fit:
         )
         vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
         return found
+
+    def require_scans(self, what: str) -> None:
+        """Refuse, for `what` shows or keeps readings along directions, a fit of several measurements or of totals.
+
+        Raises:
+            ValueError: it is one.
+        """
+        problems = self.problem.problems
+        if problems.get("") is not self.problem:
+            raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
+        if isinstance(self.problem.data, Totals):
+            raise ValueError(f"{what}: totals have no scans; Fit.values and Fit.errors are what they tell")
 
     @property
     def values(self) -> dict[str, float]:

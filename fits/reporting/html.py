@@ -77,8 +77,10 @@ def report(
         force: replace a file that is there.
 
     Raises:
-        ValueError: `path` exists and `force` is False, or `others` cannot be compared with this fit.
+        ValueError: `path` exists and `force` is False, `others` cannot be compared with this fit, or it is one of
+            several measurements (see `Fit.part`) or of totals.
     """
+    fit.require_scans("report")
     foretold = None if unseen is None else foretell(fit, posterior, unseen)
     images = draw(fit, posterior, others, name, foretold)
     write_text(path, page(fit, posterior, images, others, name, foretold), force=force)

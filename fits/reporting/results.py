@@ -65,8 +65,9 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
     Raises:
         ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
             callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
-            cannot be written (see `write_csv`).
+            cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`) or of totals.
     """
+    fit.require_scans("save_fit")
     with reserved(directory, force), replacing(directory, force) as folder:
         write_fit(fit, folder)
 

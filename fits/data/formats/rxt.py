@@ -1,11 +1,11 @@
 """Input files of inverse adding-doubling, ``.rxt`` (Prahl, iad): a slab between slides, measured with spheres.
 
 After ``IAD1`` stand numbers, whatever the lines; ``#`` begins a comment. In this order: index of the sample, of the
-slides; thickness of the sample, of a slide, diameter of the beam in mm; reflectance of the standard; how many spheres at a
-time; five numbers of the reflection sphere and five of the transmission sphere (diameter, ports of sample, light and
-detector in mm, reflectance of the wall). Then either how many kinds of readings a row has (1: M_R, 2: and M_T, 3: and
-M_U), or letters that name its columns: L wavelength, r M_R, t M_T, u M_U, n index of the sample, N of the slides, d
-thickness, g asymmetry. Then the rows; with a count, a number above 1 at the head of a row is its wavelength.
+slides; thickness of the sample, of a slide, diameter of the beam in mm; reflectance of the standard; how many spheres
+at a time; five numbers of the reflection sphere and five of the transmission sphere (diameter, ports of sample, light
+and detector in mm, reflectance of the wall). Then either how many kinds of readings a row has (1: M_R, 2: and M_T, 3:
+and M_U), or letters that name its columns: L wavelength, r M_R, t M_T, u M_U, n index of the sample, N of the slides,
+d thickness, g asymmetry. Then the rows; with a count, a number above 1 at the head of a row is its wavelength.
 """
 
 import re

@@ -14,6 +14,8 @@ from fits.problem.joint import Joint
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal, Normal
 from fits.problem.problem import Problem
+from fits.reporting.html import report
+from fits.reporting.results import save_fit
 from tests.helpers.models import LINE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
 
 SIGMA = {"first": 0.05, "second": 0.02}
@@ -91,6 +93,9 @@ def test_a_part_is_a_fit_of_its_own(joint):
     assert first.standard_errors[OFFSET] == joint.standard_errors[f"first.{OFFSET}"]
     np.testing.assert_allclose(first.predicted[:, 0], design(COUNTS["first"]) @ [first.stack["a"], first.stack["b"]])
     assert first.minima[0].values == first.values
+    for write in (lambda: report(joint, path="never written"), lambda: save_fit(joint, "never written")):
+        with pytest.raises(ValueError, match=r"of a joint fit it takes a part: fit.part\(...\) of first, second"):
+            write()
     with pytest.raises(ValueError, match="part 'third' is not one of first, second"):
         joint.part("third")
 
