@@ -31,8 +31,8 @@ TEXT = """\
 
 {environment}
 Device: {device}. The same programs on the device and on the processor of that machine, as one device of JAX (one
-core, where work runs in chunks), medians of {rounds} rounds, everything compiled, results left where they were found. An
-*item* is a texel with a stack and a pair of directions of its own, a pair of directions of one stack, or a stack at
+core, where work runs in chunks), medians of {rounds} rounds, everything compiled, results left where they were found.
+An *item* is a texel with a stack and a pair of directions of its own, a pair of directions of one stack, or a stack at
 {readings} pairs that all share (a batch of fits). *gradient*: a value with the derivatives of a mean squared difference
 in all parameters. *apart*: the largest difference of device and processor, relative to the value or to {floor:g} of the
 largest.

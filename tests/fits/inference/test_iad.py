@@ -26,8 +26,8 @@ IAD1
 1500.0  0.29950   0.35218   1.41832
 """
 """A row of `docs/phantom_with_no_slides.rxt` of github.com/scottprahl/iad (A. Bahl, King's College London), measured by
-comparing two beams at 8 degrees. iad's own results (mu_a 0.0416, mu_s' 0.580) count light lost at the edges of the sample
-as well, which it follows by Monte Carlo; iadpython does not, and neither does this."""
+comparing two beams at 8 degrees. iad's own results (mu_a 0.0416, mu_s' 0.580) count light lost at the edges of the
+sample as well, which it follows by Monte Carlo; iadpython does not, and neither does this."""
 G = 0.9
 
 
