@@ -76,7 +76,10 @@ def fit(
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
     if isinstance(stack, Joint):
-        for name, given in (("data", data), ("noise", noise), ("scale", scale), ("instrument", instrument)):
+        beside: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
+        beside |= {"transport": None if transport == "auto" else transport}
+        beside |= {"objective": None if objective == "likelihood" else objective}
+        for name, given in beside.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
         problem: Posed = stack

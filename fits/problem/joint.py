@@ -259,14 +259,13 @@ class Joint(Posed):
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def _is_shared(self, name: str) -> bool:
-        return any(name == one or name.startswith((f"{one}.", f"{one}[")) for one in self.shared)
+        return any(_begins(name, one) for one in self.shared)
 
     def _require_common(self) -> None:
         """Refuse shared names that are not in every problem, or not the same there."""
         for one in self.shared:
             sets = {
-                part: {name for name in problem.names if name == one or name.startswith((f"{one}.", f"{one}["))}
-                for part, problem in self.parts.items()
+                part: {name for name in problem.names if _begins(name, one)} for part, problem in self.parts.items()
             }
             every = set.union(*sets.values())
             if not every:
@@ -282,6 +281,11 @@ class Joint(Posed):
                     raise ValueError(
                         f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first[0]!r}"
                     )
+
+
+def _begins(name: str, with_: str) -> bool:
+    """Whether a parameter's name is this, or begins with it and goes on."""
+    return name == with_ or name.startswith((f"{with_}.", f"{with_}["))
 
 
 def _same(one: Problem, other: Problem, name: str) -> bool:

@@ -27,6 +27,7 @@ from fits.data import geometry
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats
 from fits.data.measurements import QUANTITIES, Measurements, Quantity, Source, channel_names, check_quantity, to_bsdf
+from fits.data.totals import Totals
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
 _NOT_NEGATIVE = (0.0, float("inf"))
@@ -119,8 +120,11 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
 
     Raises:
         ValueError: the file exists and `force` is False, or the name of a channel would not come back: "cos" (the
-            column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one.
+            column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one; or
+            these are `Totals`.
     """
+    if isinstance(measurements, Totals):
+        raise ValueError(f"{path}: totals are no BSDF values, which is what these columns hold")
     value_names = _names_to_write(measurements.channels)
     names = ["theta_i", "phi_i", "theta_o", "phi_o", *value_names]
     columns = [

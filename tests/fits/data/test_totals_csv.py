@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fits.data.formats import read
+from fits.data.formats import read, write_csv
 from fits.data.totals import Totals
 
 HEADER = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"
@@ -32,6 +32,12 @@ def test_channels_and_unscattered_light(tmp_path):
     assert found.channels == ("red", "blue")
     assert found.kinds == ("unscattered",)
     assert found.sigma is None
+
+
+def test_they_are_not_written_as_what_they_are_not(tmp_path):
+    with pytest.raises(ValueError, match="totals are no BSDF values"):
+        write_csv(Totals.of(reflectance=0.3), tmp_path / "new.csv")
+    assert not (tmp_path / "new.csv").exists()
 
 
 def test_more_than_all_the_light_is_noted(tmp_path):

@@ -182,6 +182,8 @@ def test_what_does_not_go_together_is_refused():
     both = Joint({"a": first, "b": second})
     with pytest.raises(ValueError, match="data is given beside a Joint"):
         fit(both, data("first"))
+    with pytest.raises(ValueError, match="transport is given beside a Joint"):
+        fit(both, transport=line)
     with pytest.raises(ValueError, match="data is None"):
         fit(LINE)
     with pytest.raises(AttributeError, match="Joint has no data"):
