@@ -104,6 +104,15 @@ def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, m
     return _through(wi, m, dot(wi, m), weight, far.ior / near.ior, normals)
 
 
+def polar_count(grid: Grid) -> int:
+    """Points from pole to rim of the dense quadrature of visible normals."""
+    return max(_least(grid), 3 * grid.nodes // 2)
+
+
+def _least(grid: Grid) -> int:
+    return LEAST_OF_SEVERAL if grid.interfaces > 1 else LEAST_FACETS
+
+
 def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -> tuple[Vector, Array, Vector]:
     """Normals visible from every node, (nodes, points), their weights, and the nodes' wi.
 
@@ -112,8 +121,7 @@ def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -
     two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
     from pole to rim.
     """
-    least = LEAST_OF_SEVERAL if grid.interfaces > 1 else LEAST_FACETS
-    polar_facets, azimuth_facets = max(least, 3 * grid.nodes // 2), max(least, 3 * modes // 4)
+    polar_facets, azimuth_facets = polar_count(grid), max(_least(grid), 3 * modes // 4)
     alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
     if normals.distribution == "vmf":

@@ -21,6 +21,7 @@ from layerjax.surfaces.interface import interface_reflection
 from layerjax.transport.adding_doubling.facet_light import (
     Normals,
     facet_energies,
+    polar_count,
     reflected_energy,
     refracted_densely,
     refracted_rays,
@@ -45,9 +46,9 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
-BLUR = 0.35
-"""Of alpha / (1 + 2 alpha), half the width in s^2 over which rays move from one panel to another: as far apart as they
-are next to each other, or a few times that."""
+BLUR = 5.6
+"""Of alpha / (1 + 2 alpha) over the facets from pole to rim, half the width in s^2 over which rays move from one panel
+to another: as far apart as they are next to each other, or a few times that."""
 
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
@@ -164,7 +165,7 @@ def _blur(grid: Grid, normals: Normals) -> Array:
     alpha = jnp.asarray(normals.alpha)
     if grid.interfaces > 1:
         return jnp.zeros_like(alpha)
-    return BLUR * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
+    return BLUR / polar_count(grid) * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:

@@ -76,3 +76,14 @@ def test_tables_are_smooth_in_an_inner_interface() -> None:
     for ior, alpha in ((1.5 + steps, 0.2 + 0.0 * steps), (1.5 + 0.0 * steps, 0.2 + steps)):
         found = np.stack([values(*pair) for pair in zip(ior, alpha, strict=True)])
         assert np.abs(np.diff(found, 2, axis=0) / found[0]).max() < 5e-6
+
+
+def test_what_is_far_from_a_mirrors_lobe_is_that_of_the_walk() -> None:
+    """Under a rough interface, at 48 nodes: values of 2^17 paths to 0.3 %, which edges as wide as at 8 nodes had 22 %
+    beside."""
+    wi = lj.direction(np.radians([50.0, 70.0, 85.0]), np.radians(25.0))
+    wo = lj.direction(np.radians([80.0, 5.0, 40.0]), np.radians([25.0, 85.0, 25.0]))
+    mirror = lj.Conductor(0.01, 20.0, 0.0014142, "vmf")
+    stack = lj.Stack([lj.Interface(1.5, 0.447214, "vmf"), lj.Medium(0.4, 0.0)], mirror)
+    found = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=48, modes=64))[:, 0]
+    np.testing.assert_allclose(found, [4.621e-4, 8.081e-3, 7.072e-4], rtol=1e-2)
