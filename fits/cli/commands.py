@@ -16,10 +16,9 @@ from fits.cli.interrupts import hint
 from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.predictions import held_out, print_scores
 from fits.cli.predictions import predict as predict
+from fits.cli.reading import measurements
 from fits.cli.setting import use_jax
-from fits.data.formats import read
 from fits.data.measurements import Measurements
-from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -45,7 +44,7 @@ def fit(arguments: Namespace) -> int:
 
     directory = Path(arguments.out)
     results.check_directory(directory, arguments.force)
-    data, unseen = held_out(_measurements(arguments), arguments)
+    data, unseen = held_out(measurements(arguments), arguments)
     given = read_problem(arguments.stack)
     objective = arguments.objective or given.objective
     if arguments.sample and objective != "likelihood":
@@ -205,7 +204,7 @@ def search(arguments: Namespace) -> int:
     """Look for the stack behind the data among those that a library makes."""
     from fits.cli.searches import search as run_search
 
-    return run_search(_measurements(arguments), arguments)
+    return run_search(measurements(arguments), arguments)
 
 
 def info(arguments: Namespace) -> int:
@@ -217,7 +216,7 @@ def info(arguments: Namespace) -> int:
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
         refuse_existing(out, arguments.force)
-    data = _measurements(arguments)
+    data = measurements(arguments)
     for table in (tables.source_table(data), tables.data_table(data)):
         tables.print_table(table, sys.stdout)
     for sentence in data_statements(data):
@@ -233,7 +232,7 @@ def info(arguments: Namespace) -> int:
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     require_free_place(arguments, ".csv", "measurements")
-    return _write_measurements(_measurements(arguments), arguments)
+    return _write_measurements(measurements(arguments), arguments)
 
 
 def simulate(arguments: Namespace) -> int:
@@ -308,17 +307,6 @@ def write_report(
     pictures = {f"{picture}.png": content for picture, content in images.items()}
     write_together(folder, {**pictures, results.REPORT: text.encode()})
     return foretold
-
-
-def _measurements(arguments: Namespace) -> Measurements:
-    data = read(arguments.data, format=arguments.format, quantity=arguments.quantity)
-    if isinstance(data, Totals):
-        raise ValueError(f"{arguments.data}: holds totals, which no command takes; in Python see fits.Joint")
-    if arguments.mask_retro is not None:
-        data = data.without_retro(arguments.mask_retro)
-    if arguments.mask_grazing is not None:
-        data = data.without_grazing(arguments.mask_grazing)
-    return data
 
 
 def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":

@@ -7,6 +7,7 @@ from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
 FORMATS = ("csv", "merl", "zemax", "fred")
+STRATA = ("bins", "flux")
 
 
 def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:
@@ -32,6 +33,12 @@ def add_format(parser: "argparse._ActionsContainer") -> None:
     """What is in it."""
     parser.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
     parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
+    several = parser.add_mutually_exclusive_group()
+    several.add_argument("--bins", type=count, metavar="N", help="of a MERL table, N bins from all over it, not slices")
+    several.add_argument("--all", action="store_true", help="of a MERL table, every bin that holds a measurement")
+    parser.add_argument(
+        "--strata", choices=STRATA, help="what each of N bins has an equal share of: the table, or flux (default: bins)"
+    )
 
 
 def add_sampling(parser: argparse.ArgumentParser) -> None:

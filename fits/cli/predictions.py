@@ -10,8 +10,8 @@ import numpy as np
 
 from fits._files import write_text
 from fits.cli.places import require_free_place
+from fits.cli.reading import readings
 from fits.cli.setting import use_jax
-from fits.data.formats import read
 from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
 from fits.data.selection import select
@@ -97,7 +97,7 @@ def predict(arguments: Namespace) -> int:
 
 
 def _predicted_readings(arguments: Namespace) -> Measurements:
-    data = read(arguments.at, format=arguments.format, quantity=arguments.quantity)
+    data = readings(arguments.at, arguments)
     data, only = _channels(data, arguments.only)
     for words in only:
         data = data.where(select(data, words))

@@ -4,9 +4,11 @@
 """
 
 from pathlib import Path
+from typing import Literal
 
 from fits.data.formats import csv, fred, merl, totals_csv, zemax
 from fits.data.formats.csv import write_csv as write_csv
+from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
 
@@ -30,6 +32,9 @@ def read(
     *,
     geometry: Geometry | None = None,
     lookup: str = "centre",
+    bins: int | Literal["all"] | None = None,
+    strata: Strata = "bins",
+    seed: int = 0,
 ) -> Measurements:
     """Read a measurement file: CSV, MERL binary, Zemax BSDF or FRED text.
 
@@ -42,6 +47,10 @@ def read(
             FRED files hold "brdf" unless this says otherwise.
         geometry: for MERL only, the directions to look up; None: the default `slices`.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
+        bins: for MERL only, in place of slices: so many bins from all over the table, at most 100,000, or "all".
+        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
+            the projected solid angle of light and viewer.
+        seed: of their choice.
 
     Raises:
         ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
@@ -51,8 +60,8 @@ def read(
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     kind = sniff(path) if format is None else format
-    if kind != "merl" and (geometry is not None or lookup != "centre"):
-        raise ValueError(f"{path}: geometry and lookup apply to MERL files only, this is a {kind} file")
+    if kind != "merl" and (geometry is not None or lookup != "centre" or bins is not None):
+        raise ValueError(f"{path}: geometry, lookup and bins apply to MERL files only, this is a {kind} file")
     if kind == "csv":
         return csv.read(path, checked)
     if kind == "totals":
@@ -60,7 +69,7 @@ def read(
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
-        return merl.read(path, geometry=geometry, lookup=lookup)
+        return merl.read(path, geometry=geometry, lookup=lookup, bins=bins, strata=strata, seed=seed)
     if kind == "zemax":
         return zemax.read(path, checked or "brdf")
     if kind == "fred":

@@ -14,10 +14,12 @@ to 1 %, finds an optical depth of 0.828 +- 0.002 for 0.8, and at the centres 0.8
 
 import itertools
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.data.formats import merl_bins
 from fits.data.formats._text import plural
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, Geometry, azimuth, polar, slices
 from fits.data.measurements import Measurements, Source
@@ -29,6 +31,7 @@ SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
 CHANNELS = ("red", "green", "blue")
 LOOKUPS = ("centre", "linear", "nearest")
 SAME_INCIDENCE = 0.2  # degrees; slices stay slices: `fits.data.scans.incidences` needs less than 0.25
+CONVENTION = "bin i taken to cover [i, i + 1) with its centre at i + 1/2, as in the database's own code"
 REACH = 2  # bins to either side, in each index, among which a centre is sought
 _HEADER = np.array(SHAPE, "<i4").tobytes()
 _BYTES = len(_HEADER) + 8 * len(CHANNELS) * int(np.prod(SHAPE))
@@ -39,8 +42,15 @@ def recognises(head: bytes) -> bool:
     return head.startswith(_HEADER)
 
 
-def read(path: Path, geometry: Geometry | None = None, lookup: str = "centre") -> Measurements:
-    """Look a MERL table up along slices.
+def read(
+    path: Path,
+    geometry: Geometry | None = None,
+    lookup: str = "centre",
+    bins: int | Literal["all"] | None = None,
+    strata: merl_bins.Strata = "bins",
+    seed: int = 0,
+) -> Measurements:
+    """Look a MERL table up along slices, or read many bins all over it.
 
     geometry: the directions, both above the surface. Default: incidence 10, 30, 50, 70 degrees, detector from -85 to 85
         degrees in steps of 5 in the planes at azimuth 0, 30 and 60 degrees; for "centre" all polar angles are half a
@@ -51,10 +61,19 @@ def read(path: Path, geometry: Geometry | None = None, lookup: str = "centre") -
         than were asked for.
         "linear" interpolates between the 8 nearest bin centres, "nearest" takes the bin that the angles fall into, as
         the database's own code does: both keep the directions asked for.
-    A sample that needs a bin without a measurement is masked and holds 0.
+    bins: instead of slices, so many bins that hold a measurement, at most 100,000, or "all" of them (1.4 million).
+    strata: what each of so many bins stands for an equal share of: "bins" of the table, which are dense around the
+        mirror direction, or "flux", the projected solid angle of light and viewer, as in an integral over both.
+    seed: of the choice.
+    A sample that needs a bin without a measurement is masked and holds 0; bins that are chosen all have one.
     """
     if lookup not in LOOKUPS:
         raise ValueError(f"lookup is {lookup!r}, must be one of {', '.join(LOOKUPS)}")
+    if bins is not None:
+        merl_bins.check(bins, strata, seed)
+        if geometry is not None or lookup != "centre":
+            raise ValueError("bins stands beside geometry or lookup: whole bins are read, at their centres")
+        return _of_bins(path, bins, strata, seed)
     if geometry is None:
         more = 0.5 if lookup == "centre" else 0.0
         incidence, outgoing = np.array([10.0, 30.0, 50.0, 70.0]) + more, np.arange(-85.0, 86.0, 5.0) + more
@@ -62,9 +81,7 @@ def read(path: Path, geometry: Geometry | None = None, lookup: str = "centre") -
     if (geometry.wi[:, 2] <= 0).any() or (geometry.wo[:, 2] <= 0).any():
         raise ValueError("geometry holds directions at or below the horizon, a MERL table has only reflection above it")
     table = _table(path)
-    notes = [
-        f"{lookup} lookup; bin i taken to cover [i, i + 1) with its centre at i + 1/2, as in the database's own code"
-    ]
+    notes = [f"{lookup} lookup; {CONVENTION}"]
     if lookup == "centre":
         geometry, bins, choice = _at_centres(geometry)
         notes += choice
@@ -76,15 +93,49 @@ def read(path: Path, geometry: Geometry | None = None, lookup: str = "centre") -
         else:
             corners, weights = _corners(index)
     corner_values = table[:, corners[..., 0], corners[..., 1], corners[..., 2]]  # (3, corners, N)
-    if not np.isfinite(corner_values).all():
-        raise ValueError(f"{path}: the table holds {corner_values[~np.isfinite(corner_values)][0]}, must be finite")
+    _require_finite(path, corner_values)
     valid = ((corner_values >= 0) | (weights == 0)).all(axis=(0, 1))
     values = np.where(valid, (weights * corner_values).sum(axis=1), 0.0).T * SCALE
     if not valid.all():
         notes.append(f"masked: {plural(int((~valid).sum()), 'sample')} that need a bin without a measurement")
-    return Measurements(
-        geometry.wi, geometry.wo, values, None, valid, CHANNELS, Source(str(path), "merl", "brdf", tuple(notes))
-    )
+    return _readings(path, geometry, values, valid, notes)
+
+
+def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, seed: int) -> Measurements:
+    """Readings at the centres of bins that hold a measurement."""
+    table = _table(path)
+    _require_finite(path, table)
+    wi, wo = _centre(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
+    cosine_i, cosine_o = wi[:, 2].reshape(SHAPE), wo[:, 2].reshape(SHAPE)
+    readable = (cosine_i > 0) & (cosine_o > 0) & (table >= 0).all(axis=0)
+    if not readable.any():
+        raise ValueError(f"{path}: no bin holds a measurement")
+    if bins == "all":
+        chosen, note = merl_bins.every(readable)
+    else:
+        measure = np.ones(SHAPE)
+        if strata == "flux":
+            theta_h, theta_d, _ = np.meshgrid(*_angles(*(np.arange(size) for size in SHAPE)), indexing="ij")
+            measure = merl_bins.projected_solid_angle(cosine_i, cosine_o, theta_h, theta_d)
+        chosen, note = merl_bins.choice(readable, measure, bins, strata, seed)
+    place = np.ravel_multi_index(tuple(chosen.T), SHAPE)
+    wi, wo = wi[place], wo[place]
+    turn = np.radians(LIGHT_AZIMUTH - azimuth(wi))
+    values = table[:, *chosen.T].T * SCALE
+    geometry = Geometry(_turned(wi, turn), _turned(wo, turn))
+    return _readings(path, geometry, values, np.ones(len(values), bool), [CONVENTION, note])
+
+
+def _readings(
+    path: Path, geometry: Geometry, values: Floats, valid: NDArray[np.bool_], notes: list[str]
+) -> Measurements:
+    source = Source(str(path), "merl", "brdf", tuple(notes))
+    return Measurements(geometry.wi, geometry.wo, values, None, valid, CHANNELS, source)
+
+
+def _require_finite(path: Path, values: Floats) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"{path}: the table holds {values[~np.isfinite(values)][0]}, must be finite")
 
 
 def half_difference(wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:
@@ -171,10 +222,16 @@ def _near(asked: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
 
 def _centre(bins: Indices) -> tuple[Floats, Floats]:
     """wi and wo (N, 3) at the centres of bins (N, 3), the half vector at azimuth 0; phi_d may count beyond 180."""
-    theta_h, theta_d, phi_d = (((bins + 0.5) / SHAPE) ** (2, 1, 1) * (np.pi / 2, np.pi / 2, np.pi)).T[..., None]
+    theta_h, theta_d, phi_d = (angle[:, None] for angle in _angles(*bins.T))
     tangent, bitangent, half = _frame(theta_h[:, 0], np.zeros(len(bins)))
     across = np.sin(theta_d) * (np.cos(phi_d) * tangent + np.sin(phi_d) * bitangent)
     return np.cos(theta_d) * half + across, np.cos(theta_d) * half - across
+
+
+def _angles(i: Indices, j: Indices, k: Indices) -> tuple[Floats, Floats, Floats]:
+    """theta_h, theta_d and phi_d at the centres of bins, in radians."""
+    share_h, share_d, share_phi = ((index + 0.5) / size for index, size in zip((i, j, k), SHAPE, strict=True))
+    return share_h**2 * (np.pi / 2), share_d * (np.pi / 2), share_phi * np.pi
 
 
 def _distances(asked: Geometry, wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:

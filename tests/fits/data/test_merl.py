@@ -1,7 +1,6 @@
 """MERL tables: a synthetic file, written from a formula in the half and difference angles, is looked up again."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,37 +13,19 @@ from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, incidences, relative_azimuth
 from fits.inference.optimise import fit
 from fits.problem.parameters import Free
+from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
 
-SHAPE = (90, 90, 180)
-SCALE = np.array([1.0, 1.15, 1.66]) / 1500
 MERL_BYTES = 12 + 8 * 3 * 90 * 90 * 180
-
-
-def _bsdf(theta_h, theta_d, phi_d):
-    """A smooth BRDF in three channels, with reciprocity: a period of pi in phi_d."""
-    lobe = 0.1 + 2 * np.cos(theta_h) ** 6
-    colour = [1 + 0.5 * theta_d, np.cos(theta_d) ** 2 + 0.3, 1 + 0.2 * np.sin(theta_d) ** 2 * np.cos(2 * phi_d + 0.4)]
-    return np.stack([lobe * factor * np.ones_like(phi_d) for factor in colour])
-
-
-def _centres():
-    i, j, k = (np.arange(size) + 0.5 for size in SHAPE)
-    return np.meshgrid((i / 90) ** 2 * np.pi / 2, j / 90 * np.pi / 2, k / 180 * np.pi, indexing="ij")
-
-
-def _write(path: Path, table: np.ndarray) -> Path:
-    path.write_bytes(np.array(SHAPE, "<i4").tobytes() + (table / SCALE[:, None, None, None]).astype("<f8").tobytes())
-    return path
 
 
 @pytest.fixture(scope="module")
 def table():
-    return _bsdf(*_centres())
+    return smooth_bsdf(*centre_angles())
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory, table):
-    return _write(tmp_path_factory.mktemp("merl") / "synthetic.binary", table)
+    return write_merl(tmp_path_factory.mktemp("merl") / "synthetic.binary", table)
 
 
 def _rotate(v, axis, angle):
@@ -78,18 +59,7 @@ def _bins(data: Measurements) -> np.ndarray:
     return np.stack([np.sqrt(theta_h * 2 / np.pi) * 90, np.degrees(theta_d), np.degrees(phi_d)], axis=-1)
 
 
-def _pairs(bins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions at the centres of bins (N, 3): a direction at (theta_d, phi_d) and the normal, turned by theta_h."""
-    theta_h, theta_d, phi_d = ((bins + 0.5) / SHAPE * [1, 90, 180]).T
-    wi = direction(theta_d, phi_d)
-    cosine, sine = np.cos(theta_h**2 * np.pi / 2), np.sin(theta_h**2 * np.pi / 2)
-    wi, wo = (
-        np.stack([cosine * x + sine * z, y, cosine * z - sine * x], axis=-1) for x, y, z in (wi.T, (wi * [-1, -1, 1]).T)
-    )
-    return wi, wo
-
-
-def test_centre_lookup_reads_bins_as_they_are_at_their_centres(path, geometry, table):
+def test_centre_lookup_reads_bins_as_they_are_at_theircentre_angles(path, geometry, table):
     for data in (read(path), read(path, geometry=geometry)):
         found = half_difference(data.wi, data.wo)
         index = np.floor(_bins(data)).astype(int)
@@ -116,7 +86,7 @@ def test_centres_are_near_what_was_asked_for(path, geometry):
 
 def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, table):
     index = np.array([[3, 40, 20], [20, 30, 100], [45, 10, 179], [0, 60, 0]])
-    wi, wo = _pairs(index)
+    wi, wo = centre_pairs(index)
     for light, viewer in ((wi, wo), (wo, wi)):
         data = read(path, geometry=Geometry(light, viewer))
         np.testing.assert_allclose([data.wi, data.wo], [light, viewer], atol=1e-12)
@@ -159,14 +129,14 @@ def _flakes(thickness, albedo):
 @pytest.fixture(scope="module")
 def flakes_path(tmp_path_factory):
     """An exact table of flakes of thickness 0.8 over Lambertian(0.5), with values near the default slices only."""
-    wi, wo = _pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
+    wi, wo = centre_pairs(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
     near = np.zeros(len(wi), bool)
     for theta in (10.5, 30.5, 50.5, 70.5):
         near |= (abs(np.degrees(np.arccos([wi[:, 2], wo[:, 2]])) - theta) < 0.3).any(axis=0)
     near &= (wi[:, 2] > 0) & (wo[:, 2] > 0)
     values = np.full(len(wi), -1.0)
     values[near] = lj.evaluate(_flakes(0.8, 0.5), wi[near], wo[near], lj.SingleScattering())[:, 0]
-    return _write(
+    return write_merl(
         tmp_path_factory.mktemp("merl") / "flakes.binary", np.broadcast_to(values.reshape(SHAPE), (3, *SHAPE))
     )
 
@@ -185,7 +155,7 @@ def test_an_exact_table_gives_back_its_stack(flakes_path):
 def test_linear_lookup_recovers_the_formula(path, geometry, table):
     data = read(path, geometry=geometry, lookup="linear")
     np.testing.assert_array_equal([data.wi, data.wo], [geometry.wi, geometry.wo])
-    expected = _bsdf(*_angles(geometry)).T
+    expected = smooth_bsdf(*_angles(geometry)).T
     # linear interpolation is off by at most an eighth of the second difference along each axis
     bound = sum(abs(np.diff(table, 2, axis=axis)).max(axis=(1, 2, 3)) for axis in (1, 2, 3)) / 8
     assert (abs(data.values - expected) <= 1.05 * bound).all()
@@ -212,7 +182,7 @@ def test_mirror_normal_and_retro_directions_are_finite(path):
     wo = direction([30, 0, -30, 80, 85], 0)
     data = read(path, geometry=Geometry(wi, wo), lookup="linear")
     assert data.mask.all()
-    expected = _bsdf(*np.array([_half_difference(*pair) for pair in zip(wi, wo, strict=True)]).T).T
+    expected = smooth_bsdf(*np.array([_half_difference(*pair) for pair in zip(wi, wo, strict=True)]).T).T
     np.testing.assert_allclose(data.values[:, :2], expected[:, :2], rtol=0.02)
 
 
@@ -228,7 +198,7 @@ def test_bins_without_measurement_are_masked(tmp_path, table, lookup):
     holed = table.copy()
     holed[1, :, 40:] = -SCALE[1]  # what the database writes where it has nothing, in one channel
     data = read(
-        _write(tmp_path / "holed.binary", holed), geometry=slices(incidence=[60], outgoing=[-55, 60]), lookup=lookup
+        write_merl(tmp_path / "holed.binary", holed), geometry=slices(incidence=[60], outgoing=[-55, 60]), lookup=lookup
     )
     np.testing.assert_array_equal(data.mask, [True, False])  # theta_d of 2.5 and of 60 degrees
     np.testing.assert_array_equal(data.values[1], 0)
