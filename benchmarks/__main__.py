@@ -5,7 +5,8 @@ beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe
 ``spongecake`` (its multiple scattering beside the truth: held-out materials, energy, figures, fits), ``endf`` (thin
 coats beside a walk of one bounce), ``rough-diffuse`` (rough diffuse surfaces beside each other), ``unseen`` (how well
 stacks foretell readings of real coatings that were not fitted), ``wrong-stacks`` (whether bands hold where a simulated
-material is fitted by another), ``structures`` (whether a search finds the stack behind simulated data),
+material is fitted by another), ``pulls`` (whether instruments, mixtures and bins of tables give parameters and honest
+errors), ``structures`` (whether a search finds the stack behind simulated data),
 ``accelerator`` (a GPU beside the processor) and ``side-by-side`` (which transport when: a page of docs from the results
 of error-vs-time)."""
 
@@ -18,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
-         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "structures", "accelerator",
-         "side-by-side")  # fmt: skip
+         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "pulls", "structures",
+         "accelerator", "side-by-side")  # fmt: skip
 
 POSTERIORS = ("haze", "errors", "banana", "degenerate", "bounded")
 

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from fits.problem.parameters import Uniform as Uniform
     from fits.problem.problem import Problem as Problem
     from fits.problem.simulate import simulate as simulate
+    from fits.problem.spectra import PowerLaw as PowerLaw
     from fits.problem.stack_file import read_problem as read_problem
     from fits.problem.stack_file import write_problem as write_problem
     from fits.reporting.html import report as report
@@ -76,6 +77,7 @@ _HOMES = {
     "Instrument": "problem.instrument",
     "Joint": "problem.joint",
     "Noise": "problem.likelihood",
+    "PowerLaw": "problem.spectra",
     "Measurements": "data.measurements",
     "Totals": "data.totals",
     "fit": "inference.optimise",

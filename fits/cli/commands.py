@@ -333,5 +333,6 @@ def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
     import jax
 
     from fits.problem.parameters import is_free
+    from fits.problem.spectra import with_values
 
-    return jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free)
+    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))

@@ -1,6 +1,7 @@
 """Measurement files as the command line names them, and how it says that they are read."""
 
 from argparse import Namespace
+from typing import Literal
 
 from fits.data.formats import read
 from fits.data.measurements import Measurements
@@ -9,7 +10,7 @@ from fits.data.totals import Totals
 
 def readings(path: str, arguments: Namespace) -> Measurements:
     """What a file holds, read as the options say (see `fits.cli.options.add_format`)."""
-    bins = "all" if arguments.all else arguments.bins
+    bins: int | Literal["all"] | None = "all" if arguments.all else arguments.bins
     if arguments.strata is not None and not arguments.bins:
         raise ValueError("--strata is given without --bins")
     data = read(path, arguments.format, arguments.quantity, bins=bins, strata=arguments.strata or "bins")

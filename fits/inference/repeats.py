@@ -62,7 +62,8 @@ def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, A
         ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, promise), starts)
         end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
         width = model.box.slope(end.vector)
-        covariance = jnp.linalg.pinv(end.root.T @ end.root + jnp.diag(model.box.prior_slopes() ** 2), hermitian=True)
+        slopes = model.box.prior_slopes()
+        covariance = jnp.linalg.pinv(end.root.T @ end.root + slopes.T @ slopes, hermitian=True)
         if model.objective != "likelihood":
             covariance = covariance * 2.0 * end.cost / max(row.size - width.size, 1)
         return end.vector, jnp.sqrt(jnp.diagonal(covariance)) * width, end.cost, end.converged

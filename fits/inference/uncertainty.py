@@ -103,8 +103,8 @@ def condition_number(root: Floats) -> float:
 
 
 def _prior_root(problem: Posed) -> Floats:
-    """Rows (P, P) of the prior's information, in boxes^-1."""
-    return np.diag(np.asarray(problem.model.box.prior_slopes(), float))
+    """Rows (P + Q, P) of the prior's information, in boxes^-1."""
+    return np.asarray(problem.model.box.prior_slopes(), float)
 
 
 def _inverse_information(root: Floats) -> Floats:

@@ -19,6 +19,9 @@ from fits.problem.parameters import Box
 from fits.problem.posed import Assembled, Floats, Posed
 from fits.problem.problem import Problem
 
+OF_EACH = tuple(field for field in Box.__dataclass_fields__ if field != "between")
+"""What a box holds of each parameter."""
+
 
 class JointParts(NamedTuple):
     """What a vector makes of each measurement, by its name: stacks, and calibration factors."""
@@ -206,8 +209,9 @@ class Joint(Posed):
         box = Box(
             **{
                 field: jnp.asarray(_gathered(len(names), own, [np.asarray(getattr(m.box, field)) for m in models]))
-                for field in Box.__dataclass_fields__
-            }
+                for field in OF_EACH
+            },
+            between=jnp.asarray(_steps(len(names), own, [np.asarray(m.box.between) for m in models])),
         )
         return Assembled(tuple(names), start, low, high, JointModel(parts=models, box=box, own=tuple(own)))
 
@@ -292,9 +296,10 @@ def _same(one: Problem, other: Problem, name: str) -> bool:
     """Whether a parameter has the same bounds and prior in both."""
     i, j = one.names.index(name), other.names.index(name)
     mine, theirs = one.model.box, other.model.box
-    return all(
+    first, second = (np.asarray(box.between[:, place]) for box, place in ((mine, i), (theirs, j)))
+    return np.array_equal(first[first != 0.0], second[second != 0.0]) and all(
         math.isclose(float(getattr(mine, field)[i]), float(getattr(theirs, field)[j]), rel_tol=1e-12)
-        for field in Box.__dataclass_fields__
+        for field in OF_EACH
     )
 
 
@@ -304,6 +309,18 @@ def _gathered(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarr
     for places, values in reversed(list(zip(own, parts, strict=True))):
         found[list(places)] = values
     return found
+
+
+def _steps(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarray]) -> Floats:
+    """Differences between neighbouring channels of all measurements, (Q, count); of shared ones once."""
+    found: list[Floats] = []
+    for places, rows in zip(own, parts, strict=True):
+        for row in rows:
+            whole = np.zeros(count)
+            whole[list(places)] = row
+            if not any(np.array_equal(whole, one) for one in found):
+                found.append(whole)
+    return np.array(found).reshape(-1, count)
 
 
 def _column(parts: Sequence[Array]) -> Array:

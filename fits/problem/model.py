@@ -32,6 +32,7 @@ from fits.problem.likelihood import (
 from fits.problem.logarithm import logarithm, size
 from fits.problem.parameters import Box, Template
 from fits.problem.process import Correlation, Process, Whitened
+from fits.problem.spectra import with_values
 from layerjax._shapes import require_single
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
@@ -105,7 +106,7 @@ class Model(Density):
 
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
-        return Parts(*self.template.fill(vector))
+        return Parts(*with_values(self.template.fill(vector)))
 
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr."""

@@ -24,7 +24,7 @@ from fits.problem.priors import LogUniform as LogUniform
 from fits.problem.priors import Normal as Normal
 from fits.problem.priors import Prior as Prior
 from fits.problem.priors import Uniform as Uniform
-from fits.problem.priors import log_normaliser, require_computable
+from fits.problem.priors import log_normaliser, require_computable, require_steps, shared_normaliser, steps
 from fits.problem.values import shown
 
 
@@ -37,12 +37,17 @@ class Free:
     `LogUniform`. A `Normal` must have its mean within 37 standard deviations of the bounds, and a standard deviation
     above 1e-15 of the distance from the mean to either bound, so that its density can be computed (`LogNormal`: the
     same of the logarithms). Each place is a parameter of its own, even where the same object stands twice.
+
+    `smooth` holds channels together: the standard deviation of the difference between neighbours (of the logarithms for
+    `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root of the distance
+    in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at the bounds.
     """
 
     start: float | tuple[float, ...]
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
     prior: Prior
+    smooth: float | tuple[float, ...] | None
 
     __layerjax_placeholder__: ClassVar[bool] = True
 
@@ -52,12 +57,14 @@ class Free:
         low: float | Sequence[float],
         high: float | Sequence[float],
         prior: Prior | None = None,
+        smooth: float | Sequence[float] | None = None,
     ):
         prior = Uniform() if prior is None else prior
         if not isinstance(prior, Prior):
             raise ValueError(f"Free.prior is {shown(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None")
-        for field, value in (("start", start), ("low", low), ("high", high), ("prior", prior)):
-            object.__setattr__(self, field, value if field == "prior" else _plain(f"Free.{field}", value))
+        object.__setattr__(self, "prior", prior)
+        for field, value in (("start", start), ("low", low), ("high", high), ("smooth", smooth)):
+            object.__setattr__(self, field, value if value is None else _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
         if np.any(lower >= upper):
             raise ValueError(
@@ -68,6 +75,8 @@ class Free:
                 f"Free.start is {shown(self.start)}; it must lie in [{shown(self.low)}, {shown(self.high)}]"
             )
         require_computable(prior, lower, upper)
+        if self.smooth is not None:
+            require_steps(np.asarray(self.smooth), self.shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -87,7 +96,10 @@ class Free:
 
 
 class Box(eqx.Module):
-    """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces."""
+    """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces.
+
+    between: (Q, P), differences between neighbouring channels over their standard deviations, see `Free.smooth`.
+    """
 
     low: Array
     high: Array
@@ -95,6 +107,7 @@ class Box(eqx.Module):
     centre: Array
     inverse_sd: Array
     log_normaliser: Array
+    between: Array
 
     @classmethod
     def of(cls, free: Sequence[Free]) -> "Box":
@@ -104,7 +117,16 @@ class Box(eqx.Module):
         high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
         priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
-        logs = [log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)]
+        logs = np.array([log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
+        between = [np.zeros((0, len(low)))]
+        first = 0
+        for entry in free:
+            here = slice(first, first := first + math.prod(entry.shape))
+            if entry.smooth is not None:
+                rows = np.zeros((here.stop - here.start - 1, len(low)))
+                rows[:, here] = steps(entry.smooth, here.stop - here.start)
+                between.append(rows)
+                logs[here] = shared_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(
             low=jnp.asarray(low),
             high=jnp.asarray(high),
@@ -112,6 +134,7 @@ class Box(eqx.Module):
             centre=jnp.asarray(gaussians[:, 0]),
             inverse_sd=jnp.asarray(gaussians[:, 1]),
             log_normaliser=jnp.asarray(logs, dtype=jnp.result_type(float)),
+            between=jnp.asarray(np.concatenate(between), dtype=jnp.result_type(float)),
         )
 
     def from_unit(self, s: Array) -> Array:
@@ -145,21 +168,23 @@ class Box(eqx.Module):
         inside = jnp.all((vector >= self.low) & (vector <= self.high))
         safe = jnp.clip(vector, self.low, self.high)
         jacobian = jnp.where(self.logarithmic, self._natural(safe), 0.0)
-        density = -0.5 * self.prior_residuals(safe) ** 2 - self.log_normaliser - jacobian
-        return jnp.where(inside, jnp.sum(density), -jnp.inf)
+        density = -0.5 * jnp.sum(self.prior_residuals(safe) ** 2) - jnp.sum(self.log_normaliser + jacobian)
+        return jnp.where(inside, density, -jnp.inf)
 
     def prior_residuals(self, vector: Array) -> Array:
-        """Standardised distance from the prior's centre, shape (P,), 0 for flat priors.
+        """Standardised distance from the prior's centre, (P,), 0 for flat priors; and between neighbours, (Q,).
 
         Their squares are the prior's part in the fit, whose optimum is therefore the mode in the coordinate where the
         prior is Gaussian or flat: the logarithm for `LogNormal` and `LogUniform`.
         """
-        return (self._natural(vector) - self.centre) * self.inverse_sd
+        natural = self._natural(vector)
+        own = (natural - self.centre) * self.inverse_sd
+        return own if not self.between.shape[0] else jnp.concatenate([own, self.between @ natural])
 
     def prior_slopes(self) -> Array:
-        """d `prior_residuals` / d unit, each by its own parameter, shape (P,)."""
+        """d `prior_residuals` / d unit, (P + Q, P)."""
         low, high = self._ends()
-        return (high - low) * self.inverse_sd
+        return jnp.concatenate([jnp.diag(self.inverse_sd), self.between]) * (high - low)
 
     def slope(self, vector: Array) -> Array:
         """d physical / d unit, shape (P,): the width of the box in physical units at this point."""

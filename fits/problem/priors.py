@@ -128,6 +128,40 @@ def log_normaliser(prior: Prior, low: float, high: float) -> float:
     return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
 
 
+def steps(smooth: Any, channels: int) -> NDArray[np.float64]:
+    """Differences between neighbouring channels over their standard deviations, (channels - 1, channels)."""
+    inverse = 1.0 / np.broadcast_to(np.asarray(smooth, float), (channels - 1,))
+    return inverse[:, None] * np.diff(np.eye(channels), axis=0)
+
+
+def shared_normaliser(prior: Prior, steps: NDArray[np.float64], own: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of channels (C,) with these normalisers of their own, and steps between them: of all together, in the first.
+
+    Flat priors count once, for the walk starts anywhere; Gaussian ones by their joint precision. Bounds cut off nothing
+    of the steps.
+    """
+    channels = len(own)
+    inverse_sd = prior.gaussian()[1]
+    if inverse_sd > 0.0:
+        cut = own.sum() - channels * (0.5 * math.log(2 * math.pi) - math.log(inverse_sd))
+        precision = inverse_sd**2 * np.eye(channels) + steps.T @ steps
+        whole = cut + 0.5 * channels * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(precision)[1]
+    else:
+        scales = -np.log(np.max(np.abs(steps), axis=1))
+        whole = own[0] + np.sum(scales) + 0.5 * (channels - 1) * math.log(2 * math.pi)
+    return np.array([whole] + [0.0] * (channels - 1))
+
+
+def require_steps(smooth: NDArray[np.float64], shape: tuple[int, ...]) -> None:
+    """ValueError for standard deviations between neighbours that are none."""
+    if not shape or shape[0] < 2:
+        raise ValueError("Free.smooth is given for a single number; start, low or high must have two channels or more")
+    if smooth.shape not in ((), (shape[0] - 1,)):
+        raise ValueError(f"Free.smooth has {smooth.size} entries; it must have one, or {shape[0] - 1}, one a step")
+    if not np.all(smooth > 0.0):
+        raise ValueError(f"Free.smooth is {shown(smooth.tolist())}; it must be above 0")
+
+
 def _require_finite(field: str, value: Any) -> None:
     if not np.all(np.isfinite(value)):
         raise ValueError(f"{field} is {value}; it must be finite")

@@ -30,6 +30,7 @@ from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.posed import Assembled, Posed
 from fits.problem.process import Process, make_process
+from fits.problem.spectra import require_in_range
 from fits.problem.totalling import Totalling
 from layerjax._parameters import plain_name
 from layerjax.stack import with_known
@@ -165,6 +166,7 @@ def _require_known(objective: str, scale: Any) -> None:
 
 def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple[Any, ...]:
     """All that a parameter may stand for, in the order of `Parts`."""
+    require_in_range(problem.stack)
     # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
     stack = _with_known(problem.stack)
     scale = 1.0 if problem.scale is None else problem.scale
@@ -302,4 +304,6 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 
 
 def _unit(name: str) -> str:
-    return UNITS.get(name) or UNITS.get(re.sub(r"\[\d+\]$", "", name).rpartition(".")[2], "1")
+    known = UNITS.get(name)
+    whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
+    return known or UNITS.get(whole.rpartition(".")[2], "1")

@@ -13,6 +13,7 @@ from fits.problem.correlated import Correlated
 from fits.problem.instrument import Instrument
 from fits.problem.likelihood import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
+from fits.problem.spectra import PowerLaw
 from fits.problem.values import (
     ANY,
     Range,
@@ -38,9 +39,10 @@ _TRANSPORTS: _Kinds = {
     for name, kind in vars(lj).items()
     if inspect.isclass(kind) and issubclass(kind, lj.Transport) and not inspect.isabstract(kind)
 }
+_LAWS: _Kinds = {"PowerLaw": PowerLaw}
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
 SHARED = "correlated"
-_FREE_KEYS = ("start", "low", "high", "prior")
+_FREE_KEYS = ("start", "low", "high", "prior", "smooth")
 
 
 MATERIAL = ("gallery", "layers", "base", "mixture")
@@ -182,13 +184,16 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
     if hint is float:
         return one_number(where, value)
     if get_origin(hint) is tuple:
-        return whole_numbers(where, value, len(get_args(hint)))
+        kinds = get_args(hint)
+        return numbers(where, value) if float in kinds else whole_numbers(where, value, len(kinds))
     if name.endswith(".phase"):
         return _build(where, value, _PHASES)
     return _number_or_free(where, value, lj.RANGES.get(name, ANY))
 
 
-def _number_or_free(where: str, value: Any, allowed: Range) -> float | tuple[float, ...] | Free:
+def _number_or_free(where: str, value: Any, allowed: Range) -> float | tuple[float, ...] | Free | PowerLaw:
+    if isinstance(value, dict) and "kind" in value:
+        return cast(PowerLaw, _build(where, value, _LAWS))
     return _free(where, value, allowed) if isinstance(value, dict) else numbers(where, value, allowed)
 
 
@@ -200,8 +205,9 @@ def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
             raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
     bounds = {key: numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
     prior = cast(Prior, _build(f"{where}.prior", table["prior"], _PRIORS)) if "prior" in table else None
+    smooth = numbers(f"{where}.smooth", table["smooth"], ANY) if "smooth" in table else None
     try:
-        return Free(**bounds, prior=prior)
+        return Free(**bounds, prior=prior, smooth=smooth)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 
@@ -283,11 +289,12 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 
 def to_plain(value: Any) -> Any:
     if isinstance(value, Free):
-        table = {key: to_plain(getattr(value, key)) for key in _FREE_KEYS}
-        return {key: entry for key, entry in table.items() if value.prior != Uniform() or key != "prior"}
+        table = {key: getattr(value, key) for key in _FREE_KEYS}
+        left_out = {"prior": Uniform(), "smooth": None}
+        return {key: to_plain(entry) for key, entry in table.items() if key not in left_out or entry != left_out[key]}
     if isinstance(value, str | bool | int):
         return value
-    if isinstance(value, lj.PhaseFunction | Prior):
+    if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
     if isinstance(value, Correlated):
         table = {entry.name: getattr(value, entry.name) for entry in fields(value)}

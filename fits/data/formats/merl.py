@@ -83,9 +83,9 @@ def read(
     table = _table(path)
     notes = [f"{lookup} lookup; {CONVENTION}"]
     if lookup == "centre":
-        geometry, bins, choice = _at_centres(geometry)
+        geometry, found, choice = _at_centres(geometry)
         notes += choice
-        corners, weights = bins[None], np.ones((1, len(bins)))
+        corners, weights = found[None], np.ones((1, len(found)))
     else:
         index = _index(*half_difference(geometry.wi, geometry.wo))
         if lookup == "nearest":
@@ -105,7 +105,7 @@ def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, s
     """Readings at the centres of bins that hold a measurement."""
     table = _table(path)
     _require_finite(path, table)
-    wi, wo = _centre(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
+    wi, wo = centre(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
     cosine_i, cosine_o = wi[:, 2].reshape(SHAPE), wo[:, 2].reshape(SHAPE)
     readable = (cosine_i > 0) & (cosine_o > 0) & (table >= 0).all(axis=0)
     if not readable.any():
@@ -184,7 +184,7 @@ def _at_centres(asked: Geometry) -> tuple[Geometry, Indices, list[str]]:
     _, first = np.unique((bins % SHAPE)[found], axis=0, return_index=True)
     kept = np.flatnonzero(found)[np.sort(first)]
     total, bins, asked = len(asked), bins[kept], Geometry(asked.wi[kept], asked.wo[kept])
-    wi, wo = _centre(bins)
+    wi, wo = centre(bins)
     incidence, along, across = _distances(asked, wi, wo)
     notes = [
         f"readings at the centres of {plural(len(bins), 'bin')}; from the directions asked for the incidence differs "
@@ -210,7 +210,7 @@ def _near(asked: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
     bins, least = start, np.full(len(asked), np.inf)
     for step in itertools.product(range(-REACH, REACH + 1), repeat=3):
         tried = start + stride * np.array(step)
-        wi, wo = _centre(tried)
+        wi, wo = centre(tried)
         exists = ((tried >= 0) & (tried < SHAPE))[:, :2].all(axis=-1) & (wi[:, 2] > 0) & (wo[:, 2] > 0)
         incidence, along, across = _distances(asked, wi, wo)
         # across counts double, so that what was asked for in the plane of incidence stays near it
@@ -220,7 +220,7 @@ def _near(asked: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
     return bins, np.isfinite(least)
 
 
-def _centre(bins: Indices) -> tuple[Floats, Floats]:
+def centre(bins: Indices) -> tuple[Floats, Floats]:
     """wi and wo (N, 3) at the centres of bins (N, 3), the half vector at azimuth 0; phi_d may count beyond 180."""
     theta_h, theta_d, phi_d = (angle[:, None] for angle in _angles(*bins.T))
     tangent, bitangent, half = _frame(theta_h[:, 0], np.zeros(len(bins)))

@@ -7,13 +7,13 @@ import pytest
 
 import fits
 import layerjax as lj
+from benchmarks.measuring.cones import mean_over_cones
 from fits.inference.fit_result import Fit
 from fits.inference.limits import finest_step, instrument_limits
 from fits.problem.parameters import Free, LogUniform
 from fits.reporting import verdicts
 from fits.reporting.diagnostics import residual_structure, standardised
 from fits.reporting.tables import parameter_table
-from tests.helpers.cones import mean_over_cones
 
 SINGLE = lj.SingleScattering()
 

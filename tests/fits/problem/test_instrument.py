@@ -8,13 +8,13 @@ import pytest
 
 import fits
 import layerjax as lj
+from benchmarks.measuring.cones import mean_over_cones
 from fits.data.measurements import Measurements
 from fits.inference.repeats import fit_many
 from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from tests.helpers.cones import mean_over_cones
 
 SINGLE = lj.SingleScattering()
 GEOMETRY = fits.slices([10.0, 40.0, 65.0], np.arange(-80.0, 81.0, 4.0))

@@ -19,14 +19,21 @@ def disc(w: np.ndarray, width: float, count: int) -> tuple[np.ndarray, np.ndarra
     return found.reshape(-1, 3), np.repeat(0.5 * weights, 2 * count) / (2 * count)
 
 
-def mean_over_cones(stack: lj.Stack, wi: np.ndarray, wo: np.ndarray, source: float, detector: float) -> np.ndarray:
-    """Readings (N, C), each by some thousand pairs of directions."""
+def mean_over_cones(
+    stack: lj.Stack,
+    wi: np.ndarray,
+    wo: np.ndarray,
+    source: float,
+    detector: float,
+    transport: lj.Transport = lj.SingleScattering(),  # noqa: B008 (frozen)
+) -> np.ndarray:
+    """Readings (N, C), each by some thousand pairs of directions; less than a hundred where one of the two is none."""
     found = []
     for i, o in zip(wi, wo, strict=True):
         (lights, a), (views, b) = (
             disc(w, width, 6) if width else (w[None], np.ones(1)) for w, width in ((i, source), (o, detector))
         )
-        values = np.asarray(lj.evaluate(stack, lights[:, None], views[None], lj.SingleScattering()))
+        values = np.asarray(lj.evaluate(stack, lights[:, None], views[None], transport))
         cosines = np.abs(lights[:, None, 2] * views[None, :, 2]) / abs(i[2] * o[2])
         above = (lights[:, None, 2] * i[2] > 0.0) & (views[None, :, 2] * o[2] > 0.0)
         found.append(np.einsum("i,j,ijc->c", a, b, values * (cosines * above)[..., None]))
