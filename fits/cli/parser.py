@@ -194,6 +194,7 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
     parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
     parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
+    parser.add_argument("--instrument", metavar="TOML", help="a stack file, or any other, with an [instrument]")
     parser.add_argument(
         "--noise",
         type=level,

@@ -21,6 +21,7 @@ def search(data: Measurements, arguments: Namespace) -> int:
     use_jax()
     from fits.problem.likelihood import Noise
     from fits.problem.parameters import Free, LogNormal
+    from fits.problem.stack_file import read_instrument
     from fits.reporting import tables
     from fits.reporting.plots.data import as_png
     from fits.structures import telling
@@ -29,6 +30,7 @@ def search(data: Measurements, arguments: Namespace) -> int:
 
     directory = Path(arguments.out)
     library = None if arguments.library is None else read_library(arguments.library)
+    instrument = None if arguments.instrument is None else read_instrument(arguments.instrument)
     level, sd = arguments.noise, arguments.calibration
     # far enough for four standard deviations
     scale = Free(1.0, float(np.exp(-4.0 * sd)), float(np.exp(4.0 * sd)), LogNormal(1.0, sd)) if sd > 0.0 else None
@@ -41,6 +43,7 @@ def search(data: Measurements, arguments: Namespace) -> int:
             layers=arguments.layers,
             noise=noise,
             scale=scale,
+            instrument=instrument,
             starts=arguments.starts,
             seed=arguments.seed,
             progress=progress,

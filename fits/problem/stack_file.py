@@ -94,6 +94,21 @@ def read_problem(path: str | Path) -> ProblemFile:
         raise ValueError(f"{path}: {error}") from None
 
 
+def read_instrument(path: str | Path) -> Instrument:
+    """The ``[instrument]`` of a TOML file, whatever else it holds.
+
+    Raises:
+        ValueError: as `read_problem`, or there is none.
+    """
+    _, tables = read_tables(Path(path))
+    try:
+        if "instrument" not in tables:
+            raise ValueError("there is no [instrument]")
+        return instrument_from_dict(tables["instrument"])
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
 def write_problem(
     path: str | Path,
     stack: lj.Stack | lj.Mixture,

@@ -26,6 +26,7 @@ from fits.inference.marginal_likelihood import Evidence, evidence
 from fits.inference.optimise import fit_again, fit_problem
 from fits.inference.shared_errors import alone, are_shared, left_open
 from fits.problem.compiled import cores
+from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
@@ -104,6 +105,7 @@ def search(
     transport: Transport = "auto",
     noise: Noise | None = None,
     scale: float | Free | None = None,
+    instrument: Instrument | None = None,
     starts: int = STARTS,
     seed: int = 0,
     progress: Progress | None = None,
@@ -115,7 +117,7 @@ def search(
         data: only the samples that its mask leaves in are used.
         library: `default_library` for the channels of the data, if None.
         layers: at most so many over the base, in [0, 6].
-        transport, noise, scale: see `Problem`; "auto" carries all orders of scattering.
+        transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         starts, seed: of each fit, see `fit`.
         progress: called with (what is done, structures done, structures of this level, note).
         directory: where each structure is kept as it is fitted: a search that was killed takes those for done. Of
@@ -128,9 +130,10 @@ def search(
         raise ValueError(f"layers is {layers}; it must be in [0, 6]")
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
-    settings = (library, noise, scale, transport, starts, seed)
+    # without an instrument it is the same search as before there were any
+    settings = (library, noise, scale, transport, starts, seed, *([] if instrument is None else [instrument]))
     with nullcontext() if directory is None else Kept(directory, data, *settings) as kept:
-        run = _Fitting(data, library, transport, noise, scale, starts, seed, kept)
+        run = _Fitting(data, library, transport, noise, scale, instrument, starts, seed, kept)
         return _searched(run, _Looked(kept), layers, progress)
 
 
@@ -159,6 +162,7 @@ class _Fitting:
     transport: Transport
     noise: Noise
     scale: float | Free | None
+    instrument: Instrument | None
     starts: int
     seed: int
     kept: Kept | None
@@ -174,7 +178,8 @@ class _Fitting:
         return found
 
     def _fitted(self, structure: Structure, plain: Fit | None) -> Fit:
-        problem = Problem(self.library.stack(structure), self.data, self.transport, self.noise, self.scale)
+        stack = self.library.stack(structure)
+        problem = Problem(stack, self.data, self.transport, self.noise, self.scale, instrument=self.instrument)
         if plain is not None and left_open(problem) and are_shared(alone(plain)):
             return fit_again(problem, plain, starts=self.starts, seed=self.seed)
         if plain is None or left_open(problem):

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, is_free
-from fits.problem.stack_file import read_problem, write_problem
+from fits.problem.stack_file import read_instrument, read_problem, write_problem
 from fits.problem.tables import stack_from_dict, stack_to_dict
 from tests.helpers import places
 
@@ -305,3 +306,16 @@ def test_examples_are_valid(path):
 
 def test_there_are_examples():
     assert {"flake_coat_over_diffuse", "hg_coat_over_diffuse", "rough_conductor"} <= {path.stem for path in EXAMPLES}
+
+
+def test_an_instrument_is_read_by_itself(tmp_path: Path) -> None:
+    path = tmp_path / "seen.toml"
+    path.write_text("[instrument]\ndetector = 2.0\noffset = { start = 0.0, low = -1.0, high = 1.0 }\n")
+    assert read_instrument(path) == Instrument(detector=2.0, offset=Free(0.0, -1.0, 1.0))
+    for text, message in (
+        ("[noise]\nfloor = 1e-4\n", "there is no .instrument."),
+        ("[instrument]\ndetector = 40\n", "detector is 40"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=rf"seen.toml: .*{message}"):
+            read_instrument(path)

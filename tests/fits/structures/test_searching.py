@@ -87,6 +87,19 @@ def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path,
     assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
 
 
+def test_every_structure_is_seen_by_the_instrument(data: fits.Measurements, tmp_path: Path) -> None:
+    seen = fits.Instrument(detector=2.0, gain_per_incidence=0.02)
+    given = {"layers": 0, "transport": lj.Statistical(), "noise": NOISE, "starts": 1, "directory": tmp_path / "seen"}
+    found = search(data, LIBRARY, instrument=seen, **given)
+    assert len(found.found) == 2
+    for one in found.found:
+        assert one.fit.problem.instrument == seen
+        assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3
+    for other in (None, fits.Instrument(detector=1.0, gain_per_incidence=0.02)):
+        with pytest.raises(ValueError, match="holds a search of other data, or with another library or settings"):
+            search(data, LIBRARY, instrument=other, **given)
+
+
 def test_another_search_is_refused(data: fits.Measurements, directory: Path, found: fits.Search) -> None:
     with pytest.raises(ValueError, match="holds a search of other data, or with another library or settings"):
         search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=NOISE, starts=3, directory=directory)
