@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
+    from fits.data.spheres import Sphere as Sphere
+    from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
     from fits.inference.averaging import Average as Average
     from fits.inference.averaging import average as average
@@ -79,6 +81,8 @@ _HOMES = {
     "Noise": "problem.likelihood",
     "PowerLaw": "problem.spectra",
     "Measurements": "data.measurements",
+    "Sphere": "data.spheres",
+    "Spheres": "data.spheres",
     "Totals": "data.totals",
     "fit": "inference.optimise",
     "Free": "problem.parameters",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.measurements import Floats, Measurements, Source, channel_names
+from fits.data.spheres import Spheres
 
 Kind = Literal["reflectance", "transmittance", "unscattered"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -27,9 +28,12 @@ class Totals(Measurements):
         wo: (N, 3), where a mirror, or nothing at all, would send it: it tells sides apart and nothing else.
         values, sigma: (N, C), shares of the light, in [0, 1].
         kinds: N names, of `KINDS`.
+        spheres: that reflectance and transmittance were read by, and whose part in them the model takes on itself; None
+            where they are of the sample alone.
     """
 
     kinds: tuple[Kind, ...] = ()
+    spheres: Spheres | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,6 +57,7 @@ class Totals(Measurements):
         unscattered: ArrayLike | None = None,
         sigma: float | Mapping[str, ArrayLike] = 0.01,
         channels: Sequence[str] | None = None,
+        spheres: Spheres | None = None,
     ) -> "Totals":
         """Totals at K incidences; those that are None were not read.
 
@@ -63,6 +68,7 @@ class Totals(Measurements):
             unscattered: what leaves on the other side and no medium has scattered.
             sigma: standard deviation of all of them, or of each kind by its name.
             channels: C names.
+            spheres: if readings are those of integrating spheres, over a standard, rather than of the sample alone.
 
         Raises:
             ValueError: nothing is given, an angle or value is out of range, or shapes do not go together.
@@ -93,6 +99,7 @@ class Totals(Measurements):
             channels=names,
             source=Source("", "memory"),
             kinds=tuple(kinds),
+            spheres=spheres,
         )
         for words in found.beyond():
             warnings.warn(words, stacklevel=2)

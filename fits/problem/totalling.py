@@ -8,9 +8,14 @@ import numpy as np
 from jax import Array
 
 import layerjax as lj
+from fits.data.spheres import Shares, Spheres
 from fits.data.totals import Kind, Totals
 from layerjax._shapes import require_single
+from layerjax.quadrature import gauss_legendre
 from layerjax.stack import simplify
+
+DIFFUSE = 12
+"""Directions, on either side, that diffuse light comes from."""
 
 
 class Totalling(eqx.Module):
@@ -21,12 +26,14 @@ class Totalling(eqx.Module):
         kinds: of the N readings.
         asked: rows with different lights, which are solved for.
         light: the place among these of each reading's.
+        spheres: that read them; None: shares of the sample alone.
     """
 
     transport: Any = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
     asked: tuple[int, ...] = eqx.field(static=True)
     light: tuple[int, ...] = eqx.field(static=True)
+    spheres: Spheres | None = eqx.field(static=True)
 
     @classmethod
     def of(cls, totals: Totals, transport: Any) -> "Totalling":
@@ -34,18 +41,36 @@ class Totalling(eqx.Module):
         if not isinstance(transport, lj.Transport) and transport != "auto":
             raise ValueError(f"transport is {transport!r}; totals take a layerjax transport, or 'auto'")
         _, asked, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)
-        return cls(transport, totals.kinds, tuple(asked.tolist()), tuple(np.ravel(light).tolist()))
+        return cls(transport, totals.kinds, tuple(asked.tolist()), tuple(np.ravel(light).tolist()), totals.spheres)
 
     def __call__(self, stack: lj.Stack | lj.Mixture, wi: Array, wo: Array) -> Array:
         require_single(stack, "inference")
         lights = jnp.asarray(wi)[np.array(self.asked)]
         sides: dict[Kind, Array] = {}
         if not {"reflectance", "transmittance"}.isdisjoint(self.kinds):
-            near, far = lj.albedo(stack, lights, self.transport)
-            sides = {"reflectance": near, "transmittance": far + lj.unscattered(stack, lights)}
+            near, far = self._sides(stack, lights)
+            sides = {"reflectance": near, "transmittance": far}
         if "unscattered" in self.kinds:
             sides["unscattered"] = _unscattered(stack, lights, self.transport)
         return jnp.stack([sides[kind][place] for kind, place in zip(self.kinds, self.light, strict=True)])
+
+    def _sides(self, stack: lj.Stack | lj.Mixture, lights: Array) -> tuple[Array, Array]:
+        """All that leaves on the side of each light, and on the other; as spheres read it, if there are any."""
+        if self.spheres is None:
+            return _both(stack, lights, self.transport)
+        cosine, weight = gauss_legendre(DIFFUSE)
+        upper = np.stack([np.sqrt(1.0 - cosine**2), 0.0 * cosine, cosine], axis=-1)
+        near, far = _both(stack, jnp.concatenate([lights, upper, upper * (1, 1, -1)]), self.transport)
+        share = jnp.asarray(2.0 * cosine * weight)
+        above, below = slice(-2 * DIFFUSE, -DIFFUSE), slice(-DIFFUSE, None)
+        mean = [jnp.tensordot(share, part[side], 1) for part in (near, far) for side in (above, below)]
+        count = len(self.asked)
+        return self.spheres.readings(Shares(near[:count], far[:count], *mean))
+
+
+def _both(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> tuple[Array, Array]:
+    near, far = lj.albedo(stack, lights, transport)
+    return near, far + lj.unscattered(stack, lights)
 
 
 def _unscattered(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> Array:

@@ -18,6 +18,7 @@ import numpy as np
 
 from fits.data.formats._text import Line, read_lines
 from fits.data.geometry import Floats
+from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import KINDS, Kind, Totals
 
 if TYPE_CHECKING:
@@ -80,12 +81,12 @@ def read_slab(
         path: the file.
         incidence: polar angle of the light, in [0, 90) degrees; the format does not say it.
         sigma: standard deviation of every reading, above 0; nor this.
-        corrected: the readings are of the slab itself, whatever the spheres: two beams were compared, say.
+        corrected: the readings are of the slab itself, whatever the spheres: two beams were compared, say. Else what
+            spheres add is part of the model (`Spheres`): of one at a time, each for its reading, or of two together.
         wavelengths: the lowest and the highest that are read, in nm; None for all rows.
 
     Raises:
-        ValueError: on one line: no such file, another format, numbers that are missing or out of range, or readings by
-            spheres that are not `corrected`.
+        ValueError: on one line: no such file, another format, or numbers that are missing or out of range.
     """
     path = Path(path)
     if not path.is_file():
@@ -98,12 +99,8 @@ def read_slab(
     if len(words) < HEADER:
         raise ValueError(f"{path}: {len(words)} numbers, must be {HEADER} before the readings")
     header = [line.parse(text, place) for place, (line, text) in enumerate(words[:HEADER], start=1)]
-    ior, slides, thickness, slide, _, _, spheres = header[:7]
-    if spheres and not corrected:
-        raise ValueError(
-            f"{path}: read with {spheres:g} sphere(s), whose corrections are not made here; corrected=True takes the "
-            "readings for those of the slab itself"
-        )
+    ior, slides, thickness, slide = header[:4]
+    by = None if corrected else _spheres(path, header)
     columns = _columns(path, words[HEADER:])
     if wavelengths is not None:
         columns = _within(path, columns, *wavelengths)
@@ -116,7 +113,7 @@ def read_slab(
     if waves is not None and len(set(waves)) == count:
         names = [f"{wave:g} nm" for wave in waves]
     shares: dict[str, Any] = {kind: given[kind][None] for kind in KINDS if kind in given}
-    totals = Totals.of(incidence, **shares, sigma=sigma, channels=names)
+    totals = Totals.of(incidence, **shares, sigma=sigma, channels=names, spheres=by)
     slides = _one(path, "N", columns, slides) if slide > 0 and slides > 0 else 1.0
     return Slab(
         totals=totals,
@@ -126,6 +123,20 @@ def read_slab(
         thickness_mm=_one(path, "d", columns, thickness),
         asymmetry=columns.get("g"),
     )
+
+
+def _spheres(path: Path, header: list[float]) -> Spheres | None:
+    """What the header says of spheres; a sphere of no diameter is none."""
+    standard, count = header[5], header[6]
+    if count not in (0, 1, 2):
+        raise ValueError(f"{path}: number of spheres is {count:g}, must be 0, 1 or 2")
+    if count == 0:
+        return None
+    try:
+        front, behind = (Sphere(*numbers) if numbers[0] else None for numbers in (header[7:12], header[12:17]))
+        return Spheres(front, behind, standard, together=count == 2)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _words(line: Line) -> list[tuple[Line, str]]:

@@ -83,7 +83,6 @@ def test_the_stack_is_the_slab(tmp_path, slides, ior, expected):
         (BARE + "L r q\n800 0.3 0.4", "column 'q' is not one of r, t, u, L"),
         (BARE + "L r\n800 x", "'x' is not a number"),
         (BARE + "L r n\n800 0.3 1.3\n900 0.3 1.5", "n goes from 1.3 to 1.5"),
-        (SAMPLE.format(spheres=1) + "1\n0.3", r"read with 1 sphere\(s\), whose corrections are not made here"),
     ],
 )
 def test_bad_files_are_refused_on_one_line(tmp_path, text, words):
@@ -98,8 +97,3 @@ def test_rows_by_their_wavelengths(tmp_path):
     assert (slab.ior, slab.totals.values.tolist()) == (1.5, [[0.2]])
     with pytest.raises(ValueError, match=r"no row lies in \[100, 200\] nm; they go from 800 to 900"):
         read_slab(path, wavelengths=(100, 200))
-
-
-def test_spheres_whose_readings_are_corrected(tmp_path):
-    slab = read_slab(written(tmp_path, SAMPLE.format(spheres=1) + "1\n0.3"), corrected=True)
-    assert slab.totals.values[0, 0] == 0.3

@@ -1,0 +1,158 @@
+"""Integrating spheres: against the sum over all ways that light goes between wall, ports and sample."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import layerjax as lj
+from fits.data.formats.rxt import read_slab
+from fits.data.spheres import Shares, Sphere, Spheres
+from fits.data.totals import Totals
+from fits.inference.optimise import fit
+from fits.problem.parameters import Free
+from fits.problem.problem import Problem
+
+FRONT = Sphere(100.0, 30.0, 15.0, 10.0, 0.95, 0.1)
+BEHIND = Sphere(80.0, 30.0, 0.0, 12.0, 0.97)
+OF = Shares(0.4, 0.35, 0.5, 0.45, 0.3, 0.28)
+
+
+def detected(spheres: tuple[Sphere, Sphere | None], of: Shares) -> np.ndarray:
+    """Light of a beam on the detectors of both spheres, by a chain of states that is followed to its end.
+
+    Light in a sphere is either just sent off by the sample or the detector, which a baffle keeps from each other (some
+    leaves by the entrance, the wall gets the rest), or sent off by the wall, and goes to all parts by their areas.
+    """
+    n = 4  # sent off by a port, by the wall; of the first sphere, of the second
+    moves, found = np.zeros((n, n)), np.zeros((2, n))
+    for k, sphere in enumerate(spheres):
+        if sphere is None:
+            continue
+        port, wall, other = 2 * k, 2 * k + 1, 2 * (1 - k)
+        reflected = (of.diffuse_reflected, of.diffuse_reflected_behind)[k]
+        passed = (of.diffuse_transmitted, of.diffuse_transmitted_up)[k]
+        areas = {name: sphere.share(name) for name in ("sample", "entrance", "detector")}
+        moves[wall, port] = (1.0 - areas["entrance"]) * sphere.wall
+        moves[wall, wall] = (1.0 - sum(areas.values())) * sphere.wall
+        moves[port, wall] = areas["sample"] * reflected + areas["detector"] * sphere.detector_reflectance
+        moves[other, wall] = areas["sample"] * passed
+        found[k, wall] = areas["detector"]
+    light = np.array([of.reflected, 0.0, of.transmitted, 0.0])
+    total = np.zeros(2)
+    while light.max() > 1e-18:
+        total += found @ light
+        light = moves @ light
+    return total
+
+
+def test_two_spheres_exchange_light() -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
+    plate = Shares(0.98, 0.0, 0.98, 0.0, 0.0, 0.0)
+    passed = Shares(0.0, 1.0, 0.0, 0.0, 1.0, 1.0)
+    both = (FRONT, BEHIND)
+    expected = detected(both, OF) / [detected(both, plate)[0] / 0.98, detected(both, passed)[1]]
+    np.testing.assert_allclose(spheres.readings(OF), expected, rtol=1e-12)
+
+
+def test_one_sphere_at_a_time() -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.9)
+    plate, nothing = Shares(0.9, 0.0, 0.9, 0.0, 0.0, 0.0), Shares(0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
+    alone = OF._replace(diffuse_transmitted=0.0, diffuse_transmitted_up=0.0)
+    both = (FRONT, BEHIND)
+    expected = detected(both, alone) / [detected(both, plate)[0] / 0.9, detected(both, nothing)[1]]
+    np.testing.assert_allclose(spheres.readings(OF), expected, rtol=1e-12)
+    np.testing.assert_allclose(Spheres(FRONT, None, 0.9).readings(OF), [expected[0], OF.transmitted])
+    np.testing.assert_allclose(Spheres().readings(OF), [OF.reflected, OF.transmitted])
+
+
+def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
+    depth = 0.7
+    spheres = Spheres(FRONT, BEHIND, together=True)
+    totals = Totals.of(0.0, reflectance=0.1, transmittance=0.5, spheres=spheres)
+    problem = Problem(lj.Stack([lj.Medium(Free(depth, 0.1, 2.0), 0.0)]), totals, lj.SingleScattering())
+    passed = 2.0 * special.expn(3, depth)
+    expected = spheres.readings(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
+    np.testing.assert_allclose(np.ravel(problem.predict([depth])), expected, rtol=1e-4)
+
+
+def test_what_is_opaque_reflects_diffuse_light() -> None:
+    spheres = Spheres(FRONT, standard=0.98)
+    totals = Totals.of(8.0, reflectance=0.5, spheres=spheres)
+    problem = Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), totals, lj.SingleScattering())
+    for albedo in (0.0, 0.3, 1.0):
+        expected, _ = spheres.readings(Shares(albedo, 0.0, albedo, 0.0, 0.0, 0.0))
+        np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
+
+
+def test_light_from_behind_meets_the_other_face() -> None:
+    """A slab that is dark on one side: only the sphere there sees it."""
+    grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+    readings = []
+    for layers in ([grey, white], [white, grey]):
+        totals = Totals.of(0.0, transmittance=0.5, spheres=Spheres(None, BEHIND))
+        readings.append(float(Problem(lj.Stack(layers), totals, solver).predict([1.0])[0, 0]))
+    transmitted = [
+        float(Problem(lj.Stack(layers), Totals.of(0.0, transmittance=0.5), solver).predict([1.0])[0, 0])
+        for layers in ([grey, white], [white, grey])
+    ]
+    gains = np.array(readings) / transmitted
+    assert gains[0] > 1.02 * gains[1]
+
+
+def test_coefficients_are_recovered_through_spheres() -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
+    slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
+    solver = lj.AddingDoubling(nodes=8, modes=1)
+
+    def totals(values: np.ndarray, seen: Spheres | None) -> Totals:
+        return Totals.of(0.0, reflectance=values[0], transmittance=values[1], sigma=0.001, spheres=seen)
+
+    exact = np.ravel(Problem(slab, totals(np.array([0.2, 0.3]), spheres), solver).predict([5.0, 0.2]))
+    found, blind = (fit(slab, totals(exact, seen), transport=solver, starts=2) for seen in (spheres, None))
+    np.testing.assert_allclose(list(found.values.values()), [5.0, 0.2], rtol=1e-4)
+    assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
+
+
+TEXT = "IAD1 1.4 1.0 1 0 5 0.98 {count} 100 30 15 10 0.95 80 30 0 12 0.97 2 0.3 0.4"
+
+
+def test_headers_say_which_spheres(tmp_path) -> None:
+    path = tmp_path / "slab.rxt"
+    front, behind = Sphere(100.0, 30.0, 15.0, 10.0, 0.95), Sphere(80.0, 30.0, 0.0, 12.0, 0.97)
+    for count, expected in ((0, None), (1, Spheres(front, behind, 0.98)), (2, Spheres(front, behind, 0.98, True))):
+        path.write_text(TEXT.format(count=count))
+        assert read_slab(path).totals.spheres == expected
+        assert read_slab(path, corrected=True).totals.spheres is None
+    path.write_text(TEXT.format(count=1).replace(" 80 30 0 12 0.97", " 0 0 0 0 0"))
+    assert read_slab(path).totals.spheres == Spheres(front, None, 0.98)
+    for bad, message in ((3, "number of spheres is 3, must be 0, 1 or 2"), (1.5, "number of spheres is 1.5")):
+        path.write_text(TEXT.format(count=bad))
+        with pytest.raises(ValueError, match=message):
+            read_slab(path)
+    path.write_text(TEXT.format(count=2).replace("100 30 15", "100 130 15"))
+    with pytest.raises(ValueError, match=r"slab.rxt: Sphere.sample is 130.0, must be in \[0, 100\) mm"):
+        read_slab(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Sphere(0.0, 0.0), "Sphere.diameter is 0.0, must be above 0"),
+        (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports leave nothing of the wall"),
+        (lambda: Sphere(100.0, 10.0, wall=1.0), r"Sphere.wall is 1.0, must be in \[0, 1\)"),
+        (lambda: Sphere(100.0, 10.0, detector_reflectance=-0.1), "Sphere.detector_reflectance is -0.1"),
+        (lambda: Spheres(FRONT, standard=0.0), r"Spheres.standard is 0.0, must be in \(0, 1\]"),
+        (lambda: Spheres(FRONT, together=True), "Spheres.together: there is but one sphere"),
+    ],
+)
+def test_bad_spheres(make, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_readings_are_functions_of_arrays() -> None:
+    many = Shares(*(jnp.full(3, share) for share in OF))
+    found = Spheres(FRONT, BEHIND, together=True).readings(many)
+    assert [part.shape for part in found] == [(3,), (3,)]
