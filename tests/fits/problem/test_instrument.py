@@ -65,6 +65,18 @@ def test_means_are_taken_only_where_a_lobe_may_be_narrow() -> None:
     assert np.all(counts[1][(tilt > 30.0) & ~steep] == 1)
 
 
+def test_means_cost_four_readings_where_a_lobe_is_narrow_and_nothing_where_it_is_wide() -> None:
+    """By operations."""
+
+    def operations(instrument: Instrument | None, low: float) -> float:
+        of = problem(instrument, low, fits.slices([10.0, 40.0], np.arange(-60.0, 61.0, 4.0)))
+        lowered = jax.jit(lambda vector: of.model.predict(vector)).lower(of.start)
+        return float(lowered.cost_analysis()["flops"])
+
+    assert operations(Instrument(detector=3.0), 0.02) < 4.2 * operations(None, 0.02)
+    assert operations(Instrument(detector=0.5), 0.5) == operations(None, 0.5)
+
+
 def test_readings_in_the_tangent_plane_are_dark() -> None:
     """As they are without an aperture: a mean would be divided by a cosine of nothing."""
     geometry = fits.slices([30.0], [80.0, 90.0])
