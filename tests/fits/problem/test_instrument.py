@@ -31,7 +31,7 @@ def readings(geometry: fits.Geometry = GEOMETRY) -> Measurements:
 
 
 def problem(instrument: Instrument | None, low: float = 0.02, geometry: fits.Geometry = GEOMETRY) -> Problem:
-    return Problem(metal(Free(0.2, low, 1.0)), readings(geometry), SINGLE, EXACT, instrument=instrument)
+    return Problem(metal(Free(max(0.2, low), low, 1.0)), readings(geometry), SINGLE, EXACT, instrument=instrument)
 
 
 @pytest.mark.parametrize(("source", "detector"), [(0.0, 2.0), (1.5, 0.0), (1.0, 3.0), (3.0, 3.0)])
