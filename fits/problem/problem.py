@@ -33,6 +33,7 @@ from fits.problem.process import Process, make_process
 from fits.problem.spectra import require_in_range
 from fits.problem.totalling import Totalling
 from layerjax._parameters import plain_name
+from layerjax._shapes import channel_count
 from layerjax.stack import with_known
 
 Floats = NDArray[np.float64]
@@ -298,9 +299,14 @@ def _uses_known(transport: Any) -> bool:
 
 
 def _require_same_channels(model: Model, start: Floats, used: Measurements) -> None:
+    material = model.build(jnp.asarray(start)).stack
+    if isinstance(material, lj.Stack | lj.Mixture):
+        channel_count(material)
     shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
-    if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
+    if shape[-1] not in (1, used.values.shape[-1]):
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
+    if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
+        raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
 
 
 def _unit(name: str) -> str:

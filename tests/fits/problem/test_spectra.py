@@ -91,6 +91,13 @@ def test_laws_where_they_may_not_stand(exact: np.ndarray) -> None:
         problem(lj.Stack([], lj.Conductor(1.5, 3.0, law(amplitude=Free(0.1, 0.05, 0.2), exponent=0.0))), exact)
 
 
+def test_channels_that_do_not_go_together_are_named(exact: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"layers\[0\].mu_s has 4, layers\[0\].mu_a has 3"):
+        problem(paint(law(), Free((0.5,) * 3, 0.1, 5.0)), exact)
+    with pytest.raises(ValueError, match="stack: it has 3 channels, the data 4"):
+        problem(paint(law(wavelengths=WAVELENGTHS[:3])), exact)
+
+
 def test_both_are_written_and_read(tmp_path) -> None:
     stack = paint(law(reference=600.0), Free((0.5,) * 4, 0.1, 5.0, LogUniform(), smooth=(0.1, 0.2, 0.3)))
     write_problem(tmp_path / "paint.toml", stack)
