@@ -19,6 +19,7 @@ from fits.cli.predictions import predict as predict
 from fits.cli.reading import measurements
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
+from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -209,22 +210,25 @@ def search(arguments: Namespace) -> int:
 
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
-    from fits.reporting import tables
     from fits.reporting.data_statements import data_statements
+    from fits.reporting.data_tables import data_table, source_table
     from fits.reporting.plots.data import as_png, data_picture
+    from fits.reporting.plots.totals import totals_picture
+    from fits.reporting.tables import print_table
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
         refuse_existing(out, arguments.force)
     data = measurements(arguments)
-    for table in (tables.source_table(data), tables.data_table(data)):
-        tables.print_table(table, sys.stdout)
-    for sentence in data_statements(data):
+    for table in (source_table(data), data_table(data)):
+        print_table(table, sys.stdout)
+    for sentence in [] if isinstance(data, Totals) else data_statements(data):
         print(sentence)
     if Path(out).exists() and not arguments.force:
         print(f"Picture: {out} exists already (--force draws it again)")
         return DONE
-    write_bytes(out, as_png(data_picture(data)), arguments.force)
+    picture = totals_picture(data) if isinstance(data, Totals) else data_picture(data)
+    write_bytes(out, as_png(picture), arguments.force)
     print(f"Picture: {out}")
     return DONE
 
@@ -257,8 +261,13 @@ def simulate(arguments: Namespace) -> int:
 
 
 def _write_measurements(data: Measurements, arguments: Namespace) -> int:
+    from fits.data.formats import totals_csv
     from fits.data.formats.csv import write_csv
 
+    if isinstance(data, Totals):
+        totals_csv.write(data, arguments.out, force=arguments.force)
+        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the light")
+        return DONE
     write_csv(data, arguments.out, force=arguments.force)
     print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
     return DONE

@@ -6,7 +6,7 @@ from typing import Any
 from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = ("csv", "merl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "zemax", "fred")
 STRATA = ("bins", "flux")
 
 

@@ -14,16 +14,26 @@ def readings(path: str, arguments: Namespace) -> Measurements:
     if arguments.strata is not None and not arguments.bins:
         raise ValueError("--strata is given without --bins")
     data = read(path, arguments.format, arguments.quantity, bins=bins, strata=arguments.strata or "bins")
-    if isinstance(data, Totals):
-        raise ValueError(f"{path}: holds totals, which no command takes; in Python see fits.Joint")
     return data
 
 
 def measurements(arguments: Namespace) -> Measurements:
     """What a command's data file holds, with what the options mask."""
     data = readings(arguments.data, arguments)
+    if isinstance(data, Totals):
+        _refuse_angles(arguments)
+        return data
     if arguments.mask_retro is not None:
         data = data.without_retro(arguments.mask_retro)
     if arguments.mask_grazing is not None:
         data = data.without_grazing(arguments.mask_grazing)
     return data
+
+
+def _refuse_angles(arguments: Namespace) -> None:
+    """Totals have no direction of view, by which these would choose, and stacks are searched by angles left out."""
+    for name in ("mask_retro", "mask_grazing", "only", "hold_out", "library"):
+        if getattr(arguments, name, None):
+            raise ValueError(f"{arguments.data}: holds totals, of which --{name.replace('_', '-')} chooses nothing")
+    if arguments.command == "search":
+        raise ValueError(f"{arguments.data}: holds totals; a search takes values along directions")

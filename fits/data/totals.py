@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fits.data.geometry import LIGHT_AZIMUTH, direction
 from fits.data.measurements import Floats, Measurements, Source, channel_names
 from fits.data.spheres import Spheres
 
@@ -88,7 +89,7 @@ class Totals(Measurements):
             raise ValueError(f"totals: {sorted(count)} channels are given, must be as many for every kind")
         names = tuple(channels) if channels is not None else channel_names(*count)
         spread = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in read}
-        wi = np.stack([np.sin(np.radians(angles)), 0 * angles, np.cos(np.radians(angles))], axis=-1)
+        wi = direction(angles, LIGHT_AZIMUTH)
         kinds = [kind for kind in KINDS if kind in read for _ in angles]
         found = cls(
             wi=np.tile(wi, (len(read), 1)),

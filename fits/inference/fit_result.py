@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.totals import Totals
 from fits.inference.identifiability import Combination
 from fits.problem.problem import Problem
 
@@ -138,8 +137,8 @@ class Fit:
         vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
         return found
 
-    def require_scans(self, what: str) -> None:
-        """Refuse, for `what` shows or keeps readings along directions, a fit of several measurements or of totals.
+    def require_one(self, what: str) -> None:
+        """Refuse, for `what` shows or keeps one measurement, a fit of several.
 
         Raises:
             ValueError: it is one.
@@ -147,8 +146,6 @@ class Fit:
         problems = self.problem.problems
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
-        if isinstance(self.problem.data, Totals):
-            raise ValueError(f"{what}: totals have no scans; Fit.values and Fit.errors are what they tell")
 
     @property
     def values(self) -> dict[str, float]:

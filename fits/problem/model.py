@@ -109,16 +109,17 @@ class Model(Density):
         return Parts(*with_values(self.template.fill(vector)))
 
     def predict(self, vector: Array) -> Array:
-        """Scaled BSDF, (N, C), in 1/sr."""
+        """Scaled BSDF, (N, C), in 1/sr: a stack of one channel has the same in all."""
         parts = self.build(vector)
 
         def values(wi: Array, wo: Array, known: lj.KnownDirections | None) -> Array:
             return forward(parts.stack, wi, wo, self.transport, self.side, known)
 
-        if self.optics is None:
-            return parts.scale * values(self.wi, self.wo, self.known)
-        assert parts.instrument is not None
-        return parts.scale * self.optics.seen(values, parts.instrument, len(self.wi))
+        if self.optics is None or parts.instrument is None:
+            found = parts.scale * values(self.wi, self.wo, self.known)
+        else:
+            found = parts.scale * self.optics.seen(values, parts.instrument, len(self.wi))
+        return jnp.broadcast_to(found, (len(found), max(found.shape[-1], self.values.shape[-1])))
 
     def sigma(self, vector: Array) -> Array:
         """Scale of the noise, (N, C), in 1/sr."""

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, NamedTuple
 from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
+from fits.data.totals import Totals
 from fits.reporting import tables, verdicts
+from fits.reporting.data_tables import came_as
 from fits.reporting.diagnostics import ResidualStructure, residual_label, residual_structure, standardised
 from fits.reporting.plots import data as pictures
 from fits.reporting.plots import model as model_pictures
 from fits.reporting.plots import parameters as parameter_pictures
 from fits.reporting.plots.predictions import bands_picture
+from fits.reporting.plots.totals import totals_picture
 from fits.reporting.predictions import scores_table
 
 if TYPE_CHECKING:
@@ -78,9 +81,9 @@ def report(
 
     Raises:
         ValueError: `path` exists and `force` is False, `others` cannot be compared with this fit, or it is one of
-            several measurements (see `Fit.part`) or of totals.
+            several measurements (see `Fit.part`).
     """
-    fit.require_scans("report")
+    fit.require_one("report")
     foretold = None if unseen is None else foretell(fit, posterior, unseen)
     images = draw(fit, posterior, others, name, foretold)
     write_text(path, page(fit, posterior, images, others, name, foretold), force=force)
@@ -106,11 +109,16 @@ def draw(
     estimates = posterior if posterior is not None and verdicts.reportable(posterior) else None
     figures: dict[str, Figure | None] = {
         "stack": parameter_pictures.stack_picture(fit.stack),
-        "model": model_pictures.curves_picture({name: fit}, estimates),
-        "maps": model_pictures.maps_picture(fit),
-        "residuals": pictures.residual_picture(data, standardised(fit), residual_label(fit)),
         "correlation": parameter_pictures.correlation_picture(fit),
     }
+    if isinstance(data, Totals):
+        figures["totals"] = totals_picture(data, fit)
+    else:
+        figures |= {
+            "model": model_pictures.curves_picture({name: fit}, estimates),
+            "maps": model_pictures.maps_picture(fit),
+            "residuals": pictures.residual_picture(data, standardised(fit), residual_label(fit)),
+        }
     if estimates is not None:
         figures["corner"] = parameter_pictures.corner_picture(estimates)
     if posterior is not None:
@@ -147,6 +155,7 @@ def page(
         ),
         section(
             "Data and model",
+            image(images, "totals", "Shares of the light, with one sigma, and those of the fit."),
             image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),
             image(
                 images,
@@ -238,7 +247,7 @@ def _fitted(fit: "Fit") -> str:
     rows = [
         ("file", data.source.path or "none"),
         ("format", data.source.format),
-        ("values came as", f"{data.source.quantity}; converted to BRDF in 1/sr"),
+        ("values came as", came_as(data)),
         ("channels", ", ".join(data.channels)),
         ("readings", f"{int(data.mask.sum())} of {len(data.mask)} used, {int((~data.mask).sum())} masked"),
         ("incidence", ", ".join(f"{group.theta:g}°" for group in incidences(data))),

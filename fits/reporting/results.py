@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import locked, read_json, text_checksum, write_json, write_text
-from fits.data.formats import read
+from fits.data.formats import read, totals_csv
 from fits.data.formats.csv import write_csv
+from fits.data.totals import Totals
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -65,9 +66,9 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
     Raises:
         ValueError: `directory` is not empty, unless `force` is given and it holds an earlier result; the transport is a
             callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
-            cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`) or of totals.
+            cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`).
     """
-    fit.require_scans("save_fit")
+    fit.require_one("save_fit")
     with reserved(directory, force), replacing(directory, force) as folder:
         write_fit(fit, folder)
 
@@ -86,7 +87,11 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
     scale = problem.scale if isinstance(problem.scale, Free) else None
-    write_csv(problem.data, folder / DATA)
+    totals = problem.data if isinstance(problem.data, Totals) else None
+    if totals is None:
+        write_csv(problem.data, folder / DATA)
+    else:
+        totals_csv.write(totals.used(), folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
@@ -110,6 +115,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "numerical_error": fit.numerical_error,
         "alone": None if fit.alone is None else asdict(fit.alone),
         "source": asdict(problem.data.source),
+        "spheres": None if totals is None or totals.spheres is None else asdict(totals.spheres),
         "fixed_scale": None if scale is not None else problem.scale,
         "parameters": [
             {
@@ -143,12 +149,14 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.inference.fit_result import Fit, Minimum
     from fits.inference.identifiability import Combination
     from fits.problem.stack_file import read_problem
-    from fits.reporting.stored import stored_alone, stored_array, stored_number, stored_problem
+    from fits.reporting.stored import stored_alone, stored_array, stored_number, stored_problem, stored_spheres
 
     directory = Path(directory)
     content = _content(directory)
-    given, data = read_problem(directory / PROBLEM), read(directory / DATA, format="csv")
+    given, data = read_problem(directory / PROBLEM), read(directory / DATA)
     try:
+        if isinstance(data, Totals):
+            data = replace(data, spheres=stored_spheres(content.get("spheres")))
         problem = stored_problem(content, given, data)
         stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
         minima = tuple(

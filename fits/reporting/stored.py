@@ -9,6 +9,7 @@ import numpy as np
 import layerjax as lj
 from fits.data.formats import read
 from fits.data.measurements import Measurements, Source
+from fits.data.spheres import Sphere, Spheres
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Alone
@@ -70,3 +71,11 @@ def stored_alone(content: dict[str, Any] | None) -> "Alone | None":
         alike=stored_number(content["alike"]),
         pairs=content["pairs"],
     )
+
+
+def stored_spheres(content: "dict[str, Any] | None") -> Spheres | None:
+    """The spheres that totals were read by."""
+    if content is None:
+        return None
+    both = {name: None if content[name] is None else Sphere(**content[name]) for name in ("reflection", "transmission")}
+    return Spheres(**(content | both))

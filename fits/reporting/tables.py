@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
-from fits.data.scans import in_plane, incidences
 from fits.inference.limits import instrument_limits
 from fits.reporting.diagnostics import ResidualStructure
 from fits.reporting.verdicts import identifiability
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table as Boxed
 
-    from fits.data.measurements import Measurements
     from fits.inference.compare import Comparison, Row
     from fits.inference.fit_result import Fit
     from fits.inference.foresight import Foresight
@@ -202,52 +200,6 @@ def incidence_table(structure: ResidualStructure) -> Table:
     return Table("Residuals by incidence", ("incidence", "readings", "mean", "rms"), rows, note)
 
 
-def source_table(data: "Measurements") -> Table:
-    """What a file is: format, convention, counts, channels, sigma, and what its reader noted."""
-    source = data.source
-    used = int(np.count_nonzero(data.mask))
-    rows = [
-        ("format", source.format),
-        ("values came as", f"{source.quantity}, converted to BRDF in 1/sr"),
-        ("readings", f"{len(data)}, {used} used, {len(data) - used} masked"),
-        ("channels", ", ".join(data.channels)),
-        ("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}"),
-        ("sigma", _sigma_words(data)),
-        *(("attribution", word) for word in (source.attribution,) if word),
-        *(("note", note) for note in source.notes),
-    ]
-    return Table(source.path, ("", ""), tuple(rows))
-
-
-def _sigma_words(data: "Measurements") -> str:
-    if data.sigma is None:
-        return "none"
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = (data.sigma / np.abs(data.values))[data.mask]
-    return f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
-
-
-def data_table(data: "Measurements") -> Table:
-    """One row per incidence of a measurement: angles, readings, and the range of each channel's values."""
-    flat = in_plane(data)
-    rows = []
-    for incidence in incidences(data):
-        theta, values = data.theta_o[incidence.rows], data.values[incidence.rows]
-        ranges = [
-            f"{values[:, channel].min():.3g} to {values[:, channel].max():.3g}" for channel in range(values.shape[1])
-        ]
-        counts = (
-            len(incidence.rows),
-            np.count_nonzero(data.mask[incidence.rows]),
-            np.count_nonzero(flat[incidence.rows]),
-        )
-        angles = (degrees(incidence.theta), degrees(incidence.phi), f"{degrees(theta.min())} to {degrees(theta.max())}")
-        rows.append((*angles, *map(str, counts), *ranges))
-    heads = tuple(f"BRDF {channel}" for channel in data.channels)
-    columns = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
-    return Table("Angles, and BRDF in 1/sr", columns, tuple(_shortened(rows, 40)), keys=2)
-
-
 _ORDERS = {
     "left_out": "the score of what is left out",
     "loo": "leave-one-out",
@@ -312,7 +264,8 @@ def with_error(value: float, error: float) -> tuple[str, str]:
     return f"{value:.{max(digits, 0)}f}", f"{error:.{max(digits, 0)}f}"
 
 
-def _shortened(rows: list[tuple[str, ...]], most: int) -> list[tuple[str, ...]]:
+def shortened(rows: list[tuple[str, ...]], most: int) -> list[tuple[str, ...]]:
+    """The first and the last of so many rows, and how many are left out between them."""
     if len(rows) <= most:
         return rows
     gap = (f"... {len(rows) - most} more", *[""] * (len(rows[0]) - 1))

@@ -19,9 +19,6 @@ from fits.inference.repeats import fit_many
 
 NAME = "pulls"
 WITHIN, ENOUGH = 3.0, 0.98
-UNIT = 0.2
-"""By how much the standard deviation of pulls may differ from 1: twice its own error in 50 repeats."""
-
 MOST_BYTES = 4e9
 
 TEXT = """\
@@ -45,7 +42,7 @@ detector's cone by dense quadrature; the sample leans by {leans:g} degrees, and 
 ## Bins of MERL tables ({few} repeats)
 
 Tables of six materials, read at {bins:,} bins that were chosen by each of both strata. Asked for: a mean pull within 3
-of its standard errors of 0, and a standard deviation within {unit:g} of 1.
+of its standard errors of 0, and a standard deviation within 3 of its own, {unit:.2f}, of 1.
 
 {tables}
 ## Every bin
@@ -78,7 +75,8 @@ class Row:
     @property
     def of_unit_width(self) -> bool:
         """Whether pulls are those of unbiased values with honest errors."""
-        return abs(self.bias) <= WITHIN * self.pull / np.sqrt(self.repeats) and abs(self.pull - 1.0) <= UNIT
+        own = self.pull / np.sqrt(self.repeats), 1.0 / np.sqrt(2 * self.repeats)
+        return abs(self.bias) <= WITHIN * own[0] and abs(self.pull - 1.0) <= WITHIN * own[1]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class Size:
     few: int
 
 
-DEFAULT, QUICK = Size(100, 50), Size(8, 4)
+DEFAULT, QUICK = Size(400, 400), Size(8, 4)
 
 
 def study(
@@ -122,7 +120,7 @@ def study(
         leans=cases.LEANS,
         gain=cases.GAIN,
         bins=cases.BINS,
-        unit=UNIT,
+        unit=1.0 / np.sqrt(2 * size.few),
         **{
             group: _table([row for row in rows if row.group == group], group == "tables")
             for group in ("instruments", "mixtures", "tables")

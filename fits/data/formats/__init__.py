@@ -6,13 +6,13 @@
 from pathlib import Path
 from typing import Literal
 
-from fits.data.formats import csv, fred, merl, totals_csv, zemax
+from fits.data.formats import csv, fred, merl, rxt, totals_csv, zemax
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
 
-FORMATS = ("csv", "totals", "merl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "zemax", "fred")
 
 _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
     b"tensor_file": "an RGL tensor file (Dupuy and Jakob)",
@@ -36,12 +36,12 @@ def read(
     strata: Strata = "bins",
     seed: int = 0,
 ) -> Measurements:
-    """Read a measurement file: CSV, MERL binary, Zemax BSDF or FRED text.
+    """Read a measurement file: CSV, MERL binary, Zemax BSDF, FRED text, or iad's ``.rxt``.
 
     Args:
         path: the file.
-        format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "merl", "zemax" or "fred"; None
-            finds out from the content.
+        format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
+            `read_slab`), "merl", "zemax" or "fred"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
             FRED files hold "brdf" unless this says otherwise.
@@ -66,6 +66,8 @@ def read(
         return csv.read(path, checked)
     if kind == "totals":
         return totals_csv.read(path)
+    if kind == "rxt":
+        return rxt.read_slab(path).totals
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
@@ -95,6 +97,8 @@ def sniff(path: Path) -> str:
     lines = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
     lines = [line for line in lines if line and not line.startswith("#")]
     first = lines[0] if lines else ""
+    if first.startswith(rxt.FIRST):
+        return "rxt"
     if fred.recognises(first):
         return "fred"
     if zemax.recognises(lines):

@@ -9,7 +9,7 @@ d thickness, g asymmetry. Then the rows; with a count, a number above 1 at the h
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ import numpy as np
 
 from fits.data.formats._text import Line, read_lines
 from fits.data.geometry import Floats
+from fits.data.measurements import Source
 from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import KINDS, Kind, Totals
 
@@ -114,6 +115,7 @@ def read_slab(
         names = [f"{wave:g} nm" for wave in waves]
     shares: dict[str, Any] = {kind: given[kind][None] for kind in KINDS if kind in given}
     totals = Totals.of(incidence, **shares, sigma=sigma, channels=names, spheres=by)
+    totals = replace(totals, source=Source(str(path), "rxt"))
     slides = _one(path, "N", columns, slides) if slide > 0 and slides > 0 else 1.0
     return Slab(
         totals=totals,

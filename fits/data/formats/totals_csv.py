@@ -10,12 +10,15 @@ unscattered_transmittance    of this, what no medium has scattered
 One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read.
 """
 
+import csv
+import io
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from fits._files import write_text
 from fits.data.formats._text import content, read_lines
 from fits.data.formats.csv import SUFFIXES, Table, delimiter_of
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
@@ -80,6 +83,44 @@ def read(path: Path) -> Totals:
     )
     notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
     return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.beyond())))
+
+
+def write(totals: Totals, path: str | Path, force: bool = False) -> None:
+    """Write totals so that they come back as they are, but for spheres, of which no column tells.
+
+    Raises:
+        ValueError: the file exists and `force` is False, rows are masked, light comes along several directions of one
+            angle, or the name of a channel would not come back.
+    """
+    for name in totals.channels:
+        if not name or name != name.strip() or name.endswith(SUFFIXES) or "," in name:
+            raise ValueError(f"{path}: the name {name!r} of a channel would not come back")
+    if not totals.mask.all():
+        raise ValueError(f"{path}: rows that are not used cannot be written")
+    kinds = [kind for kind in KINDS if kind in totals.kinds]
+    spreads = [""] if totals.sigma is None else ["", SUFFIXES[0]]
+    names = [f"{COLUMNS[kind]}{_end(name)}{suffix}" for kind in kinds for suffix in spreads for name in totals.channels]
+    angles = np.unique(np.round(totals.theta_i, 9))
+    rows = []
+    for angle in angles:
+        cells: list[str] = []
+        for kind in kinds:
+            own = [k for k, one in enumerate(totals.kinds) if one == kind and abs(totals.theta_i[k] - angle) < 1e-8]
+            if len(own) > 1:
+                raise ValueError(f"{path}: {kind} was read {len(own)} times at {angle:g} degrees")
+            for array in (totals.values, totals.sigma)[: len(spreads)]:
+                assert array is not None
+                cells += [repr(float(number)) for number in array[own[0]]] if own else [""] * len(totals.channels)
+        rows.append([repr(float(angle)), *cells])
+    text = io.StringIO()
+    text.writelines(f"# note: {' '.join(note.split())}\n" for note in totals.source.notes)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerows([["theta_i", *names], *rows])
+    write_text(path, text.getvalue(), force)
+
+
+def _end(channel: str) -> str:
+    return "" if channel == channel_names(1)[0] else f"_{channel}"
 
 
 def _channels(names: list[str], column: str) -> dict[str, str]:
