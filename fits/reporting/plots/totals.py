@@ -55,4 +55,5 @@ def _panel(axes: Axes, totals: Totals, rows: np.ndarray, predicted: np.ndarray) 
         axes.errorbar(x, read, errors, fmt="o", color=INK, markersize=3, capsize=2, label=f"read{label}")
         if np.isfinite(predicted).any():
             axes.plot(x, predicted[row, channel], "-" if len(x) > 1 else "x", color=colour, label=f"fit{label}")
+    axes.margins(y=0.1)
     axes.set_ylim(bottom=0.0)
