@@ -41,10 +41,11 @@ def fit(arguments: Namespace) -> int:
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
     from fits.reporting.diagnostics import residual_structure, standardised
+    from fits.reporting.directories import check_directory, replacing, reserved
     from fits.reporting.stored import HELD_OUT
 
     directory = Path(arguments.out)
-    results.check_directory(directory, arguments.force)
+    check_directory(directory, arguments.force)
     data, unseen = held_out(measurements(arguments), arguments)
     given = read_problem(arguments.stack)
     objective = arguments.objective or given.objective
@@ -56,7 +57,7 @@ def fit(arguments: Namespace) -> int:
         require_blackjax()
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
-    with results.reserved(directory, arguments.force), show_progress() as progress, hint(kept):
+    with reserved(directory, arguments.force), show_progress() as progress, hint(kept):
         result = run_fit(
             given.stack,
             data,
@@ -72,7 +73,7 @@ def fit(arguments: Namespace) -> int:
             checkpoint=done,
         )
         progress("pictures and report", 0, 1)
-        with results.replacing(directory, arguments.force) as folder:
+        with replacing(directory, arguments.force) as folder:
             text = given.text if objective == given.objective else None
             results.write_fit(result, folder, text)
             if unseen is not None:

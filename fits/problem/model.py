@@ -119,7 +119,7 @@ class Model(Density):
             found = parts.scale * values(self.wi, self.wo, self.known)
         else:
             found = parts.scale * self.optics.seen(values, parts.instrument, len(self.wi))
-        return jnp.broadcast_to(found, (len(found), max(found.shape[-1], self.values.shape[-1])))
+        return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
     def sigma(self, vector: Array) -> Array:
         """Scale of the noise, (N, C), in 1/sr."""

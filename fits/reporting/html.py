@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 Pictures = Mapping[str, bytes]
 
+MOST_ANGLES = 24
+"""Incidences that are named one by one."""
+
 
 class Foretold(NamedTuple):
     """Readings that were not fitted, and the prediction of them."""
@@ -250,7 +253,7 @@ def _fitted(fit: "Fit") -> str:
         ("values came as", came_as(data)),
         ("channels", ", ".join(data.channels)),
         ("readings", f"{int(data.mask.sum())} of {len(data.mask)} used, {int((~data.mask).sum())} masked"),
-        ("incidence", ", ".join(f"{group.theta:g}°" for group in incidences(data))),
+        ("incidence", _incidence_words([group.theta for group in incidences(data)])),
         ("noise", verdicts.noise_in_words(problem)),
         ("objective", problem.objective),
         ("common scale", verdicts.scale_in_words(problem)),
@@ -261,6 +264,13 @@ def _fitted(fit: "Fit") -> str:
         *((("attribution", data.source.attribution),) if data.source.attribution else ()),
     ]
     return section("What was fitted", tables.html_table(tables.Table("", ("", ""), tuple(rows))))
+
+
+def _incidence_words(angles: Sequence[float]) -> str:
+    """Each of them; of many how many there are, and from where to where."""
+    if len(angles) > MOST_ANGLES:
+        return f"{len(angles)}, from {min(angles):g}° to {max(angles):g}°"
+    return ", ".join(f"{angle:g}°" for angle in angles)
 
 
 def _stack_text(fit: "Fit") -> str:

@@ -8,9 +8,6 @@ chain.h5       the posterior's chain, once sampled, and summary.json with its es
 report.html    all of it to read, and its pictures as *.png
 """
 
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
@@ -18,10 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import locked, read_json, text_checksum, write_json, write_text
+from fits._files import read_json, text_checksum, write_json, write_text
 from fits.data.formats import read, totals_csv
 from fits.data.formats.csv import write_csv
+from fits.data.measurements import Measurements
+from fits.data.spheres import Spheres
 from fits.data.totals import Totals
+from fits.reporting.directories import FIT, replacing, reserved
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 SCHEMA = 2
 REPORT, SUMMARY = "report.html", "summary.json"
-FIT, DATA, PROBLEM, FITTED, CHAIN = "fit.json", "data.csv", "problem.toml", "fitted.toml", "chain.h5"
-LOCK = "chain.lock"
+DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.h5"
 _STORED = (
     "vector",
     "errors",
@@ -87,11 +86,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
     scale = problem.scale if isinstance(problem.scale, Free) else None
-    totals = problem.data if isinstance(problem.data, Totals) else None
-    if totals is None:
-        write_csv(problem.data, folder / DATA)
-    else:
-        totals_csv.write(totals.used(), folder / DATA)
+    spheres = _write_data(problem.data, folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
@@ -115,20 +110,9 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "numerical_error": fit.numerical_error,
         "alone": None if fit.alone is None else asdict(fit.alone),
         "source": asdict(problem.data.source),
-        "spheres": None if totals is None or totals.spheres is None else asdict(totals.spheres),
+        "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
-        "parameters": [
-            {
-                "name": name,
-                "value": value,
-                "standard_error": fit.standard_errors[name],
-                "unit": fit.units[name],
-                "low": float(problem.low[index]),
-                "high": float(problem.high[index]),
-                "at_bound": name in fit.at_bound,
-            }
-            for index, (name, value) in enumerate(fit.values.items())
-        ],
+        "parameters": _parameters(fit),
         "fit": {name: getattr(fit, name) for name in _STORED},
         "without_influence": fit.without_influence,
         "unresolved": [asdict(combination) for combination in fit.unresolved],
@@ -138,6 +122,30 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
     write_json(folder / FIT, content)
+
+
+def _write_data(data: Measurements, path: Path) -> Spheres | None:
+    """What was fitted; and spheres that its file does not tell of."""
+    if isinstance(data, Totals):
+        totals_csv.write(data.used(), path)
+        return data.spheres
+    write_csv(data, path)
+    return None
+
+
+def _parameters(fit: "Fit") -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "value": value,
+            "standard_error": fit.standard_errors[name],
+            "unit": fit.units[name],
+            "low": float(fit.problem.low[index]),
+            "high": float(fit.problem.high[index]),
+            "at_bound": name in fit.at_bound,
+        }
+        for index, (name, value) in enumerate(fit.values.items())
+    ]
 
 
 def load_fit(directory: str | Path) -> "Fit":
@@ -273,70 +281,3 @@ def _content(directory: Path) -> dict[str, Any]:
         if path.is_file() and text_checksum(path) != checksum:
             raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
     return content
-
-
-def check_directory(directory: Path, force: bool) -> None:
-    """Refuses a place where a result cannot be written, or is being sampled: ValueError that says why."""
-    if not directory.resolve().parent.is_dir():
-        raise ValueError(f"{directory}: there is no directory {directory.resolve().parent}")
-    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
-        return
-    if not (directory / FIT).is_file():
-        raise ValueError(f"{directory}: exists and is not a result directory (it holds no {FIT}), will not be replaced")
-    if not force:
-        raise ValueError(f"{directory}: holds a result already (--force, or force=True, replaces it)")
-    if (directory / LOCK).exists():
-        with locked(directory / LOCK, str(directory)):
-            pass
-
-
-@contextmanager
-def reserved(directory: str | Path, force: bool = False) -> Iterator[None]:
-    """While the block lasts, no other process writes this result: a ValueError where one does, or as `replacing`."""
-    directory = Path(directory)
-    check_directory(directory, force)
-    target = directory.resolve()
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
-        new, old = _beside(target)  # as a killed process left them
-        if old.exists() and not target.exists():
-            old.rename(target)
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
-        yield
-
-
-def _beside(target: Path) -> tuple[Path, Path]:
-    return target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
-
-
-@contextmanager
-def replacing(directory: str | Path, force: bool = False) -> Iterator[Path]:
-    """A new folder beside `directory` that takes its place when the block ends well, and is removed when it does not.
-
-    The directory must be `reserved`. Raises ValueError for one that is not empty, unless `force` is given and it is an
-    earlier result.
-    """
-    directory = Path(directory)
-    check_directory(directory, force)
-    target = directory.resolve()
-    folder, old = _beside(target)
-    try:
-        folder.mkdir()
-        yield folder
-        check_directory(directory, force)  # someone else may have written there in the meantime
-        if not target.exists():
-            folder.rename(target)
-            return
-        with locked(target / LOCK, str(directory)):
-            target.rename(old)
-            try:
-                folder.rename(target)
-            except OSError:
-                old.rename(target)
-                raise
-        shutil.rmtree(old)
-    except BaseException as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
-            error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
-        raise

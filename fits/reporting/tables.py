@@ -2,7 +2,7 @@
 
 import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO
 
@@ -192,12 +192,12 @@ def posterior_table(posterior: "Posterior") -> Table:
 
 def incidence_table(structure: ResidualStructure) -> Table:
     """Residuals of each incidence in units of sigma."""
-    rows = tuple(
+    rows = [
         (degrees(group.theta), str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
         for group in structure.by_incidence
-    )
+    ]
     note = "In units of the assumed sigma: a model that explains the data has mean 0 and rms 1 at every incidence."
-    return Table("Residuals by incidence", ("incidence", "readings", "mean", "rms"), rows, note)
+    return Table("Residuals by incidence", ("incidence", "readings", "mean", "rms"), tuple(shortened(rows, 40)), note)
 
 
 _ORDERS = {
@@ -264,7 +264,7 @@ def with_error(value: float, error: float) -> tuple[str, str]:
     return f"{value:.{max(digits, 0)}f}", f"{error:.{max(digits, 0)}f}"
 
 
-def shortened(rows: list[tuple[str, ...]], most: int) -> list[tuple[str, ...]]:
+def shortened(rows: Sequence[tuple[str, ...]], most: int) -> Sequence[tuple[str, ...]]:
     """The first and the last of so many rows, and how many are left out between them."""
     if len(rows) <= most:
         return rows

@@ -4,7 +4,7 @@ A choice follows a low-discrepancy sequence through the table, with the probabil
 counts for. All readings then stand for equally much, and none needs a weight in a likelihood.
 """
 
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,8 @@ def choice(readable: NDArray[np.bool_], measure: Table, count: int, strata: Stra
 
 def check(bins: object, strata: object, seed: object) -> None:
     """ValueError for a choice that is none."""
-    if bins != "all" and not (isinstance(bins, int) and not isinstance(bins, bool) and bins >= 1):
+    whole = isinstance(bins, int | np.integer) and not isinstance(bins, bool)
+    if bins != "all" and not (whole and cast(int, bins) >= 1):
         raise ValueError(f"bins is {bins!r}, must be a whole number of at least 1, or 'all'")
     if strata not in get_args(Strata):
         raise ValueError(f"strata is {strata!r}, must be one of {', '.join(get_args(Strata))}")

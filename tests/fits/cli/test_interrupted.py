@@ -24,8 +24,9 @@ from fits.inference.starts import start_points
 from fits.inference.starts_file import StartsFile
 from fits.problem.likelihood import Noise
 from fits.problem.problem import Problem
+from fits.reporting.directories import reserved
 from fits.reporting.plots.data import data_picture
-from fits.reporting.results import load_fit, load_posterior, reserved, save_fit, save_posterior
+from fits.reporting.results import load_fit, load_posterior, save_fit, save_posterior
 from tests.helpers.files import contents, largest_file, mounted, read_only
 from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT

@@ -49,7 +49,7 @@ def test_bad_arguments(tmp_path):
         read(path, format="xls")
     with pytest.raises(ValueError, match="quantity is 'f', must be one of"):
         read(path, quantity="f")
-    with pytest.raises(ValueError, match="geometry and lookup apply to MERL files only"):
+    with pytest.raises(ValueError, match="geometry, lookup and bins apply to MERL files only"):
         read(path, geometry=slices())
     with pytest.raises(ValueError, match="no such file"):
         read(tmp_path / "nothing.csv")

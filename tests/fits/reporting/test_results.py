@@ -15,7 +15,8 @@ from fits.inference.identifiability import Combination
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.reporting.results import load_fit, load_posterior, replacing, save_fit
+from fits.reporting.directories import replacing
+from fits.reporting.results import load_fit, load_posterior, save_fit
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
 
