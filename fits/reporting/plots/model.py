@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fits.inference.posterior import Posterior
 
 BAND_DRAWS = 200  # posterior draws behind a band
+STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
 STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # readings that make a panel
 
@@ -86,10 +87,9 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             lower.set_ylabel(
                 (r"residual / $\sigma$" if first.is_posterior else "residual / scatter") if column == 0 else ""
             )
-            if index >= len(shown) - columns:
-                lower.set_xlabel(ANGLE_LABEL)
+        figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
 
 
@@ -172,6 +172,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     for incidence in shown:
         own = signed[incidence.rows[flat[incidence.rows]]]
         angle = np.arange(np.floor(own.min()), np.ceil(own.max()) + STEP / 2, STEP)
+        angle = np.clip(angle, -STEEPEST, STEEPEST)
         angles.append(angle)
         wi.append(np.tile(direction(incidence.theta, incidence.phi), (len(angle), 1)))
         wo.append(direction(angle, incidence.phi + 180.0))
