@@ -225,7 +225,7 @@ def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
     upper, lower = figure.axes[:2]
     assert upper.get_title(loc="left") == "θᵢ = 10°"
     assert "1/sr" in upper.get_ylabel()
-    assert "degrees" in figure.axes[-1].get_xlabel()
+    assert "degrees" in figure.get_supxlabel()
     line = next(line for line in upper.lines if line.get_label() == "model")
     data, used = coat_fit.problem.data, coat_fit.problem.data.mask
     rows = np.flatnonzero(used & in_plane(data) & (data.theta_i == 10))
