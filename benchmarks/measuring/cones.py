@@ -4,6 +4,8 @@ import numpy as np
 
 import layerjax as lj
 
+SINGLE = lj.SingleScattering()
+
 
 def disc(w: np.ndarray, width: float, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions over a cone about w (3,) of this full angle, (K, 3), and their shares of its solid angle."""
@@ -25,7 +27,7 @@ def mean_over_cones(
     wo: np.ndarray,
     source: float,
     detector: float,
-    transport: lj.Transport = lj.SingleScattering(),  # noqa: B008 (frozen)
+    transport: lj.Transport = SINGLE,
 ) -> np.ndarray:
     """Readings (N, C), each by some thousand pairs of directions; less than a hundred where one of the two is none."""
     found = []

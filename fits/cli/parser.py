@@ -190,7 +190,7 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "look for the stack behind data: stacks grow layer by layer, and are ranked by what they foretell",
         "layerjax search slices.csv --out stacks --noise 0.03 --calibration 0.1",
     )
-    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf, FRED text or .rxt")
+    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
     parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
     parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")

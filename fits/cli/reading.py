@@ -13,8 +13,7 @@ def readings(path: str, arguments: Namespace) -> Measurements:
     bins: int | Literal["all"] | None = "all" if arguments.all else arguments.bins
     if arguments.strata is not None and not arguments.bins:
         raise ValueError("--strata is given without --bins")
-    data = read(path, arguments.format, arguments.quantity, bins=bins, strata=arguments.strata or "bins")
-    return data
+    return read(path, arguments.format, arguments.quantity, bins=bins, strata=arguments.strata or "bins")
 
 
 def measurements(arguments: Namespace) -> Measurements:
@@ -32,7 +31,7 @@ def measurements(arguments: Namespace) -> Measurements:
 
 def _refuse_angles(arguments: Namespace) -> None:
     """Totals have no direction of view, by which these would choose, and stacks are searched by angles left out."""
-    for name in ("mask_retro", "mask_grazing", "only", "hold_out", "library"):
+    for name in ("mask_retro", "mask_grazing", "only", "hold_out"):
         if getattr(arguments, name, None):
             raise ValueError(f"{arguments.data}: holds totals, of which --{name.replace('_', '-')} chooses nothing")
     if arguments.command == "search":

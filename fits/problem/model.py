@@ -115,10 +115,10 @@ class Model(Density):
         def values(wi: Array, wo: Array, known: lj.KnownDirections | None) -> Array:
             return forward(parts.stack, wi, wo, self.transport, self.side, known)
 
-        if self.optics is None or parts.instrument is None:
+        if self.optics is None:
             found = parts.scale * values(self.wi, self.wo, self.known)
         else:
-            found = parts.scale * self.optics.seen(values, parts.instrument, len(self.wi))
+            found = parts.scale * self.optics.seen(values, cast(Setting, parts.instrument), len(self.wi))
         return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
     def sigma(self, vector: Array) -> Array:

@@ -135,6 +135,7 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.cor
 
 def _assemble(problem: Problem) -> Assembled:
     _require_known(problem.objective, problem.scale)
+    require_in_range(problem.stack)
     if isinstance(problem.data, Totals):
         _refuse_angular_only(problem)
     used = problem.data.used()
@@ -167,7 +168,6 @@ def _require_known(objective: str, scale: Any) -> None:
 
 def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple[Any, ...]:
     """All that a parameter may stand for, in the order of `Parts`."""
-    require_in_range(problem.stack)
     # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
     stack = _with_known(problem.stack)
     scale = 1.0 if problem.scale is None else problem.scale

@@ -131,7 +131,7 @@ def test_with_a_gaussian_prior_it_is_one_gaussian(logarithmic: bool) -> None:
 
 
 def test_a_smooth_prior_draws_a_channel_to_its_neighbours(exact: np.ndarray) -> None:
-    """The fit is the generalised least-squares solution, and says so of its errors."""
+    """More so the narrower it is; and what is tied is known better."""
     values = exact.copy()
     values[:, 1] *= 1.3
     alone, tied, rigid = (
