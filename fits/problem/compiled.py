@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+FULL = 0.5
+"""Share of the maps that a process may have."""
+
 
 class Static:
     """A tree without arrays as a hashable key: the hash is taken once, not at every call."""
@@ -75,6 +78,17 @@ def _libraries() -> Any:
 def cores() -> int:
     """Of this machine."""
     return os.cpu_count() or 1
+
+
+def make_room() -> None:
+    """Let go of all compiled programs where they take half of the maps that Linux allows a process: dozens each."""
+    try:
+        with open("/proc/self/maps", "rb") as maps, open("/proc/sys/vm/max_map_count", "rb") as most:
+            full = sum(1 for _ in maps) > FULL * int(most.read())
+    except OSError:  # another system, which counts no maps
+        return
+    if full:
+        jax.clear_caches()
 
 
 def devices_of_cores() -> None:

@@ -9,13 +9,14 @@ chance would nor has a clearly lower criterion: with errors that readings share,
 foretell as well as one that lacks one.
 """
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import TypeVar
 
-import jax
 import numpy as np
 
 from fits.data.measurements import Measurements
@@ -25,7 +26,7 @@ from fits.inference.left_out import LeftOut, leave_out
 from fits.inference.marginal_likelihood import Evidence, evidence
 from fits.inference.optimise import fit_again, fit_problem
 from fits.inference.shared_errors import alone, are_shared, left_open
-from fits.problem.compiled import cores
+from fits.problem.compiled import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
@@ -45,8 +46,11 @@ STRONG = 10.0
 CLOSER = 3
 """So many of a level are looked at closely, besides those that were before."""
 
-REMEMBERED = 16
-"""Structures whose programs are kept."""
+TOGETHER = 8
+"""Structures at a time, at most: as many programs as a process can hold beside those that it has."""
+
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,20 +194,26 @@ class _Fitting:
 def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
     """Fit structures with noise alone, some at a time: to compile one keeps a single core busy."""
     _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])
-    with ThreadPoolExecutor(cores()) as pool:
-        for done, (structure, found) in enumerate(zip(level, pool.map(run, level), strict=True), 1):
-            looked.plain[structure] = found
-            _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
-    looked.clear(len(level))
+    for done, (structure, found) in enumerate(_at_a_time(run, level), 1):
+        looked.plain[structure] = found
+        _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
 
 
 def _look_closer(closer: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
     """At some structures of a level at a time, as they are screened."""
     _report(progress, "closer look", 0, len(closer), closer[0])
-    with ThreadPoolExecutor(cores()) as pool:
-        looks = pool.map(lambda structure: looked.look(structure, run), closer)
-        for done, (structure, _) in enumerate(zip(closer, looks, strict=True), 1):
-            _report(progress, "closer look", done, len(closer), structure)
+    for done, (structure, _) in enumerate(_at_a_time(lambda one: looked.look(one, run), closer), 1):
+        _report(progress, "closer look", done, len(closer), structure)
+
+
+def _at_a_time(call: Callable[[Structure], Result], structures: list[Structure]) -> Iterator[tuple[Structure, Result]]:
+    """Structures with what the call gives of them, some on all cores at a time, and none runs while programs go."""
+    together = min(cores(), TOGETHER)
+    with ThreadPoolExecutor(together) as pool:
+        for first in range(0, len(structures), together):
+            make_room()
+            some = structures[first : first + together]
+            yield from zip(some, pool.map(call, some), strict=True)
 
 
 def _next(looked: "_Looked", library: Library, layers: int) -> list[Structure]:
@@ -232,14 +242,6 @@ class _Looked:
         self.fits: dict[Structure, Fit] = {}
         self.left: dict[Structure, LeftOut] = {}
         self.evidences: dict[Structure, Evidence] = {}
-        self.since = 0
-
-    def clear(self, count: int) -> None:
-        """Let go of programs after so many more structures: a process may not map thousands into its memory."""
-        self.since += count
-        if self.since > REMEMBERED:
-            jax.clear_caches()
-            self.since = 0
 
     def bic(self, structure: Structure) -> float:
         fit = self.plain[structure]
