@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
+    from fits.exporting.export import Exported as Exported
+    from fits.exporting.export import export as export
     from fits.inference.averaging import Average as Average
     from fits.inference.averaging import average as average
     from fits.inference.compare import Comparison as Comparison
@@ -66,6 +68,8 @@ _HOMES = {
     "compare": "inference.compare",
     "Evidence": "inference.marginal_likelihood",
     "evidence": "inference.marginal_likelihood",
+    "Exported": "exporting.export",
+    "export": "exporting.export",
     "Fit": "inference.fit_result",
     "Foresight": "inference.foresight",
     "read": "data.formats",

@@ -58,6 +58,7 @@ PACKAGES = [
     "fits.inference",
     "fits.reporting",
     "fits.structures",
+    "fits.exporting",
     "fits.cli",
     "fits",
     "benchmarks.suite",

@@ -13,12 +13,15 @@ import numpy as np
 
 from fits._files import write_bytes, write_text, write_together
 from fits.cli.interrupts import hint
+from fits.cli.materials import export as export
+from fits.cli.materials import render as render
+from fits.cli.materials import simulate as simulate
+from fits.cli.materials import write_measurements
 from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.predictions import held_out, print_scores
 from fits.cli.predictions import predict as predict
 from fits.cli.reading import measurements
 from fits.cli.setting import use_jax
-from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
@@ -26,7 +29,6 @@ if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
     from fits.reporting.html import Foretold
-    from layerjax import Mixture, Stack
 
 DONE, DOUBTFUL = 0, 1
 
@@ -237,65 +239,7 @@ def info(arguments: Namespace) -> int:
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     require_free_place(arguments, ".csv", "measurements")
-    return _write_measurements(measurements(arguments), arguments)
-
-
-def simulate(arguments: Namespace) -> int:
-    """Write what a goniometer would measure of a stack."""
-    require_free_place(arguments, ".csv", "measurements")
-    use_jax()
-    from fits.data.geometry import slices
-    from fits.problem.simulate import simulate as run_simulation
-    from fits.problem.stack_file import read_problem
-
-    given = read_problem(arguments.stack)
-    geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
-    data = run_simulation(
-        _at_start(given.stack),
-        geometry,
-        transport=given.transport,
-        noise=arguments.noise,
-        floor=arguments.floor,
-        seed=arguments.seed,
-    )
-    return _write_measurements(data, arguments)
-
-
-def _write_measurements(data: Measurements, arguments: Namespace) -> int:
-    from fits.data.formats import totals_csv
-    from fits.data.formats.csv import write_csv
-
-    if isinstance(data, Totals):
-        totals_csv.write(data, arguments.out, force=arguments.force)
-        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the light")
-        return DONE
-    write_csv(data, arguments.out, force=arguments.force)
-    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
-    return DONE
-
-
-def render(arguments: Namespace) -> int:
-    """Draw a material of the gallery, or of a file."""
-    require_free_place(arguments, ".png", "pictures")
-    use_jax()
-    from fits.problem.stack_file import read_problem
-    from fits.reporting.plots.data import as_png
-    from fits.reporting.render import render as run_render
-    from layerjax import gallery
-
-    name, transport = arguments.material, None
-    stack: Stack | Mixture
-    if name in gallery.names():
-        stack = gallery.stack(name)
-    elif Path(name).suffix == ".toml":
-        given = read_problem(name)
-        stack, transport = _at_start(given.stack), None if given.transport == "auto" else given.transport
-    else:
-        raise ValueError(f"{name}: neither a .toml file nor one of the gallery: {', '.join(gallery.names())}")
-    figure = run_render(stack, transport, title=Path(name).stem.replace("_", " "), size=arguments.size)
-    write_bytes(arguments.out, as_png(figure), force=arguments.force)
-    print(f"{arguments.out}: {name}")
-    return DONE
+    return write_measurements(measurements(arguments), arguments)
 
 
 def write_report(
@@ -336,13 +280,3 @@ def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, 
         found = posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
         candidates[place.name if names.count(place.name) == 1 else str(directory)] = found
     return candidates
-
-
-def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
-    """The stack with every free parameter at its start value."""
-    import jax
-
-    from fits.problem.parameters import is_free
-    from fits.problem.spectra import with_values
-
-    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))

@@ -28,6 +28,11 @@ def level(word: str) -> float:
     return _number(word, float, 0.0, None)
 
 
+def length(word: str) -> float:
+    """A wavelength, in nanometres."""
+    return _number(word, float, 1.0, None)
+
+
 def _number(word: str, kind: type[int] | type[float], low: float, high: float | None) -> float:
     allowed = f"{'a whole number' if kind is int else 'a number'} " + (
         f">= {low:g}" if high is None else f"in [{low:g}, {high:g}]"

@@ -6,7 +6,8 @@ from typing import Any
 from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = ("csv", "totals", "rxt", "merl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "fred")
+EXPORTS = ("rgl", "merl", "zemax", "csv")
 STRATA = ("bins", "flux")
 
 
@@ -34,8 +35,8 @@ def add_format(parser: "argparse._ActionsContainer") -> None:
     parser.add_argument("--format", choices=FORMATS, help="default: from the content of the file")
     parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
     several = parser.add_mutually_exclusive_group()
-    several.add_argument("--bins", type=count, metavar="N", help="of a MERL table, N bins from all over it, not slices")
-    several.add_argument("--all", action="store_true", help="of a MERL table, every bin that holds a measurement")
+    several.add_argument("--bins", type=count, metavar="N", help="of a MERL or RGL table, N bins from all over it")
+    several.add_argument("--all", action="store_true", help="of such a table, every bin that holds a measurement")
     parser.add_argument(
         "--strata", choices=STRATA, help="what each of N bins has an equal share of: the table, or flux (default: bins)"
     )

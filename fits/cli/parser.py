@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from fits.cli.interrupts import raised_again
-from fits.cli.numbers import count, degrees, level, seed
-from fits.cli.options import add_force, add_format, add_reading, add_sampling, command
+from fits.cli.numbers import count, degrees, length, level, seed
+from fits.cli.options import EXPORTS, add_force, add_format, add_reading, add_sampling, command
 
 OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
 
@@ -70,6 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_convert,
         _add_simulate,
         _add_render,
+        _add_export,
     ):
         add(commands)
     return parser
@@ -276,6 +277,26 @@ def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
     parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
+    add_force(parser, "overwrite the file")
+
+
+def _add_export(commands: "argparse._SubParsersAction[_Parser]") -> None:
+    parser = command(
+        commands,
+        "export",
+        "write a material for renderers (Mitsuba, pbrt) or for optical design (Zemax, LightTools)",
+        "layerjax export result --to rgl --out coat.bsdf",
+    )
+    parser.add_argument(
+        "material",
+        metavar="DIR|TOML|NAME",
+        help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
+    )
+    parser.add_argument("--to", required=True, choices=EXPORTS, help="rgl: Mitsuba's and pbrt's tensor file")
+    parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
+    parser.add_argument(
+        "--wavelengths", type=length, nargs="+", metavar="NM", help="of the channels: an rgl file is spectral then"
+    )
     add_force(parser, "overwrite the file")
 
 

@@ -6,16 +6,15 @@
 from pathlib import Path
 from typing import Literal
 
-from fits.data.formats import csv, fred, merl, rxt, totals_csv, zemax
+from fits.data.formats import csv, fred, merl, rgl, rxt, totals_csv, zemax
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
 
-FORMATS = ("csv", "totals", "rxt", "merl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "fred")
 
 _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
-    b"tensor_file": "an RGL tensor file (Dupuy and Jakob)",
     b"<?xml": "an XML file (Radiance or WINDOW BSDF)",
     b"\x89HDF": "an HDF5 file",
     b"PK\x03\x04": "a zip archive (a spreadsheet?)",
@@ -36,18 +35,19 @@ def read(
     strata: Strata = "bins",
     seed: int = 0,
 ) -> Measurements:
-    """Read a measurement file: CSV, MERL binary, Zemax BSDF, FRED text, or iad's ``.rxt``.
+    """Read a measurement file: CSV, MERL binary, RGL tensor file, Zemax BSDF, FRED text, or iad's ``.rxt``.
 
     Args:
         path: the file.
         format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
-            `read_slab`), "merl", "zemax" or "fred"; None finds out from the content.
+            `read_slab`), "merl", "rgl", "zemax" or "fred"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
             FRED files hold "brdf" unless this says otherwise.
-        geometry: for MERL only, the directions to look up; None: the default `slices`.
+        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
+            directions at which the file has values.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
-        bins: for MERL only, in place of slices: so many bins from all over the table, at most 100,000, or "all".
+        bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
         strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
             the projected solid angle of light and viewer.
         seed: of their choice.
@@ -60,8 +60,10 @@ def read(
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     kind = sniff(path) if format is None else format
-    if kind != "merl" and (geometry is not None or lookup != "centre" or bins is not None):
-        raise ValueError(f"{path}: geometry, lookup and bins apply to MERL files only, this is a {kind} file")
+    if kind not in ("merl", "rgl") and (geometry is not None or bins is not None):
+        raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")
+    if kind != "merl" and (lookup != "centre" or strata != "bins"):
+        raise ValueError(f"{path}: lookup and strata apply to MERL files only, this is a {kind} file")
     if kind == "csv":
         return csv.read(path, checked)
     if kind == "totals":
@@ -72,6 +74,10 @@ def read(
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
         return merl.read(path, geometry=geometry, lookup=lookup, bins=bins, strata=strata, seed=seed)
+    if kind == "rgl":
+        if checked not in (None, "brdf_cos"):
+            raise ValueError(f"{path}: quantity is {quantity!r}, an RGL file always holds 'brdf_cos'")
+        return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
     if kind == "zemax":
         return zemax.read(path, checked or "brdf")
     if kind == "fred":
@@ -88,6 +94,8 @@ def sniff(path: Path) -> str:
     for magic, what in _KNOWN_ELSEWHERE.items():
         if head.startswith(magic):
             raise ValueError(f"{path}: this is {what}, which has no reader here (formats: {', '.join(FORMATS)})")
+    if rgl.recognises(head):
+        return "rgl"
     if merl.recognises(head) or path.suffix.lower() == ".binary":
         return "merl"
     if b"\0" in head:

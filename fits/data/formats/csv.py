@@ -125,6 +125,11 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
     """
     if isinstance(measurements, Totals):
         raise ValueError(f"{path}: totals are no BSDF values, which is what these columns hold")
+    write_text(path, csv_text(measurements), force)
+
+
+def csv_text(measurements: Measurements) -> str:
+    """What `write_csv` writes."""
     value_names = _names_to_write(measurements.channels)
     names = ["theta_i", "phi_i", "theta_o", "phi_o", *value_names]
     columns = [
@@ -149,7 +154,7 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
     writer.writerow([*names, "used"])
     for *numbers, used in zip(*columns, measurements.mask, strict=True):
         writer.writerow([*(repr(float(number)) for number in numbers), int(used)])
-    write_text(path, text.getvalue(), force)
+    return text.getvalue()
 
 
 class Table:

@@ -87,11 +87,11 @@ def read(
         notes += choice
         corners, weights = found[None], np.ones((1, len(found)))
     else:
-        index = _index(*half_difference(geometry.wi, geometry.wo))
+        index = index_of(*half_difference(geometry.wi, geometry.wo))
         if lookup == "nearest":
             corners, weights = np.minimum(index, np.array(SHAPE) - 1e-9).astype(int)[None], np.ones((1, len(index)))
         else:
-            corners, weights = _corners(index)
+            corners, weights = corners_around(index)
     corner_values = table[:, corners[..., 0], corners[..., 1], corners[..., 2]]  # (3, corners, N)
     _require_finite(path, corner_values)
     valid = ((corner_values >= 0) | (weights == 0)).all(axis=(0, 1))
@@ -167,7 +167,7 @@ def _frame(theta_h: Floats, phi_h: Floats) -> tuple[Floats, Floats, Floats]:
     return tangent, bitangent, half
 
 
-def _index(theta_h: Floats, theta_d: Floats, phi_d: Floats) -> Floats:
+def index_of(theta_h: Floats, theta_d: Floats, phi_d: Floats) -> Floats:
     """Continuous table indices (N, 3), each in [0, size of its axis]."""
     share_h, share_d = theta_h / (np.pi / 2), theta_d / (np.pi / 2)
     return np.stack([np.sqrt(share_h), share_d, phi_d / np.pi], axis=-1) * SHAPE
@@ -203,7 +203,7 @@ def _near(asked: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
     It is the one whose viewer is nearest, among those within `SAME_INCIDENCE` of the incidence where there are any.
     """
     theta_h, theta_d, phi_d = _half_difference(asked.wi, asked.wo)
-    start = np.floor(_index(theta_h, theta_d, phi_d)).astype(int)
+    start = np.floor(index_of(theta_h, theta_d, phi_d)).astype(int)
     stride = np.ones_like(start)
     # where theta_d is small a step of phi_d hardly moves anything: several at once
     stride[:, 2] = np.rint(1 / np.maximum(np.sin(theta_d), 0.01))
@@ -252,7 +252,7 @@ def _turned(w: Floats, angle: Floats) -> Floats:
     return np.stack([cosine * w[:, 0] - sine * w[:, 1], sine * w[:, 0] + cosine * w[:, 1], w[:, 2]], axis=-1)
 
 
-def _corners(index: Floats) -> tuple[np.ndarray, Floats]:
+def corners_around(index: Floats) -> tuple[np.ndarray, Floats]:
     """The 8 bins around each index (8, N, 3) and their weights (8, N) in a linear interpolation between bin centres."""
     low = np.floor(index - 0.5)
     fraction = index - 0.5 - low

@@ -65,7 +65,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
 
     theta_i, phi_i = np.meshgrid(incidence, LIGHT_AZIMUTH - rotation)  # (rotation, incidence)
     wi = np.broadcast_to(direction(theta_i, phi_i)[:, :, None, None], (*theta_i.shape, *once.shape, 3))
-    wo = _around_specular(theta_i, phi_i, azimuth, radial, btdf)
+    wo = around_specular(theta_i, phi_i, azimuth, radial, btdf)
     above = (wo[..., 2] * (-1 if btdf else 1)) > TANGENT_COSINE
     keep = once & above
     values = to_bsdf(np.moveaxis(file.values, 0, -1)[keep], wo[keep], quantity)
@@ -86,7 +86,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     return Measurements(wi[keep], wo[keep], values, None, measured, channels, source)
 
 
-def _around_specular(theta_i: Floats, phi_i: Floats, azimuth: Floats, radial: Floats, btdf: bool) -> Floats:
+def around_specular(theta_i: Floats, phi_i: Floats, azimuth: Floats, radial: Floats, btdf: bool) -> Floats:
     """Scatter directions (rotation, incidence, azimuth, radial, 3) from angles in degrees around the specular ray."""
     theta_s = (180.0 - theta_i) if btdf else theta_i
     specular = direction(theta_s, phi_i + 180.0)

@@ -32,7 +32,6 @@ def test_content_decides_and_not_the_name(tmp_path, name, format):
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        (b"tensor_file\0\x01\x00", "this is an RGL tensor file"),
         (b"<?xml version='1.0'?>", "this is an XML file"),
         (b"\x01\x02\x00\x03rest", "unknown binary file, starts with 01 02 00 03"),
         (b"BSDF 2.0 of something\n1 2 3\n", "unknown format, the first line is 'BSDF 2.0 of something'"),
@@ -49,7 +48,7 @@ def test_bad_arguments(tmp_path):
         read(path, format="xls")
     with pytest.raises(ValueError, match="quantity is 'f', must be one of"):
         read(path, quantity="f")
-    with pytest.raises(ValueError, match="geometry, lookup and bins apply to MERL files only"):
+    with pytest.raises(ValueError, match="geometry and bins apply to MERL and RGL files only"):
         read(path, geometry=slices())
     with pytest.raises(ValueError, match="no such file"):
         read(tmp_path / "nothing.csv")

@@ -94,7 +94,7 @@ def test_bad_choices(path, readable, tmp_path):
         read(empty, bins="all")
     other = tmp_path / "slices.csv"
     other.write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,20,0,0.1\n")
-    with pytest.raises(ValueError, match="geometry, lookup and bins apply to MERL files only"):
+    with pytest.raises(ValueError, match="geometry and bins apply to MERL and RGL files only"):
         read(other, bins=10)
 
 

@@ -1,0 +1,118 @@
+"""What commands do with a material rather than with data: simulate its readings, draw it, write it for renderers."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fits._files import write_bytes
+from fits.cli.places import refuse_existing, require_free_place
+from fits.cli.setting import use_jax
+from fits.data.measurements import Measurements
+from fits.data.totals import Totals
+
+if TYPE_CHECKING:
+    from fits.inference.fit_result import Fit
+    from layerjax import Mixture, Stack
+
+DONE = 0
+
+
+def simulate(arguments: Namespace) -> int:
+    """Write what a goniometer would measure of a stack."""
+    require_free_place(arguments, ".csv", "measurements")
+    use_jax()
+    from fits.data.geometry import slices
+    from fits.problem.simulate import simulate as run_simulation
+    from fits.problem.stack_file import read_problem
+
+    given = read_problem(arguments.stack)
+    geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
+    data = run_simulation(
+        _at_start(given.stack),
+        geometry,
+        transport=given.transport,
+        noise=arguments.noise,
+        floor=arguments.floor,
+        seed=arguments.seed,
+    )
+    return write_measurements(data, arguments)
+
+
+def write_measurements(data: Measurements, arguments: Namespace) -> int:
+    """As csv; says what there is of them."""
+    from fits.data.formats import totals_csv
+    from fits.data.formats.csv import write_csv
+
+    if isinstance(data, Totals):
+        totals_csv.write(data, arguments.out, force=arguments.force)
+        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the light")
+        return DONE
+    write_csv(data, arguments.out, force=arguments.force)
+    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
+    return DONE
+
+
+def render(arguments: Namespace) -> int:
+    """Draw a material of the gallery, or of a file."""
+    require_free_place(arguments, ".png", "pictures")
+    use_jax()
+    from fits.reporting.plots.data import as_png
+    from fits.reporting.render import render as run_render
+
+    name = arguments.material
+    stack, transport = _material(name)
+    figure = run_render(stack, transport, title=Path(name).stem.replace("_", " "), size=arguments.size)
+    write_bytes(arguments.out, as_png(figure), force=arguments.force)
+    print(f"{arguments.out}: {name}")
+    return DONE
+
+
+def export(arguments: Namespace) -> int:
+    """Write a material, or the best of a saved fit, for renderers or for optical design."""
+    refuse_existing(arguments.out, arguments.force)
+    use_jax()
+    from fits.exporting.export import export as run_export
+    from fits.reporting.results import load_fit
+
+    name = arguments.material
+    if Path(name).is_dir():
+        material: Fit | Stack | Mixture = load_fit(name)
+        transport = None
+    else:
+        material, transport = _material(name)
+    written = run_export(
+        material,
+        arguments.out,
+        arguments.to,
+        transport=transport,
+        wavelengths=arguments.wavelengths,
+        name=Path(name).resolve().stem,
+        force=arguments.force,
+    )
+    print(f"{written.path}: {Path(name).name}")
+    for note in written.notes:
+        print(f"{note[0].upper()}{note[1:]}.")
+    return DONE
+
+
+def _material(name: str) -> "tuple[Stack | Mixture, Any]":
+    """One of the gallery, or of a file with free parameters at their start, and its transport; None: not said."""
+    from fits.problem.stack_file import read_problem
+    from layerjax import gallery
+
+    if name in gallery.names():
+        return gallery.stack(name), None
+    if Path(name).suffix == ".toml":
+        given = read_problem(name)
+        return _at_start(given.stack), None if given.transport == "auto" else given.transport
+    raise ValueError(f"{name}: neither a .toml file nor one of the gallery: {', '.join(gallery.names())}")
+
+
+def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
+    """The stack with every free parameter at its start value."""
+    import jax
+
+    from fits.problem.parameters import is_free
+    from fits.problem.spectra import with_values
+
+    return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))

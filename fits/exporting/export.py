@@ -1,0 +1,102 @@
+"""The way from a stack to a file of a material: `fits.export`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import layerjax as lj
+from fits._files import write_bytes
+from fits.data.geometry import Floats
+from fits.exporting import merl, rgl, slices, zemax
+from fits.exporting.contents import Contents
+from fits.exporting.material import Material, material_of
+from fits.inference.fit_result import Fit
+
+To = Literal["rgl", "merl", "zemax", "csv"]
+
+_WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
+    "rgl": rgl.contents,
+    "merl": merl.contents,
+    "zemax": zemax.contents,
+    "csv": slices.contents,
+}
+
+ENDINGS: dict[str, str] = {"rgl": ".bsdf", "merl": ".binary", "zemax": ".bsdf", "csv": ".csv"}
+"""What names of files end in."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written. notes: what it holds, how well, and what it does not, one sentence each."""
+
+    path: Path
+    to: To
+    notes: tuple[str, ...]
+
+
+def export(
+    material: "lj.Stack | lj.Mixture | Fit",
+    path: str | Path,
+    to: To,
+    *,
+    transport: lj.Transport | Literal["auto"] | None = None,
+    wavelengths: ArrayLike | None = None,
+    name: str | None = None,
+    force: bool = False,
+) -> Exported:
+    """Write a material for renderers or for optical design.
+
+    Args:
+        material: a stack or a mixture of numbers, or a fit, of which the best values are written.
+        path: the file; its name ends as `ENDINGS` says.
+        to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
+            LightTools. "csv": slices in this project's convention.
+        transport: carries the light; None: that of the fit, or "auto".
+        wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
+        name: what the material is called in the file; None: after the file.
+        force: replace a file that is there.
+
+    Raises:
+        ValueError: the format cannot hold the material (the number of channels, or an axis that breaks the symmetry it
+            needs), a transport that is random or does not carry the stack, or a file that is there without `force`.
+    """
+    if to not in get_args(To):
+        raise ValueError(f"to is {to!r}, must be one of {', '.join(get_args(To))}")
+    path = Path(path)
+    if path.suffix.lower() != ENDINGS[to]:
+        raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")
+    if path.exists() and not force:
+        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
+    stack, chosen = _stack_and_transport(material, transport)
+    prepared = material_of(stack, chosen, name or path.stem)
+    written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
+    write_bytes(path, written.content, force)
+    return Exported(path, to, written.notes)
+
+
+def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.Mixture, Any]:
+    if isinstance(material, Fit):
+        own = material.problem.transport
+        if transport is None and own != "auto" and not isinstance(own, lj.Transport):
+            raise ValueError("transport: the fit's is a function of one's own; give one of layerjax")
+        return material.stack, transport or own
+    if not isinstance(material, lj.Stack | lj.Mixture):
+        raise ValueError(f"material is a {type(material).__name__}, must be a Stack, a Mixture or a Fit")
+    return material, transport or "auto"
+
+
+def _checked(wavelengths: ArrayLike | None, to: str, channels: int) -> Floats | None:
+    if wavelengths is None:
+        return None
+    if to != "rgl":
+        raise ValueError(f"wavelengths: a file for {to!r} has none, only one for 'rgl'")
+    given = np.atleast_1d(np.asarray(wavelengths, float))
+    if given.shape != (channels,):
+        raise ValueError(f"wavelengths: {given.size} given, must be one for each of {channels} channels")
+    if not (np.isfinite(given).all() and (given > 0).all() and (np.diff(given) > 0).all()):
+        raise ValueError(f"wavelengths: {', '.join(f'{one:g}' for one in given)} nm, must be above 0 and ascend")
+    return given

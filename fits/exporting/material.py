@@ -1,0 +1,103 @@
+"""What files of materials are made of: the values of a stack at any directions, and where its peaks are."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+import layerjax as lj
+from fits.data.geometry import Floats
+from layerjax.mixture import stacks_of
+from layerjax.phase.contract import Flakes
+
+AT_ONCE = 1 << 16
+"""Pairs of directions that are evaluated together."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """A stack, or a mixture of several, prepared for its transport.
+
+    name: what it is called in a file. parts: the stacks.
+    """
+
+    name: str
+    prepared: lj.Prepared | lj.Mixture
+    parts: tuple[lj.Stack, ...]
+    channels: int
+
+    def values(self, wi: Floats, wo: Floats) -> Floats:
+        """BSDF in 1/sr without the cosine, (N, C), at pairs of directions (N, 3)."""
+        found = [
+            np.asarray(lj.evaluate(self.prepared, one, other), float)
+            for one, other in zip(_batches(wi), _batches(wo), strict=True)
+        ]
+        return np.concatenate(found)[: len(wi)]
+
+    def reflected(self, wi: Floats) -> Floats:
+        """Share of the light from directions (N, 3) that goes back up, (N, C)."""
+        return np.asarray(lj.albedo(self.prepared, wi)[0], float)
+
+    @property
+    def opaque(self) -> bool:
+        """Whether no light passes."""
+        return all(part.base is not None for part in self.parts)
+
+    @property
+    def widths(self) -> tuple[float, ...]:
+        """The roughness alpha of all that mirrors light about the normal, each once."""
+        found = {width for part in self.parts for width in _widths(part)}
+        return tuple(sorted(found))
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether nothing changes if light and viewer turn about the normal."""
+        media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
+        return all(medium.phase.is_upright for medium in media)
+
+    @property
+    def turns_by_half(self) -> bool:
+        """Whether nothing changes by half a turn about the normal: every axis is the normal, or at a right angle to it.
+
+        Only flakes and fibers are known to have such an axis.
+        """
+        media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
+        return all(medium.phase.is_upright or _lies_flat(medium.phase.flakes) for medium in media)
+
+
+def material_of(
+    stack: lj.Stack | lj.Mixture, transport: lj.Transport | Literal["auto"] = "auto", name: str = "stack"
+) -> Material:
+    """Prepare a stack; ValueError for placeholders, a map, and a transport that is random or does not carry it."""
+    if isinstance(transport, lj.Transport) and transport.random:
+        raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
+    parts = tuple(stacks_of(stack))
+    prepared = lj.prepare(stack, transport)
+    return Material(name, prepared, parts, max(part.channels for part in parts))
+
+
+def _batches(w: Floats) -> Iterator[Floats]:
+    """Batches of one length, the last filled up with its last direction: one program serves all."""
+    length = min(AT_ONCE, len(w))
+    for start in range(0, len(w), length):
+        batch = w[start : start + length]
+        yield np.concatenate([batch, np.repeat(batch[-1:], length - len(batch), axis=0)])
+
+
+def _widths(stack: lj.Stack) -> Iterator[float]:
+    for layer in stack.layers:
+        if isinstance(layer, lj.Interface):
+            yield _number(layer.alpha)
+        elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface" and layer.phase.is_upright:
+            yield _number(layer.phase.flakes.alpha)
+    if isinstance(stack.base, lj.Conductor):
+        yield _number(stack.base.alpha)
+
+
+def _lies_flat(flakes: Flakes | None) -> bool:
+    return flakes is not None and not np.any(np.asarray(flakes.axis)[..., 2] != 0.0)
+
+
+def _number(value: object) -> float:
+    return float(np.min(np.asarray(value)))  # of channels that differ the narrowest
