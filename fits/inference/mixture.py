@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
-from scipy.cluster.vq import kmeans2
+from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
@@ -23,6 +23,7 @@ from fits.inference.uncertainty import local_information
 LEAST_PART = 0.01  # of the squared length of an open direction
 LOOSE = 10.0  # in the log-posterior, a box
 SMALLEST_REACH, WIDEST_REACH = 1e-9, 0.3  # of the box
+LEAST = 1e-12  # variance, of a unit, that a combination of parameters keeps
 REFINEMENTS = 10
 MOST_SAMPLES = 4000
 OWN_SAMPLES = 2.0  # that a component counts as
@@ -74,15 +75,14 @@ class Mixture:
 
     @classmethod
     def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
-        """The mixture fitted to samples (count, P) of a posterior, of which more are needed than of `COMPONENTS`."""
+        """The mixture fitted to samples (count, P) of a posterior, two at least; any may be there repeatedly."""
         samples = expit(positions)
-        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
-        root = directions * np.sqrt(np.maximum(values, SMALLEST_REACH**2))
+        root = _root(np.atleast_2d(np.cov(samples.T)))
         white = np.linalg.solve(root, samples.T).T
-        centres, nearest = kmeans2(white, COMPONENTS, minit="++", rng=generator)
-        within = np.atleast_2d(np.cov((white - centres[nearest]).T)) + SMALLEST_REACH * np.eye(white.shape[1])
-        roots = np.tile(root @ np.linalg.cholesky(within), (COMPONENTS, 1, 1))
-        log_weight = np.full(COMPONENTS, -np.log(COMPONENTS))
+        centres, nearest = _clusters(white, generator)
+        within = _root(np.atleast_2d(np.cov((white - centres[nearest]).T)))
+        log_weight = np.full(len(centres), -np.log(len(centres)))
+        roots = np.tile(root @ within, (len(centres), 1, 1))
         return cls(centres @ root.T, roots, log_weight, np.zeros(white.shape[1], bool)).refined(positions)
 
     def arrays(self) -> dict[str, Any]:
@@ -128,7 +128,7 @@ class Mixture:
             covariance = (scatter + own * prior) / (count + own)[:, None, None]
             covariance *= np.where(self.held[:, None] | self.held, np.eye(dimension), 1.0)
             log_weight = np.log((count + 1.0) / (count + 1.0).sum())
-            now = Mixture(centre, np.linalg.cholesky(covariance), log_weight, self.held)
+            now = Mixture(centre, _root(covariance), log_weight, self.held)
         centres, roots = np.concatenate([now.centre, self.centre]), np.concatenate([now.root, self.root])
         weights = np.concatenate([np.log1p(-KEPT) + now.log_weight, np.log(KEPT) + self.log_weight])
         return Mixture(centres, roots, weights, self.held)
@@ -205,6 +205,25 @@ class Leaps(NamedTuple):
         unit = self.centre[which] + jnp.einsum("...ij,...j->...i", self.root[which], normal)
         inside = jnp.all((unit > 0.0) & (unit < 1.0), axis=-1)
         return jax.scipy.special.logit(jnp.where(inside[..., None], unit, 0.5)), inside
+
+
+def _clusters(points: Floats, generator: np.random.RandomState) -> tuple[Floats, NDArray[np.int_]]:
+    """Centres of up to `COMPONENTS` clusters, none of them empty, and which one each point belongs to."""
+    for count in range(min(COMPONENTS, len(np.unique(points.round(6), axis=0))), 1, -1):
+        try:
+            return kmeans2(points, count, minit="++", missing="raise", rng=generator)
+        except ClusterError:
+            continue
+    return points.mean(axis=0, keepdims=True), np.zeros(len(points), int)
+
+
+def _root(covariance: Floats) -> Floats:
+    """Roots (..., P, P) of covariances, of full rank however little rounding has left of it."""
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.maximum(variance, SMALLEST_REACH**2))
+    scaled = covariance / (scale[..., None] * scale[..., None, :])
+    short = 1.0 - variance / scale**2  # of a unit, where there is next to no variance
+    return scale[..., None] * np.linalg.cholesky(scaled + (short + LEAST)[..., None] * np.eye(scaled.shape[-1]))
 
 
 def _inside(units: Floats) -> NDArray[np.bool_]:
