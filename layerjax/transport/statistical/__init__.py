@@ -2,8 +2,8 @@
 
 In goes a stack of interfaces and hazes over any base; out comes one GGX lobe for each group of paths, whose energy and
 `variance` follow from `adding`. `lobes` takes them off a stack, `shaped` gives them their shape. A diffuse base is
-added by `coated_base` (one coat), `streamed_base` (several, and haze), `diffuse_base` (an exact solve) or
-`diffuse_lobe` (the paper's lobe). `drawing` samples, and `transport` is what users call.
+added by `coated_base` (one coat), `streamed_base` (several, and haze), `hazy_base` (media on top), `diffuse_base` (an
+exact solve) or `diffuse_lobe` (the paper's lobe). `drawing` samples, and `transport` is what users call.
 """
 
 from layerjax.transport.statistical.transport import Statistical as Statistical

@@ -40,7 +40,7 @@ class CoatedBase(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (_arriving(self, sanitised(w, valid)[2]) for w in (wi, wo))
+        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
         returned = tuple(reflection(load("diffuse_interface"), self.alpha, self.ior, t) for t in _taus(self))
         one = jnp.ones_like(wi[2])
         level = each(lambda r, rho: closed_form(one, one, r, rho, self.ior), returned, self.reflectance)
@@ -50,7 +50,13 @@ class CoatedBase(eqx.Module):
         """Energy of `value` for light along wi, above."""
         means = [coat_means(self.alpha, self.ior, t) for t in _taus(self)]
         leaving, returned = tuple(mean.leaving for mean in means), tuple(mean.returned for mean in means)
-        return each(indirect_energy, _arriving(self, wi[2]), leaving, returned, self.reflectance)
+        return each(indirect_energy, self.arriving(wi[2]), leaving, returned, self.reflectance)
+
+    def arriving(self, cosine: Array) -> Channels:
+        """Share of light along a cosine that arrives at the base."""
+        if self.tau is None:
+            return (interface_energies(cosine, self.alpha, self.ior, "multiple")[1],)
+        return tuple(coated_transmission(cosine, self.alpha, self.ior, tau) for tau in self.tau)
 
 
 def is_coated(stack: Stack) -> bool:
@@ -72,9 +78,3 @@ def make_coated(stack: Stack) -> CoatedBase:
 
 def _taus(part: CoatedBase) -> Sequence[Array]:
     return (jnp.ones_like(part.alpha),) if part.tau is None else part.tau
-
-
-def _arriving(part: CoatedBase, cosine: Array) -> Channels:
-    if part.tau is None:
-        return (interface_energies(cosine, part.alpha, part.ior, "multiple")[1],)
-    return tuple(coated_transmission(cosine, part.alpha, part.ior, tau) for tau in part.tau)

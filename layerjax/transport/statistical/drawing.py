@@ -15,10 +15,11 @@ from layerjax.transport.single_scattering import Media, SingleScattering
 from layerjax.transport.statistical.coated_base import CoatedBase
 from layerjax.transport.statistical.diffuse_base import DiffuseBase
 from layerjax.transport.statistical.diffuse_lobe import DiffuseLobe
+from layerjax.transport.statistical.hazy_base import HazyBase
 from layerjax.transport.statistical.shaped import Shaped, folded, unfolded
 from layerjax.transport.statistical.streamed_base import StreamedBase
 
-DiffusePart = DiffuseBase | CoatedBase | StreamedBase | DiffuseLobe | Surface
+DiffusePart = DiffuseBase | CoatedBase | StreamedBase | HazyBase | DiffuseLobe | Surface
 """Light that has met a diffuse base, in closed form or as a lobe; or that base itself, if nothing lies on it."""
 
 

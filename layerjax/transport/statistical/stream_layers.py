@@ -6,6 +6,8 @@ lit alike, and the other way round where they are lit with opposite signs. Both 
 + Z W)^-1 Z: sums of what is positive, nothing cancels, in single precision either.
 """
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -14,8 +16,8 @@ import numpy as np
 from jax import Array
 
 from layerjax.channels import per_channel
-from layerjax.stack import Medium, is_known
-from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, dot, matmul, times
+from layerjax.stack import Interface, Medium, is_known
+from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, dot, face, matmul, times
 
 STEPS = 18
 """Doublings of a slab: from one thinner than 0.02 to half of the thickest medium of the box, 1e4."""
@@ -58,6 +60,23 @@ def under_medium(below: Below, medium: Medium) -> Below:
         return below._replace(onward=below.onward * passed, reflected=reflected)
     reflected, passed = _slab_of(medium, dtype)
     return _under(below, Face(passed, passed, reflected, reflected), below.ratio)
+
+
+def under_layers(below: Below, layers: Sequence[Interface | Medium]) -> tuple[Below, Array]:
+    """All these layers on top, and the index above what they lie on."""
+    dtype = below.onward.dtype
+    interfaces = [layer for layer in layers if isinstance(layer, Interface)]
+    indices = [jnp.ones((), dtype), *(jnp.asarray(layer.ior, dtype) for layer in interfaces)]
+    ratios = [behind / before for before, behind in pairwise(indices)]
+    together = face(jnp.stack([jnp.asarray(layer.alpha, dtype) for layer in interfaces]), jnp.stack(ratios))
+    k = len(interfaces)
+    for layer in reversed(layers):
+        if isinstance(layer, Medium):
+            below = under_medium(below, layer)
+        else:
+            k -= 1
+            below = under_face(below, Face(*(part[k] for part in together)), ratios[k])
+    return below, indices[-1]
 
 
 def collisions(medium: Medium, dtype: Any) -> Array:

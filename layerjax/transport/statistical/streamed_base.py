@@ -49,16 +49,15 @@ class Second(NamedTuple):
 
 
 class StreamedBase(eqx.Module):
-    """What becomes of light behind the first interface, and above it. (STREAMS,) by polynomials, and by channels.
+    """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
 
-    above: depth of what absorbs above that interface; None if nothing does. alpha, ior: of the interface. depth: of the
+    alpha, ior: of the interface. depth: of the
     media behind it, of what goes not straight on; None if there are none. onward: share of the light behind these that
     arrives at the base. again: of light that goes up there, passes them, and comes back from the interface. scattered:
     what of light just behind the interface arrives, and of light that goes up there, if it is scattered in the media;
     None if it is not. level: rho / (pi n^2 (1 - rho R)). energy: albedo over T(i).
     """
 
-    above: Channels | None
     alpha: Array
     ior: Array
     depth: Channels | None
@@ -73,19 +72,25 @@ class StreamedBase(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (_arriving(self, sanitised(w, valid)[2]) for w in (wi, wo))
+        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
         return select(valid, times(there, back, self.level))
 
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
-        return times(_arriving(self, wi[2]), self.energy)
+        return times(self.arriving(wi[2]), self.energy)
+
+    def arriving(self, cosine: Array) -> Channels:
+        """Share of light along a cosine that arrives at the base."""
+        passed, shares = streams.entering(cosine, self.alpha, self.ior)
+        there = _along_two(self, 1.0 - passed, *streams.two_cosines(shares))
+        if self.scattered is not None:
+            there = each(lambda t, row: t + streams.along(shares, row), there, self.scattered[0])
+        return tuple(passed * at_least(t, 0.0) for t in there)
 
 
 def is_streamed(stack: Stack) -> bool:
-    """Whether the first layer of a simplified stack that is not just absorbing is an interface, over a Lambertian."""
-    if not isinstance(stack.base, Lambertian):
-        return False
-    return isinstance(next((layer for layer in stack.layers if not _absorbs(layer)), None), Interface)
+    """Whether a simplified stack over a Lambertian begins with an interface."""
+    return isinstance(stack.base, Lambertian) and bool(stack.layers) and isinstance(stack.layers[0], Interface)
 
 
 def make_streamed(stack: Stack) -> StreamedBase:
@@ -98,8 +103,7 @@ def make_streamed(stack: Stack) -> StreamedBase:
     ratios = [behind / before for before, behind in pairwise(indices)]
     together = streams.face(jnp.stack(alphas), jnp.stack(ratios))  # at one look
     faces = [streams.Face(*(part[k] for part in together)) for k in range(len(alphas))]
-    first, *others = (place for place, layer in enumerate(stack.layers) if isinstance(layer, Interface))
-    end = others[0] if others else len(stack.layers)
+    end = next((k for k, layer in enumerate(stack.layers) if k and isinstance(layer, Interface)), len(stack.layers))
     bottom = below = stream_layers.base(dtype)
     second, k = None, len(faces)
     for layer in reversed(stack.layers[end:]):
@@ -110,7 +114,7 @@ def make_streamed(stack: Stack) -> StreamedBase:
         onward = None if below is bottom else per_channel(streams.by_polynomials(below.onward))
         second = Second(alphas[k], ratios[k], onward)
         below = stream_layers.under_face(below, faces[k], ratios[k])
-    media = [layer for layer in stack.layers[first + 1 : end] if isinstance(layer, Medium)]
+    media = [layer for layer in stack.layers[1:end] if isinstance(layer, Medium)]
     roof = stream_layers.roof(faces[0])
     for medium in media:
         roof = stream_layers.over_medium(roof, medium)
@@ -118,21 +122,17 @@ def make_streamed(stack: Stack) -> StreamedBase:
     depth = _depth(media, dtype)
     behind = streams.times(jnp.swapaxes(roof.inside, -1, -2), met.onward)
     again, scattered = met.again, None
-    if not all(map(_absorbs, media)):
+    if not all(map(absorbs, media)):
         assert depth is not None
         straight = stream_layers.straight(jnp.stack(depth))
         once = met.onward * straight
         again = straight * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
         down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
         scattered = per_channel(down), per_channel(up)
-    above = _depth([layer for layer in stack.layers[:first] if isinstance(layer, Medium)], dtype)
     out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind)
-    if above is not None:
-        out = out * stream_layers.straight(jnp.stack(above))
     leaving = per_channel(streams.dot(out, jnp.asarray(streams.DIFFUSE, dtype)) / indices[-1] ** 2)  # by reciprocity
     albedo, returned, one = per_channel(jnp.asarray(stack.base.albedo)), per_channel(met.returned), jnp.ones((), dtype)
     return StreamedBase(
-        above=above,
         alpha=alphas[0],
         ior=indices[1],
         depth=depth,
@@ -148,15 +148,6 @@ def make_streamed(stack: Stack) -> StreamedBase:
 def _depth(media: list[Medium], dtype: np.dtype) -> Channels | None:
     """Of what goes not straight through media."""
     return total([per_channel(stream_layers.collisions(medium, dtype)) for medium in media]) if media else None
-
-
-def _arriving(part: StreamedBase, cosine: Array) -> Channels:
-    passed, shares = streams.entering(cosine, part.alpha, part.ior)
-    there = _along_two(part, 1.0 - passed, *streams.two_cosines(shares))
-    if part.scattered is not None:
-        there = each(lambda t, row: t + streams.along(shares, row), there, part.scattered[0])
-    there = tuple(passed * at_least(t, 0.0) for t in there)
-    return there if part.above is None else each(lambda t, d: t * jnp.exp(-d / cosine), there, part.above)
 
 
 def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: Array, spread: Array) -> Channels:
@@ -184,5 +175,6 @@ def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: 
     return tuple(jnp.sum(weights * f, axis=0) for f in times(found, through))
 
 
-def _absorbs(layer: Interface | Medium) -> bool:
+def absorbs(layer: Interface | Medium) -> bool:
+    """Whether it is a medium that is known to scatter nothing."""
     return isinstance(layer, Medium) and is_known(layer.albedo, 0.0)

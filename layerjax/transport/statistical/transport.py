@@ -33,6 +33,7 @@ from layerjax.transport.statistical.drawing import (
     diffuse_part,
     draw,
 )
+from layerjax.transport.statistical.hazy_base import is_hazy, make_hazy
 from layerjax.transport.statistical.lobes import Options, Scattering, bounded, smooth_parts
 from layerjax.transport.statistical.shaped import (
     Facet,
@@ -80,10 +81,9 @@ class Statistical(DeterministicTransport):
             collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
             that lobe cannot be told from the light that nothing met, and both are left out.
         diffuse: light that has met a diffuse base: ``"tables"``, a closed form with transmittances from tables and few
-            streams, at every texel (over a `Lambertian`, ``microfacets="multiple"``, where no medium above the first
-            interface scatters; what else there is as if ``"exact"``); ``"exact"``, those of an adding-doubling solve
-            for every stack; or ``"lobe"``, one GGX lobe from tables (2022), for interfaces and absorbing media over a
-            `Lambertian`.
+            streams, at every texel (over a `Lambertian`, ``microfacets="multiple"``; what else there is as if
+            ``"exact"``); ``"exact"``, those of an adding-doubling solve for every stack; or ``"lobe"``, one GGX lobe
+            from tables (2022), for interfaces and absorbing media over a `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
         own_side: whether light from inside meets the reflectance of its own side, or by reciprocity that from outside.
 
@@ -132,7 +132,8 @@ class Statistical(DeterministicTransport):
             elif self._solves(stack):
                 diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
-                diffuse = make_coated(stack) if is_coated(stack) else make_streamed(stack)
+                make = make_coated if is_coated(stack) else make_streamed if is_streamed(stack) else make_hazy
+                diffuse = make(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -185,7 +186,7 @@ class Statistical(DeterministicTransport):
         """Whether the diffuse part of a simplified stack needs a solve of its own."""
         if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
             return False
-        return self.diffuse != "tables" or self.microfacets == "single" or not is_streamed(stack)
+        return self.diffuse != "tables" or self.microfacets == "single" or not (is_streamed(stack) or is_hazy(stack))
 
     def _shaped(self, state: Lit, cosine: Array, upward: bool) -> Shaped:
         options = Options(self.microfacets, self.scattering, self.angles, self.own_side, state.smooth)

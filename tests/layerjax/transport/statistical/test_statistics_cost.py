@@ -44,9 +44,10 @@ def test_smooth_interfaces(microfacets):
 
 
 def test_bases():
-    """A diffuse base right under haze asks for a solver, and nothing else does unasked; bare it is itself."""
+    """No diffuse base asks for a solver unasked, but one that is not Lambertian; bare it is itself."""
     two = [COAT, lj.Interface(1.8, 0.1)]
-    solved = program([HAZE], DIFFUSE), program(two, DIFFUSE, diffuse="exact")
+    rough = lj.OrenNayar(0.5, 0.3)
+    solved = program([HAZE], rough), program(two, DIFFUSE, diffuse="exact")
     read = (
         program([COAT], None),
         program([COAT]),
@@ -54,6 +55,8 @@ def test_bases():
         program([COAT, lj.Medium(0.7, 0.0)], DIFFUSE),
         program(two, DIFFUSE),
         program([COAT, HAZE], DIFFUSE),
+        program([HAZE], DIFFUSE),
+        program([HAZE, COAT, HAZE], DIFFUSE),
     )
     assert all(found["dot_general"] > 10 for found in solved)
     assert all(found["dot_general"] < 10 for found in read)

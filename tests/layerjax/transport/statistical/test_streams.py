@@ -10,7 +10,8 @@ from layerjax.precompute.streams import diffuse_moments
 from layerjax.stack import Stack, simplify
 from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.diffuse_base import make_diffuse
-from layerjax.transport.statistical.streamed_base import is_streamed, make_streamed
+from layerjax.transport.statistical.hazy_base import HazyBase, is_hazy, make_hazy
+from layerjax.transport.statistical.streamed_base import StreamedBase, is_streamed, make_streamed
 
 COAT, INNER, DYE = lj.Interface(1.5, 0.1), lj.Interface(1.9, 0.3), lj.Medium([0.3, 1.0], 0.0)
 HAZE = lj.Medium([0.5, 2.0], 0.9, lj.HenyeyGreenstein(0.7))
@@ -24,17 +25,29 @@ STRUCTURES = {
     "haze": [COAT, HAZE],
     "haze over an interface": [COAT, HAZE, INNER],
     "dye on top": [DYE, COAT, HAZE],
+    "dye on a coat": [DYE, COAT],
+    "dye alone": [DYE],
+    "haze alone": [HAZE],
+    "haze and dye": [HAZE, DYE],
+    "haze on a coat": [HAZE, COAT],
+    "haze on two": [HAZE, COAT, DYE, INNER],
+    "haze on haze": [HAZE, COAT, HAZE],
     "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
 }
+
+
+def made(stack: Stack) -> HazyBase | StreamedBase:
+    return make_hazy(stack) if is_hazy(stack) else make_streamed(stack)
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_light_from_the_base_is_as_solved(name: str) -> None:
     stack = simplify(lj.Stack(STRUCTURES[name], BASE))
-    assert is_streamed(stack)
+    assert is_hazy(stack) is isinstance(stack.layers[0], lj.Medium)
+    assert is_streamed(stack) is not is_hazy(stack)
     angles = np.random.default_rng(0).uniform(0.05, 1.4, (2, 200))
     wi, wo = ((jnp.sin(t), 0.0 * t, jnp.cos(t)) for t in map(jnp.asarray, angles))
-    part, solved = make_streamed(stack), make_diffuse(stack, stack.base, "multiple")
+    part, solved = made(stack), make_diffuse(stack, stack.base, "multiple")
     error = FALLING if name == "down in index" else ERROR
     for found, wanted in zip(part.value(wi, wo), solved.value(wi, wo), strict=True):
         apart = np.asarray(found - wanted)
@@ -60,12 +73,39 @@ def test_a_map_is_its_stacks() -> None:
     np.testing.assert_allclose(together[0, 0], exact, rtol=ERROR)
 
 
-@pytest.mark.parametrize("layers", [[COAT, INNER], [COAT, lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8)), INNER]])
+MILK = lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8))
+
+
+@pytest.mark.parametrize("layers", [[COAT, INNER], [COAT, MILK, INNER], [MILK], [MILK, COAT, MILK]])
 def test_nothing_is_lost(layers) -> None:
     """What diffuse light from the base does not return to it leaves: energy over a base that absorbs nothing is 1."""
     stack = simplify(lj.Stack(layers, lj.Lambertian(1.0)))
-    (energy,) = make_streamed(stack).energy
+    (energy,) = made(stack).energy
     np.testing.assert_allclose(energy, 1.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
+    """Finite at the ends, along grazing light too, and as differences say, which at ends look inward."""
+
+    def value(thickness, albedo, g, cosine):
+        layers = [lj.Medium(thickness, albedo, lj.HenyeyGreenstein(g)), COAT]
+        part = make_hazy(lj.Stack(layers, lj.Lambertian(0.7)))
+        w = (jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), 0.0 * cosine, cosine)
+        return part.value(w, w)[0]
+
+    ends = [0.0, 1e-6, 1.0, 1e4], [(0.5, 0.3), (0.0, 0.0), (1.0, 0.999), (1.0, -0.999)], [1e-6, 0.3, 1.0]
+    places = jnp.asarray([(d, *scatters, cosine) for d in ends[0] for scatters in ends[1] for cosine in ends[2]], dtype)
+    for mode in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(jax.vmap(mode(value, argnums=(0, 1, 2))))(*places.T)
+        assert np.all(np.isfinite(np.stack(slopes)))
+    if dtype == jnp.float64:
+        at = jnp.asarray([(d, 0.5, 0.3, 0.6) for d in ends[0]])
+        step = jnp.asarray([1e-6, 1e-6, 1e-6, -1e-2])
+        values = jax.jit(jax.vmap(value))
+        ahead = [values(at[:, 0] + k * step, *at[:, 1:].T) for k in (0, 1, 2)]
+        slope = (-3.0 * ahead[0] + 4.0 * ahead[1] - ahead[2]) / (2.0 * step)
+        np.testing.assert_allclose(jax.vmap(jax.grad(value))(*at.T), slope, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])

@@ -1,0 +1,102 @@
+"""Light that has reached a Lambertian base under media that lie on top, and what is below them: the closed form.
+
+The same closed form as `layerjax.transport.statistical.diffuse_base`, f = T(i) T(o) rho / (pi n^2 (1 - rho R)). Light
+that goes straight through the media arrives as it does without them (`streamed_base`, `coated_base`). Of what meets
+something on its way, scattered there once or often or turned back by it, few streams say how much arrives: between
+these it is a polynomial of the cosine times the share that meets anything, which is all that is steep at grazing.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import at_least, exprel, horizon
+from layerjax.channels import Channels, each, per_channel, select, times
+from layerjax.directions import Vector, sanitised
+from layerjax.stack import Interface, Medium, Stack
+from layerjax.surfaces import Lambertian
+from layerjax.transport.statistical import stream_layers, streams
+from layerjax.transport.statistical.coated_base import CoatedBase, is_coated, make_coated
+from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
+from layerjax.transport.statistical.lobes import precision
+from layerjax.transport.statistical.streamed_base import StreamedBase, absorbs, make_streamed
+
+
+class HazyBase(eqx.Module):
+    """depth: of the media on top, of what goes not straight on. scattered: what of the light that meets something there
+    arrives, a unit of depth, by polynomials and channels; None if they only absorb. inner: what becomes of light that
+    passes straight; None: the base itself. level: rho / (pi n^2 (1 - rho R)). energy: albedo over T(i).
+    """
+
+    depth: Channels
+    scattered: Channels | None
+    inner: StreamedBase | CoatedBase | None
+    level: Channels
+    energy: Channels
+
+    def value(self, wi: Vector, wo: Vector) -> Channels:
+        """BRDF of the light that has reached the base, 0 unless both directions are above."""
+        edge = horizon(wi[2].dtype)
+        valid = (wi[2] > edge) & (wo[2] > edge)
+        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
+        return select(valid, times(there, back, self.level))
+
+    def albedo(self, wi: Vector) -> Channels:
+        """Energy of `value` for light along wi, above."""
+        return times(self.arriving(wi[2]), self.energy)
+
+    def arriving(self, cosine: Array) -> Channels:
+        """Share of light along a cosine that arrives at the base."""
+        straight: Channels = tuple(jnp.exp(-depth / cosine) for depth in self.depth)
+        there = straight if self.inner is None else times(straight, self.inner.arriving(cosine))
+        if self.scattered is None:
+            return there
+        found = streams.polynomials(cosine)
+        share = tuple(exprel(depth / cosine) / cosine for depth in self.depth)
+        met = each(lambda s, row: s * at_least(streams.along(found, row), 0.0), share, self.scattered)
+        return each(jnp.add, there, met)
+
+
+def is_hazy(stack: Stack) -> bool:
+    """Whether a simplified stack over a Lambertian begins with a medium, or has no other layers."""
+    return isinstance(stack.base, Lambertian) and bool(stack.layers) and isinstance(stack.layers[0], Medium)
+
+
+def make_hazy(stack: Stack) -> HazyBase:
+    """The diffuse part of a stack for which `is_hazy`."""
+    assert isinstance(stack.base, Lambertian)
+    dtype = precision(stack)
+    first = next((k for k, layer in enumerate(stack.layers) if isinstance(layer, Interface)), len(stack.layers))
+    top = [layer for layer in stack.layers[:first] if isinstance(layer, Medium)]
+    under = Stack(stack.layers[first:], stack.base)
+    index = jnp.ones((), dtype)
+    below = under_interfaces = stream_layers.base(dtype)
+    inner: StreamedBase | CoatedBase | None = None
+    if under.layers:
+        inner = make_coated(under) if is_coated(under) else make_streamed(under)
+        below, index = stream_layers.under_layers(below, under.layers)
+        under_interfaces = below
+    for medium in reversed(top):
+        below = stream_layers.under_medium(below, medium)
+    depth = sum(
+        (stream_layers.collisions(medium, dtype) for medium in top[1:]), stream_layers.collisions(top[0], dtype)
+    )
+    scattered = None
+    if not all(map(absorbs, top)):
+        met = below.onward - under_interfaces.onward * stream_layers.straight(depth)
+        nodes = jnp.asarray(streams.NODES, dtype)
+        share = exprel(depth[:, None] / nodes) / nodes
+        scattered = per_channel(streams.by_polynomials(met / share))
+    leaving = per_channel(streams.dot(below.onward, jnp.asarray(streams.DIFFUSE, dtype)) / index**2)  # by reciprocity
+    albedo, returned, one = (
+        per_channel(jnp.asarray(stack.base.albedo)),
+        per_channel(below.returned),
+        jnp.ones((), dtype),
+    )
+    return HazyBase(
+        depth=per_channel(depth),
+        scattered=scattered,
+        inner=inner,
+        level=each(lambda r, rho: closed_form(one, one, r, rho, index), returned, albedo),
+        energy=each(lambda out, r, rho: indirect_energy(one, out, r, rho), leaving, returned, albedo),
+    )
