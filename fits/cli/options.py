@@ -7,7 +7,7 @@ from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
 FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "fred")
-EXPORTS = ("rgl", "merl", "zemax", "csv")
+EXPORTS = ("rgl", "merl", "zemax", "klems", "csv")
 STRATA = ("bins", "flux")
 
 

@@ -11,21 +11,22 @@ from numpy.typing import ArrayLike
 import layerjax as lj
 from fits._files import write_bytes
 from fits.data.geometry import Floats
-from fits.exporting import merl, rgl, slices, zemax
+from fits.exporting import klems, merl, rgl, slices, zemax
 from fits.exporting.contents import Contents
 from fits.exporting.material import Material, material_of
 from fits.inference.fit_result import Fit
 
-To = Literal["rgl", "merl", "zemax", "csv"]
+To = Literal["rgl", "merl", "zemax", "klems", "csv"]
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
     "merl": merl.contents,
     "zemax": zemax.contents,
+    "klems": klems.contents,
     "csv": slices.contents,
 }
 
-ENDINGS: dict[str, str] = {"rgl": ".bsdf", "merl": ".binary", "zemax": ".bsdf", "csv": ".csv"}
+ENDINGS: dict[str, str] = {"rgl": ".bsdf", "merl": ".binary", "zemax": ".bsdf", "klems": ".xml", "csv": ".csv"}
 """What names of files end in."""
 
 
@@ -54,7 +55,8 @@ def export(
         material: a stack or a mixture of numbers, or a fit, of which the best values are written.
         path: the file; its name ends as `ENDINGS` says.
         to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
-            LightTools. "csv": slices in this project's convention.
+            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "csv": slices in this project's
+            convention.
         transport: carries the light; None: that of the fit, or "auto".
         wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
         name: what the material is called in the file; None: after the file.

@@ -23,6 +23,7 @@ class Material:
     """
 
     name: str
+    stack: lj.Stack | lj.Mixture
     prepared: lj.Prepared | lj.Mixture
     parts: tuple[lj.Stack, ...]
     channels: int
@@ -35,9 +36,26 @@ class Material:
         ]
         return np.concatenate(found)[: len(wi)]
 
-    def reflected(self, wi: Floats) -> Floats:
-        """Share of the light from directions (N, 3) that goes back up, (N, C)."""
-        return np.asarray(lj.albedo(self.prepared, wi)[0], float)
+    def shares(self, wi: Floats) -> tuple[Floats, Floats]:
+        """Of the light from directions (N, 3) what goes back, and what is scattered through, (N, C) each."""
+        reflected, transmitted = lj.albedo(self.prepared, wi)
+        shape = (len(wi), self.channels)
+        return np.broadcast_to(reflected, shape).astype(float), np.broadcast_to(transmitted, shape).astype(float)
+
+    def unscattered(self, wi: Floats) -> Floats:
+        """Of the light from directions (N, 3) what passes straight, (N, C)."""
+        passed = np.asarray(lj.unscattered(self.stack, wi))
+        return np.broadcast_to(passed, (len(wi), self.channels)).astype(float)
+
+    def require_air_below(self) -> None:
+        """ValueError for a stack that ends in another index than that of air."""
+        for part in self.parts:
+            interfaces = [layer for layer in part.layers if isinstance(layer, lj.Interface)]
+            if part.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
+                raise ValueError(
+                    f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the file is of a "
+                    "sheet in air: close it with an Interface of ior 1, or give it a base"
+                )
 
     @property
     def opaque(self) -> bool:
@@ -74,7 +92,7 @@ def material_of(
         raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
     parts = tuple(stacks_of(stack))
     prepared = lj.prepare(stack, transport)
-    return Material(name, prepared, parts, max(part.channels for part in parts))
+    return Material(name, stack, prepared, parts, max(part.channels for part in parts))
 
 
 def _batches(w: Floats) -> Iterator[Floats]:

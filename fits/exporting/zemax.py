@@ -9,6 +9,7 @@ import numpy as np
 
 from fits.data.formats.zemax import around_specular
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
+from fits.exporting.colours import XYZ
 from fits.exporting.contents import Contents
 from fits.exporting.material import Material
 
@@ -16,9 +17,6 @@ INCIDENCE = np.array([0.0, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60, 65, 70
 ROTATION = np.arange(0.0, 360.0, 15.0)
 AZIMUTH = np.arange(0.0, 181.0, 10.0)
 FINE, COARSE = np.array([0.0, 0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 18, 21, 25]), np.arange(30.0, 181.0, 5.0)
-
-XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-"""Of linear red, green and blue (IEC 61966-2-1), by a white of D65, whose Y is 1."""
 
 BLOCKS = {1: ("Monochrome",), 3: ("TristimulusX", "TristimulusY", "TristimulusZ")}
 
@@ -37,7 +35,7 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     above = wo[..., 2] > 0
     values = np.zeros((*above.shape, material.channels))
     values[above] = material.values(np.broadcast_to(wi[:, :, None, None], wo.shape)[above], wo[above])
-    total = material.reflected(wi.reshape(-1, 3)).reshape(*theta_i.shape, material.channels)
+    total = material.shares(wi.reshape(-1, 3))[0].reshape(*theta_i.shape, material.channels)
     if material.channels == len(XYZ):
         values, total = values @ XYZ.T, total @ XYZ.T
     lines = [

@@ -1,0 +1,103 @@
+"""Matrices of WINDOW: sums, symmetries and sides, beside the stack; the readers of others are in `test_readers`."""
+
+import xml.etree.ElementTree as ElementTree
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+
+TRANSPORT = lj.SingleScattering()
+FIBERS = lj.Medium(0.7, 0.9, lj.SGGX("fiber", 0.4, (1.0, 0.5, 0.6)))
+SHEET = lj.Stack([lj.Medium(0.3, 0.0), FIBERS])  # what absorbs is on top: front and back differ
+COUNTS = (1, 8, 16, 20, 24, 24, 24, 16, 12)
+BOUNDS = (0, 5, 15, 25, 35, 45, 55, 65, 75, 90)
+
+
+def matrices(path: Path) -> dict[tuple[str, str], np.ndarray]:
+    """By wavelength and direction, rows of light that leaves."""
+    name = "{http://windows.lbl.gov}"
+    found = {}
+    for data in ElementTree.parse(path).getroot().iter(f"{name}WavelengthData"):
+        block = data.find(f"{name}WavelengthDataBlock")
+        assert block is not None
+        words = (block.findtext(f"{name}ScatteringData") or "").replace(",", " ").split()
+        direction = block.findtext(f"{name}WavelengthDataDirection") or ""
+        found[data.findtext(f"{name}Wavelength") or "", direction] = np.array(words, float).reshape(145, 145)
+    return found
+
+
+def projected_solid_angles() -> np.ndarray:
+    """Of the patches, from the basis as it is published."""
+    cosines = np.cos(np.radians(BOUNDS)) ** 2
+    return np.repeat(np.pi * (cosines[:-1] - cosines[1:]) / COUNTS, COUNTS)
+
+
+@pytest.fixture(scope="module")
+def sheet(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], np.ndarray]:
+    path = tmp_path_factory.mktemp("klems") / "sheet.xml"
+    fits.export(SHEET, path, "klems", transport=TRANSPORT)
+    return matrices(path)
+
+
+def test_columns_hold_what_the_stack_sends(sheet: dict[tuple[str, str], np.ndarray]) -> None:
+    projected = projected_solid_angles()
+    assert projected.sum() == pytest.approx(np.pi)
+    assert {direction for _, direction in sheet} == {
+        f"{kind} {side}" for kind in ("Transmission", "Reflection") for side in ("Front", "Back")
+    }
+    for side, above in (("Front", True), ("Back", False)):
+        down = lj.direction(0.0 if above else np.pi, 0.0)
+        reflected, passed = (float(share[0]) for share in lj.albedo(SHEET, down, TRANSPORT))
+        straight = float(lj.unscattered(SHEET, down)[0])
+        sums = {kind: projected @ sheet["Visible", f"{kind} {side}"] for kind in ("Reflection", "Transmission")}
+        # the first patch is 5 degrees wide
+        assert sums["Reflection"][0] == pytest.approx(reflected, rel=0.01)
+        assert sums["Transmission"][0] == pytest.approx(passed + straight, rel=0.01)
+
+
+def test_light_may_go_back_the_way_it_came(sheet: dict[tuple[str, str], np.ndarray]) -> None:
+    """Reciprocity between patches: that of light which leaves is opposite in azimuth to that it would come by."""
+    opposite = []
+    first = 0
+    for count in COUNTS:
+        opposite += [first + (place + count // 2) % count for place in range(count)]
+        first += count
+    for side in ("Front", "Back"):
+        matrix = sheet["Visible", f"Reflection {side}"]
+        np.testing.assert_allclose(matrix, matrix[np.ix_(opposite, opposite)].T, rtol=0.1, atol=1e-4)
+    through, back = sheet["Visible", "Transmission Front"], sheet["Visible", "Transmission Back"]
+    np.testing.assert_allclose(through, back[np.ix_(opposite, opposite)].T, rtol=0.1, atol=1e-3)
+
+
+def test_unscattered_light_stays_in_its_patch(tmp_path: Path) -> None:
+    fits.export(lj.Stack([lj.Medium(0.5, 0.0)]), tmp_path / "dye.xml", "klems", transport=TRANSPORT)
+    matrix = matrices(tmp_path / "dye.xml")["Visible", "Transmission Front"]
+    assert np.count_nonzero(matrix) == 145
+    squares = [
+        np.linspace(*np.sin(np.radians(ring)) ** 2, 20001) for ring in pairwise(BOUNDS)
+    ]  # of sines: even in flux
+    passed = [np.mean(np.exp(-0.5 / np.sqrt(np.maximum(1.0 - square, 1e-12)))) for square in squares]
+    found = np.diag(matrix) * projected_solid_angles()
+    np.testing.assert_allclose(found, np.repeat(passed, COUNTS), rtol=1e-3, atol=1e-4)
+
+
+def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path: Path) -> None:
+    stack = lj.Stack([], lj.Lambertian([0.8, 0.4, 0.2]))
+    done = fits.export(stack, tmp_path / "paint.xml", "klems")
+    found = matrices(tmp_path / "paint.xml")
+    assert {direction for _, direction in found} == {"Reflection Front"}
+    assert any("opaque: nothing of the back" in note for note in done.notes)
+    white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    for wavelength, value in zip(("CIE-X", "Visible", "CIE-Z"), white @ [0.8, 0.4, 0.2], strict=True):
+        np.testing.assert_allclose(found[wavelength, "Reflection Front"], value / np.pi, rtol=1e-5)
+
+
+def test_a_stack_that_ends_in_glass_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"ends in a medium of index 1\.5"):
+        fits.export(lj.Stack([lj.Interface(1.5, 0.1)]), tmp_path / "glass.xml", "klems")
+    with pytest.raises(ValueError, match="one channel or three"):
+        fits.export(lj.Stack([], lj.Lambertian([0.1, 0.2])), tmp_path / "two.xml", "klems")
