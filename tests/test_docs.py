@@ -10,7 +10,14 @@ import layerjax
 from tools import papers
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "docs/errata.md", "docs/papers.md", "docs/which_transport.md")
+PAGES = (
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "docs/errata.md",
+    "docs/formats.md",
+    "docs/papers.md",
+    "docs/which_transport.md",
+)
 AGAIN = "python -m tools.papers makes docs/papers.md again"
 
 
