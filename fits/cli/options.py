@@ -6,7 +6,7 @@ from typing import Any
 from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "klems", "fred")
 EXPORTS = ("rgl", "merl", "zemax", "klems", "csv")
 STRATA = ("bins", "flux")
 

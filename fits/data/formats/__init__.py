@@ -6,16 +6,15 @@
 from pathlib import Path
 from typing import Literal
 
-from fits.data.formats import csv, fred, merl, rgl, rxt, totals_csv, zemax
+from fits.data.formats import csv, fred, merl, rgl, rxt, totals_csv, window_xml, zemax
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements, check_quantity
+from fits.data.measurements import Measurements, Quantity, check_quantity
 
-FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "fred")
+FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "klems", "fred")
 
 _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
-    b"<?xml": "an XML file (Radiance or WINDOW BSDF)",
     b"\x89HDF": "an HDF5 file",
     b"PK\x03\x04": "a zip archive (a spreadsheet?)",
     b"\xd0\xcf\x11\xe0": "an old Excel workbook",
@@ -35,12 +34,12 @@ def read(
     strata: Strata = "bins",
     seed: int = 0,
 ) -> Measurements:
-    """Read a measurement file: CSV, MERL binary, RGL tensor file, Zemax BSDF, FRED text, or iad's ``.rxt``.
+    """Read a measurement file: CSV, MERL binary, RGL tensor file, Zemax BSDF, WINDOW XML, FRED text, or iad's ``.rxt``.
 
     Args:
         path: the file.
         format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
-            `read_slab`), "merl", "rgl", "zemax" or "fred"; None finds out from the content.
+            `read_slab`), "merl", "rgl", "zemax", "klems" or "fred"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
             FRED files hold "brdf" unless this says otherwise.
@@ -64,6 +63,24 @@ def read(
         raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")
     if kind != "merl" and (lookup != "centre" or strata != "bins"):
         raise ValueError(f"{path}: lookup and strata apply to MERL files only, this is a {kind} file")
+    try:
+        return _read_as(kind, path, checked, geometry, lookup, bins, strata, seed)
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: {error}") from None  # of numbers that do not go together
+
+
+def _read_as(
+    kind: str,
+    path: Path,
+    checked: Quantity | None,
+    geometry: Geometry | None,
+    lookup: str,
+    bins: int | Literal["all"] | None,
+    strata: Strata,
+    seed: int,
+) -> Measurements:
     if kind == "csv":
         return csv.read(path, checked)
     if kind == "totals":
@@ -72,17 +89,21 @@ def read(
         return rxt.read_slab(path).totals
     if kind == "merl":
         if checked not in (None, "brdf"):
-            raise ValueError(f"{path}: quantity is {quantity!r}, a MERL file always holds 'brdf'")
+            raise ValueError(f"{path}: quantity is {checked!r}, a MERL file always holds 'brdf'")
         return merl.read(path, geometry=geometry, lookup=lookup, bins=bins, strata=strata, seed=seed)
     if kind == "rgl":
         if checked not in (None, "brdf_cos"):
-            raise ValueError(f"{path}: quantity is {quantity!r}, an RGL file always holds 'brdf_cos'")
+            raise ValueError(f"{path}: quantity is {checked!r}, an RGL file always holds 'brdf_cos'")
         return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
     if kind == "zemax":
         return zemax.read(path, checked or "brdf")
+    if kind == "klems":
+        if checked not in (None, "brdf"):
+            raise ValueError(f"{path}: quantity is {checked!r}, matrices of WINDOW always hold 'brdf'")
+        return window_xml.read(path)
     if kind == "fred":
         return fred.read(path, checked or "brdf")
-    raise ValueError(f"format is {format!r}, must be one of {', '.join(FORMATS)}")
+    raise ValueError(f"format is {kind!r}, must be one of {', '.join(FORMATS)}")
 
 
 def sniff(path: Path) -> str:
@@ -107,6 +128,8 @@ def sniff(path: Path) -> str:
     first = lines[0] if lines else ""
     if first.startswith(rxt.FIRST):
         return "rxt"
+    if window_xml.recognises(first):
+        return "klems"
     if fred.recognises(first):
         return "fred"
     if zemax.recognises(lines):

@@ -51,6 +51,8 @@ def read(path: Path) -> Totals:
     angles = table.column("theta_i", _ANGLE)
     light = direction(angles, np.full(len(angles), LIGHT_AZIMUTH))
     named = {kind: columns for kind in KINDS if (columns := _channels(table.names, COLUMNS[kind]))}
+    if not named:
+        raise header.error(f"no column of {', '.join(COLUMNS.values())}")
     channels = tuple(next(iter(named.values())))
     wi, wo, values, sigma, kinds = [], [], [], [], []
     known = {"theta_i"}

@@ -32,7 +32,7 @@ def test_content_decides_and_not_the_name(tmp_path, name, format):
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        (b"<?xml version='1.0'?>", "this is an XML file"),
+        (b"<?xml version='1.0'?>", "not well-formed XML"),
         (b"\x01\x02\x00\x03rest", "unknown binary file, starts with 01 02 00 03"),
         (b"BSDF 2.0 of something\n1 2 3\n", "unknown format, the first line is 'BSDF 2.0 of something'"),
     ],

@@ -1,6 +1,5 @@
 """RGL's tensor files: what is read back of a table that a formula made, and of files that are broken."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,6 @@ from fits.data.formats import read
 from fits.data.formats._tensor_file import fields_as_bytes, read_fields
 from fits.data.formats.rgl_table import Table, read_table, table_as_bytes
 from fits.data.geometry import Floats, Geometry, slices
-from fits.data.measurements import Measurements
-
-MUTATIONS = 60
 
 
 def lambertian(albedo: Floats, azimuths: Floats | None = None, wavelengths: Floats | None = None) -> Table:
@@ -183,36 +179,3 @@ def test_bad_arguments(path: Path) -> None:
         read(path, strata="flux")
     with pytest.raises(ValueError, match="bins stands beside geometry"):
         read(path, geometry=slices(), bins=10)
-
-
-def mutated(raw: bytes, random: np.random.Generator) -> bytes:
-    """Bytes changed, cut off or put in."""
-    changed = bytearray(raw)
-    kind = random.integers(3)
-    head = int(random.choice([len(raw), 400]))  # as often in what comes first
-    if kind == 0:
-        for _ in range(random.integers(1, 20)):
-            changed[random.integers(head)] = random.integers(256)
-    elif kind == 1:
-        del changed[random.integers(head) :]
-    else:
-        place = random.integers(head)
-        changed[place:place] = random.bytes(random.integers(1, 50))
-    return bytes(changed)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_mutated_files_are_read_or_named(tmp_path: Path, path: Path, seed: int) -> None:
-    small = replace(lambertian(np.array([0.2, 0.5, 0.8])), ndf=np.ones((2, 2)), sigma=np.ones((2, 2)))
-    raw = table_as_bytes(small)
-    random = np.random.default_rng(seed)
-    said = []
-    for _ in range(MUTATIONS // 3):
-        bad = tmp_path / "mutated.bsdf"
-        bad.write_bytes(b"tensor_file\0" + mutated(raw, random)[12:])
-        try:
-            assert isinstance(read(bad), Measurements)
-        except ValueError as error:
-            said.append(str(error))
-    assert said
-    assert all(words.startswith(f"{bad}: ") and "\n" not in words for words in said)

@@ -101,3 +101,66 @@ def test_a_stack_that_ends_in_glass_is_refused(tmp_path: Path) -> None:
         fits.export(lj.Stack([lj.Interface(1.5, 0.1)]), tmp_path / "glass.xml", "klems")
     with pytest.raises(ValueError, match="one channel or three"):
         fits.export(lj.Stack([], lj.Lambertian([0.1, 0.2])), tmp_path / "two.xml", "klems")
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    """At the middles of patches: means over these, which a smooth sheet has there to some percent."""
+    haze = lj.Stack([lj.Medium(0.3, 0.0), lj.Medium(0.7, [0.9, 0.6, 0.3], lj.HenyeyGreenstein(0.1))])
+    path = tmp_path / "haze.xml"
+    fits.export(haze, path, "klems", transport=TRANSPORT)
+    data = fits.read(path)
+    assert data.channels == ("X", "Y", "Z")
+    assert len(data) == 4 * 145**2
+    assert np.count_nonzero(~data.mask) == 2 * 145
+    seen = data.mask & (abs(data.wi[:, 2]) > np.cos(np.radians(65))) & (abs(data.wo[:, 2]) > np.cos(np.radians(65)))
+    white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    true = np.asarray(lj.evaluate(haze, data.wi[seen], data.wo[seen], TRANSPORT)) @ white.T
+    np.testing.assert_allclose(data.values[seen], true, rtol=0.03)
+
+
+def test_axes_are_not_turned(tmp_path: Path) -> None:
+    """Fibers that lean: of every other orientation the readings would be another material's."""
+    fits.export(SHEET, tmp_path / "sheet.xml", "klems", transport=TRANSPORT)
+    data = fits.read(tmp_path / "sheet.xml").used()
+    steep = (abs(data.wi[:, 2]) > 0.5) & (abs(data.wo[:, 2]) > 0.5)
+
+    def apart(mirror: tuple[float, float, float]) -> float:
+        wi, wo = data.wi[steep] * mirror, data.wo[steep] * mirror
+        true = np.asarray(lj.evaluate(SHEET, wi, wo, TRANSPORT))
+        return float(np.sqrt(np.mean((data.values[steep] - true) ** 2)) / np.sqrt(np.mean(true**2)))
+
+    assert apart((1.0, 1.0, 1.0)) < 0.15
+    for mirror in ((-1.0, 1.0, 1.0), (1.0, -1.0, 1.0), (-1.0, -1.0, 1.0), (1.0, 1.0, -1.0), (-1.0, 1.0, -1.0)):
+        assert apart(mirror) > 0.3
+
+
+FAULTS = {
+    "no XML": (b"</WindowElement>", b"</WindowElemen>", "not well-formed XML"),
+    "another file": (b"WindowElement", b"Drawing", "an XML file of <Drawing>"),
+    "structure": (b">Columns<", b">TensorTree4<", "tensor tree, which has no reader here"),
+    "basis": (b"<RowAngleBasis>LBNL", b"<RowAngleBasis>LBL", "RowAngleBasis is"),
+    "patches": (b"<nPhis>8<", b"<nPhis>7<", "must be 144 x 144"),
+    "ring": (b"<UpperTheta>15<", b"<UpperTheta>150<", "a ring from 5 to 150 degrees"),
+    "bound": (b"<UpperTheta>15<", b"<UpperTheta>x<", "ThetaBounds/UpperTheta is 'x', must be a number"),
+    "direction": (b"Reflection Front", b"Reflection Left", "WavelengthDataDirection is 'reflection left'"),
+    "wavelength": (b">Visible<", b">Solar<", "no WavelengthData of 'Visible'"),
+    "number": (b"e-01,", b"e-x1,", "could not convert"),
+    "infinite": (b"2.546479e-01,", b"inf,", "holds inf, must be finite"),
+}
+
+
+@pytest.fixture(scope="module")
+def grey(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("klems") / "grey.xml"
+    fits.export(lj.Stack([], lj.Lambertian(0.8)), path, "klems")
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(("old", "new", "message"), FAULTS.values(), ids=FAULTS)
+def test_what_is_wrong_is_named(tmp_path: Path, grey: bytes, old: bytes, new: bytes, message: str) -> None:
+    bad = tmp_path / "bad.xml"
+    assert old in grey
+    bad.write_bytes(grey.replace(old, new))
+    with pytest.raises(ValueError, match=message) as error:
+        fits.read(bad)
+    assert str(error.value).startswith(f"{bad}: ")

@@ -1,0 +1,172 @@
+"""Matrices over patches of directions, in the XML of LBNL WINDOW and Radiance: Klems' bases, or one that it says.
+
+Patches are rings of polar angle, cut by azimuth, the first around azimuth 0; that of a direction is the azimuth along
+which light travels, seen from the front. A number is the mean of the BSDF over a patch of light that comes and one of
+light that leaves, and is read at the middles of both. WINDOW's front, which faces outside, is read as the top, the
+other way round than in Radiance, whose z points to the room: its x is turned as well. Light that passes unscattered is
+in the patch that it stays in and cannot be told from the rest: such readings are masked.
+"""
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.data.geometry import Floats, direction
+from fits.data.measurements import Measurements, Source, channel_names
+
+FIRST = ("<?xml", "<WindowElement")
+COME = {"front": 1.0, "back": -1.0}
+"""Of the side that light comes from: the sign of z."""
+
+CHANNELS = {"visible": "Y", "cie-x": "X", "cie-z": "Z"}
+_MOST_PATCHES = 2000
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Middles of the patches, along which light travels upward, (M, 3)."""
+
+    name: str
+    directions: Floats
+
+
+def recognises(first_line: str) -> bool:
+    """Whether this is the first line of an XML file."""
+    return first_line.startswith(FIRST)
+
+
+def read(path: Path) -> Measurements:
+    """Read such a file: all blocks of the visible, or X, Y and Z where it has these."""
+    layer = _layer(path)
+    incident = (_text(layer, "DataDefinition/IncidentDataStructure") or "").lower()
+    if incident not in ("columns", "rows"):
+        kind = "a tensor tree, which has no reader here" if incident.startswith("tensortree") else "neither"
+        raise ValueError(f"{path}: IncidentDataStructure is {incident!r}, must be Columns or Rows ({kind})")
+    bases = {basis.name.lower(): basis for basis in _bases(path, layer)}
+    blocks: dict[str, dict[str, Floats]] = {}
+    used: dict[str, tuple[Basis, Basis]] = {}
+    for data in layer.iter("WavelengthData"):
+        channel = CHANNELS.get((_text(data, "Wavelength") or "").lower())
+        if channel is None:
+            continue
+        for block in data.iter("WavelengthDataBlock"):
+            name = (_text(block, "WavelengthDataDirection") or "").lower()
+            kind, _, side = name.partition(" ")
+            if kind not in ("transmission", "reflection") or side not in COME:
+                raise ValueError(
+                    f"{path}: WavelengthDataDirection is {name!r}, must be Transmission or Reflection, Front or Back"
+                )
+            pair = _of(path, bases, block, "ColumnAngleBasis"), _of(path, bases, block, "RowAngleBasis")
+            come, leave = pair if incident == "columns" else pair[::-1]
+            matrix = _matrix(path, block, name, len(pair[1].directions), len(pair[0].directions))
+            if used.setdefault(name, (come, leave)) != (come, leave):
+                raise ValueError(f"{path}: {name} has different angle bases in different wavelengths")
+            blocks.setdefault(channel, {})[name] = matrix if incident == "columns" else matrix.T
+    if "Y" not in blocks:
+        raise ValueError(f"{path}: no WavelengthData of 'Visible'")
+    colours = tuple(one for one in ("X", "Y", "Z") if blocks.get(one, {}).keys() == blocks["Y"].keys())
+    chosen = colours if len(colours) == len(CHANNELS) else ("Y",)
+    return _readings(path, [blocks[one] for one in chosen], used, chosen if len(chosen) > 1 else channel_names(1))
+
+
+def _readings(
+    path: Path, blocks: list[dict[str, Floats]], used: dict[str, tuple[Basis, Basis]], channels: tuple[str, ...]
+) -> Measurements:
+    wi, wo, values, mask = [], [], [], []
+    for name, (come, leave) in used.items():
+        kind, _, side = name.partition(" ")
+        sign = COME[side]
+        through = kind == "transmission"
+        # light travels away from where it comes from
+        one = come.directions * np.array([1.0, -1.0, sign])
+        other = leave.directions * np.array([-1.0, 1.0, -sign if through else sign])
+        pairs = np.broadcast_arrays(one[None], other[:, None])
+        wi.append(pairs[0].reshape(-1, 3))
+        wo.append(pairs[1].reshape(-1, 3))
+        values.append(np.stack([block[name].ravel() for block in blocks], axis=-1))
+        straight = through & (np.abs(pairs[0] + pairs[1]).max(axis=-1) < 1e-9)
+        mask.append(~straight.ravel())
+    notes = (
+        ", ".join(used) + "; WINDOW's front is the top (Radiance calls it the back)",
+        "means over patches, read at their middles",
+        *(["masked: patches in which light passes straight"] if not all(part.all() for part in mask) else []),
+    )
+    source = Source(str(path), "klems", "brdf", notes)
+    parts = [np.concatenate(one) for one in (wi, wo, values, mask)]
+    return Measurements(parts[0], parts[1], parts[2], None, parts[3], channels, source)
+
+
+def _layer(path: Path) -> ElementTree.Element:
+    """The layer of the file, without namespaces."""
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise ValueError(f"{path}: not well-formed XML: {error}") from None
+    for element in root.iter():
+        element.tag = str(element.tag).rpartition("}")[2]
+    layer = root.find("Optical/Layer")
+    if root.tag != "WindowElement" or layer is None:
+        raise ValueError(
+            f"{path}: an XML file of <{root.tag[:40]}>, must be a <WindowElement> with <Optical> and <Layer>"
+        )
+    return layer
+
+
+def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
+    found = []
+    for basis in layer.iterfind("DataDefinition/AngleBasis"):
+        name = _text(basis, "AngleBasisName")
+        if not name:
+            raise ValueError(f"{path}: an AngleBasis without AngleBasisName")
+        directions: list[Floats] = []
+        for ring in basis.iter("AngleBasisBlock"):
+            low, high = (_number(path, ring, f"ThetaBounds/{bound}Theta") for bound in ("Lower", "Upper"))
+            count = _number(path, ring, "nPhis")
+            if not (0.0 <= low < high <= 90.0 and 1 <= count <= _MOST_PATCHES and count == int(count)):
+                raise ValueError(f"{path}: {name}: a ring from {low:g} to {high:g} degrees in {count:g} patches")
+            theta = 0.0 if count == 1 and low == 0.0 else 0.5 * (low + high)
+            directions.append(direction(theta, 360.0 * np.arange(int(count)) / count))
+        if not directions:
+            raise ValueError(f"{path}: {name}: no AngleBasisBlock")
+        found.append(Basis(name, np.concatenate(directions)))
+        if len(found[-1].directions) > _MOST_PATCHES:
+            raise ValueError(f"{path}: {name}: {len(found[-1].directions)} patches, must be {_MOST_PATCHES} at most")
+    return found
+
+
+def _of(path: Path, bases: dict[str, Basis], block: ElementTree.Element, tag: str) -> Basis:
+    name = (_text(block, tag) or "").lower()
+    if name not in bases:
+        raise ValueError(
+            f"{path}: {tag} is {name!r}, must be one of {', '.join(bases) or 'none that the file defines'}"
+        )
+    return bases[name]
+
+
+def _matrix(path: Path, block: ElementTree.Element, name: str, rows: int, columns: int) -> NDArray[np.float64]:
+    words = (_text(block, "ScatteringData") or "").replace(",", " ").split()
+    if len(words) != rows * columns:
+        raise ValueError(f"{path}: {name}: {len(words)} numbers, must be {rows} x {columns}")
+    try:
+        matrix = np.array(words, float).reshape(rows, columns)
+    except ValueError as error:
+        raise ValueError(f"{path}: {name}: {error}") from None
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{path}: {name}: holds {matrix[~np.isfinite(matrix)][0]}, must be finite")
+    return matrix
+
+
+def _number(path: Path, parent: ElementTree.Element, tag: str) -> float:
+    text = _text(parent, tag) or ""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{path}: {tag} is {text[:40]!r}, must be a number") from None
+
+
+def _text(parent: ElementTree.Element, tag: str) -> str | None:
+    text = parent.findtext(tag)
+    return None if text is None else text.strip()
