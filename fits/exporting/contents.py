@@ -41,7 +41,7 @@ def agreement(material: Material, look_up: Callable[[Floats, Floats], Floats], t
     # of what a pair sends in all its channels: one that is nearly black says nothing
     scale = true[seen].max(axis=1, keepdims=True)
     error = (abs(read[seen] - true[seen]) / scale).max(axis=1)
-    middle, most, worst = (f"{100 * part:.2g} %" for part in np.quantile(error, [0.5, 0.99, 1.0]))
+    middle, most, worst = (f"{float(f'{100 * part:.2g}'):g} %" for part in np.quantile(error, [0.5, 0.99, 1.0]))
     return (
         f"read back between its nodes, at {seen.sum():,} pairs of directions up to 80 degrees, values are off by "
         f"{middle} in the median, {most} in 99 of 100, {worst} at worst"

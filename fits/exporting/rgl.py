@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from fits.data.formats._text import plural
 from fits.data.formats.rgl_table import RGB, Table, from_u, look_up, table_as_bytes, unit
 from fits.data.geometry import Floats
 from fits.exporting.contents import Contents, agreement
@@ -63,7 +64,7 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
         return look_up(made, wi, wo)[:, : material.channels] / wo[:, 2:]
 
     notes = (
-        f"{sides}, {len(made.theta_i)} polar angles, grids of {grid} x {grid}, {material.channels} channels",
+        f"{sides}, {len(made.theta_i)} polar angles, grids of {grid} x {grid}, {plural(material.channels, 'channel')}",
         agreement(material, look_up_bsdf),
         *([] if material.opaque else ["what passes through is left out: the format has reflection alone"]),
         *(["one channel, written as grey"] if made.values.shape[2] != material.channels else []),
