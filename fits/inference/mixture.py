@@ -77,7 +77,8 @@ class Mixture:
     def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
         """The mixture fitted to samples (count, P) of a posterior, two at least; any may be there repeatedly."""
         samples = expit(positions)
-        root = _root(np.atleast_2d(np.cov(samples.T)))
+        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
+        root = directions * np.sqrt(np.maximum(values, SMALLEST_REACH**2))
         white = np.linalg.solve(root, samples.T).T
         centres, nearest = _clusters(white, generator)
         within = _root(np.atleast_2d(np.cov((white - centres[nearest]).T)))

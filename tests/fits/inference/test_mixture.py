@@ -35,12 +35,11 @@ def test_few_and_collinear_draws_make_a_mixture(seed: int) -> None:
 def test_draws_of_a_normal_are_found_again() -> None:
     """Two parameters of widths 1e-2 and 1e-6, correlated by 0.99: where the mixture is dense, the normal is."""
     random = np.random.RandomState(2)
-    width = np.array([1e-2, 1e-6])
-    covariance = width[:, None] * width * np.array([[1.0, 0.99], [0.99, 1.0]])
-    normal = stats.multivariate_normal([0.4, 0.7], covariance)
-    units = normal.rvs(4000, random_state=random)
-    mixture = Mixture.through(special.logit(units), random)
+    width, centre = np.array([1e-2, 1e-6]), np.array([0.4, 0.7])
+    normal = stats.multivariate_normal([0.0, 0.0], [[1.0, 0.99], [0.99, 1.0]])
+    mixture = Mixture.through(special.logit(centre + width * normal.rvs(4000, random_state=random)), random)
     fresh = normal.rvs(2000, random_state=random)
-    stretch = np.sum(stats.logistic.logpdf(special.logit(fresh)), axis=1)
-    lost = np.mean(normal.logpdf(fresh) - (mixture.log_density(special.logit(fresh)) - stretch))
+    positions = special.logit(centre + width * fresh)
+    stretch = np.sum(stats.logistic.logpdf(positions) - np.log(width), axis=1)  # d standard / d log-odds
+    lost = np.mean(normal.logpdf(fresh) - (mixture.log_density(positions) - stretch))
     assert 0.0 < lost < 0.2  # the divergence of Kullback and Leibler, of tails that are wider by design
