@@ -27,12 +27,12 @@ class Contents:
     notes: tuple[str, ...]
 
 
-def agreement(material: Material, look_up: Callable[[Floats, Floats], Floats], through: bool = False) -> str:
+def agreement(material: Material, look_up: Callable[[Floats, Floats], Floats]) -> str:
     """A sentence on how well a reader of the file finds the values of the stack between its nodes.
 
-    look_up: BSDF (N, C) at pairs of directions (N, 3). through: of light that passes, below the surface.
+    look_up: BSDF (N, C) at pairs of directions (N, 3) above the surface.
     """
-    wi, wo = pairs(through)
+    wi, wo = pairs()
     true = material.values(wi, wo)
     read = look_up(wi, wo)
     seen = true.max(axis=1) > 0
@@ -48,9 +48,8 @@ def agreement(material: Material, look_up: Callable[[Floats, Floats], Floats], t
     )
 
 
-def pairs(through: bool = False) -> tuple[Floats, Floats]:
-    """Pairs of directions up to 80 degrees from the normal: anywhere, and around the mirror direction (or the straight
-    one, if the light passes through)."""
+def pairs() -> tuple[Floats, Floats]:
+    """Pairs of directions up to 80 degrees from the normal: anywhere, and around the mirror direction."""
     u = qmc.Sobol(4, rng=np.random.default_rng(7)).random(2 * PAIRS)
     wi, anywhere = (_direction(u[:, place], u[:, place + 1]) for place in (0, 2))
     mirrored = wi * np.array([-1.0, -1.0, 1.0])
@@ -60,7 +59,7 @@ def pairs(through: bool = False) -> tuple[Floats, Floats]:
     near /= np.linalg.norm(near, axis=-1, keepdims=True)
     wo = np.where(np.arange(len(u))[:, None] < PAIRS, anywhere, near)
     kept = wo[:, 2] >= STEEPEST
-    return wi[kept], wo[kept] * np.array([1.0, 1.0, -1.0 if through else 1.0])
+    return wi[kept], wo[kept]
 
 
 def _direction(u: Floats, v: Floats) -> Floats:

@@ -61,10 +61,10 @@ def _at_nodes(
 ) -> tuple[Floats, Floats, Floats, str]:
     """wi and wo (N, 3), BSDF (N, C), and a note."""
     phi_i, theta_i, theta_m, phi_m = table.nodes()
-    turn = phi_i[:, None, None] if table.isotropic else 0.0
+    turn = 0.0
     if table.isotropic:
-        phi_i = np.full_like(phi_i, np.radians(LIGHT_AZIMUTH))
-        turn = phi_i[:, None, None]
+        turn = np.radians(LIGHT_AZIMUTH)
+        phi_i = np.full_like(phi_i, turn)
     wi, half = unit(theta_i, phi_i)[:, None, None], unit(theta_m, phi_m + turn)
     facing = np.sum(wi * half, axis=-1)
     wo = 2.0 * facing[..., None] * half - wi

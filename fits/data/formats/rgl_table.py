@@ -61,7 +61,7 @@ class Table:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        return RGB if self.wavelengths is None else tuple(f"{one:.4g} nm" for one in self.wavelengths)
+        return RGB if self.wavelengths is None else tuple(f"{one:g} nm" for one in self.wavelengths)
 
     @property
     def turns(self) -> int:

@@ -58,7 +58,7 @@ class HazyBase(eqx.Module):
 
 
 def is_hazy(stack: Stack) -> bool:
-    """Whether a simplified stack over a Lambertian begins with a medium, or has no other layers."""
+    """Whether a simplified stack over a Lambertian begins with a medium."""
     return isinstance(stack.base, Lambertian) and bool(stack.layers) and isinstance(stack.layers[0], Medium)
 
 
