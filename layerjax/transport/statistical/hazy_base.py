@@ -6,44 +6,29 @@ something on its way, scattered there once or often or turned back by it, few st
 these it is a polynomial of the cosine times the share that meets anything, which is all that is steep at grazing.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, exprel, horizon
-from layerjax.channels import Channels, each, per_channel, select, times
-from layerjax.directions import Vector, sanitised
+from layerjax._numerics import at_least, exprel
+from layerjax.channels import Channels, each, per_channel, times
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Lambertian
 from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.coated_base import CoatedBase, is_coated, make_coated
 from layerjax.transport.statistical.diffuse import closed_form, indirect_energy
 from layerjax.transport.statistical.lobes import precision
-from layerjax.transport.statistical.streamed_base import StreamedBase, absorbs, make_streamed
+from layerjax.transport.statistical.streamed_base import ClosedForm, StreamedBase, absorbs, make_streamed
 
 
-class HazyBase(eqx.Module):
+class HazyBase(ClosedForm):
     """depth: of the media on top, of what goes not straight on. scattered: what of the light that meets something there
     arrives, a unit of depth, by polynomials and channels; None if they only absorb. inner: what becomes of light that
-    passes straight; None: the base itself. level: rho / (pi n^2 (1 - rho R)). energy: albedo over T(i).
+    passes straight; None: the base itself.
     """
 
     depth: Channels
     scattered: Channels | None
     inner: StreamedBase | CoatedBase | None
-    level: Channels
-    energy: Channels
-
-    def value(self, wi: Vector, wo: Vector) -> Channels:
-        """BRDF of the light that has reached the base, 0 unless both directions are above."""
-        edge = horizon(wi[2].dtype)
-        valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (self.arriving(sanitised(w, valid)[2]) for w in (wi, wo))
-        return select(valid, times(there, back, self.level))
-
-    def albedo(self, wi: Vector) -> Channels:
-        """Energy of `value` for light along wi, above."""
-        return times(self.arriving(wi[2]), self.energy)
 
     def arriving(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""

@@ -12,6 +12,7 @@ largest 2e-2; with an optical depth of 1 between them 5e-3 to 1.5e-2, largest 7e
 relative L2: below 1e-2, and below 5e-2 where the index falls by a third (from 1.9 to 1.3).
 """
 
+import abc
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -48,23 +49,11 @@ class Second(NamedTuple):
     onward: Channels | None
 
 
-class StreamedBase(eqx.Module):
-    """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
-
-    alpha, ior: of the interface. depth: of the
-    media behind it, of what goes not straight on; None if there are none. onward: share of the light behind these that
-    arrives at the base. again: of light that goes up there, passes them, and comes back from the interface. scattered:
-    what of light just behind the interface arrives, and of light that goes up there, if it is scattered in the media;
-    None if it is not. level: rho / (pi n^2 (1 - rho R)). energy: albedo over T(i).
+class ClosedForm(eqx.Module):
+    """Light that has reached a base that forgets where it came from. level: rho / (pi n^2 (1 - rho R)). energy: albedo
+    over T(i).
     """
 
-    alpha: Array
-    ior: Array
-    depth: Channels | None
-    onward: Channels
-    again: Channels
-    scattered: tuple[Channels, Channels] | None
-    second: Second | None
     level: Channels
     energy: Channels
 
@@ -78,6 +67,28 @@ class StreamedBase(eqx.Module):
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
         return times(self.arriving(wi[2]), self.energy)
+
+    @abc.abstractmethod
+    def arriving(self, cosine: Array) -> Channels:
+        """T, the share of light along a cosine that arrives at the base."""
+
+
+class StreamedBase(ClosedForm):
+    """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
+
+    alpha, ior: of the interface. depth: of the media behind it, of what goes not straight on; None if there are none.
+    onward: share of the light behind these that arrives at the base. again: of light that goes up there, passes them,
+    and comes back from the interface. scattered: what of light just behind the interface arrives, and of light that
+    goes up there, if it is scattered in the media; None if it is not.
+    """
+
+    alpha: Array
+    ior: Array
+    depth: Channels | None
+    onward: Channels
+    again: Channels
+    scattered: tuple[Channels, Channels] | None
+    second: Second | None
 
     def arriving(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
