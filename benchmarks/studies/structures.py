@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 
 import fits
@@ -26,8 +27,13 @@ FIRST, WANTED = 3, 36
 """The true structure is asked to be among so many first in so many of all."""
 
 WHOLE = default_library()
+FORWARD = lj.HenyeyGreenstein(fits.Free(0.3, 0.0, 0.9))
+"""The transport does not follow what is scattered backwards: no g below 0 means anything to it."""
 LIBRARY = Library(
-    {name: WHOLE.layers[name] for name in ("interface", "haze")},
+    {
+        "interface": WHOLE.layers["interface"],
+        "haze": eqx.tree_at(lambda haze: haze.phase, WHOLE.layers["haze"], FORWARD),
+    },
     {name: WHOLE.bases[name] for name in ("diffuse", "metal")},
 )
 

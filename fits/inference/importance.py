@@ -1,9 +1,9 @@
 """Draws that are weighted so that they stand for the posterior of a fit, without a chain.
 
-They come from an approximation of the posterior, that of the fit, or along its ridge where there is one. How well they
-stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25,
-72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from in its place
-(Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907).
+They come from an approximation of the posterior: that of the fit, and where it will not do one along the fit's ridge.
+How well they stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry
+2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from
+in its place (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907).
 """
 
 from dataclasses import dataclass
@@ -45,33 +45,42 @@ class Weighted:
     shape: float
 
     def resampled(self, generator: np.random.RandomState, count: int) -> Floats:
-        """(count, P) draws of the posterior, unconstrained: the more even the weights, the fewer occur twice."""
-        return self.positions[_chosen(self.log_weights, generator, count)]
+        """(count, P) draws of the posterior, unconstrained: the more even the weights, the fewer occur twice.
+
+        Unreliable weights are made more even: draws then spread more widely than the posterior, rather than all be one.
+        """
+        weights = self.log_weights if self.shape < UNRELIABLE else _evened(self.log_weights)
+        return self.positions[_chosen(weights, generator, count)]
 
 
 def weighted(
     fit: Fit, draws: int, generator: np.random.RandomState, *, good: float = FINITE, along_ridge: bool = False
 ) -> Weighted:
-    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS`.
+    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS` and the first two.
 
     good: the shape that is enough.
-    along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians.
+    along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians. Else
+        it is tried where the fit's own approximation is unreliable.
     """
     from fits.inference.mixture import Mixture
 
-    mixture = Mixture.of(fit) if along_ridge else None
-    approximation: Approximation | Mixture = mixture or Approximation.of(fit)
-    best = None
-    for _ in range(ROUNDS):
-        found = _drawn(fit, approximation, draws, generator)
-        if best is None or found.shape < best.shape:
-            best = found
-        if best.shape < good or not np.isfinite(found.shape):
+    first = (Mixture.of(fit) if along_ridge else None) or Approximation.of(fit)
+    best = found = _drawn(fit, first, draws, generator)
+    ridge = None if along_ridge or best.shape < UNRELIABLE else Mixture.of(fit)
+    if ridge is not None:
+        found = _drawn(fit, ridge, draws, generator)
+        best = min(found, best, key=_shape)
+    for _ in range(ROUNDS - 1):
+        if best.shape < good or not np.isfinite(found.log_weights).any():
             break
         chosen = _chosen(_evened(found.log_weights), generator, draws)
-        approximation = Mixture.through(found.positions[chosen], generator)
-    assert best is not None
+        found = _drawn(fit, Mixture.through(found.positions[chosen], generator), draws, generator)
+        best = min(found, best, key=_shape)
     return best
+
+
+def _shape(found: Weighted) -> float:
+    return found.shape
 
 
 def _drawn(

@@ -43,14 +43,17 @@ def optimum(
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
-    check: also where a parameter lies on a bound. It takes a hundred steps: what begins at a minimum that was checked
-    goes without. promise: how far it is followed, see `descend`.
+    check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
+    minimum that was checked goes without. promise: how far it is followed, see `descend`.
     """
     best = int(np.argmin([end.cost for end in ends]))
     lowest, improved = ends[best], False
     if solver == "least_squares" and lowest.converged and promise < ROUGHLY and problem.objective == "likelihood":
         lowest = _followed(problem, lowest, promise)
     found = uncertainty(problem, lowest.vector, lowest.cost)
+    if solver == "least_squares" and check and found.without_influence:
+        lowest, lower = _off_the_plateau(problem, lowest, found)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if lower else found
     if solver == "least_squares" and ((check and found.at_bound.any()) or not lowest.converged):
         lowest, improved = polished(problem, lowest)
         found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
@@ -65,6 +68,18 @@ def _followed(problem: Posed, end: End, promise: float) -> End:
     """The end, closer to its minimum."""
     closer = least_squares_end(problem, unit_of(problem, end.vector), False, promise)
     return closer._replace(steps=end.steps + closer.steps) if closer.cost <= end.cost else end
+
+
+def _off_the_plateau(problem: Posed, end: End, found: Uncertainty) -> tuple[End, bool]:
+    """The end, or where it goes on to if what has no influence there, or is at a bound, begins anew; and whether it is.
+
+    No step leads off a plateau: every start may end on one though another minimum is far lower.
+    """
+    stuck = np.isin(problem.names, found.without_influence) | found.at_bound
+    point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, end.vector))
+    other = least_squares_end(problem, point, promise=ROUGHLY)
+    lower = other.cost < end.cost - ROUGHLY
+    return (other._replace(steps=end.steps + other.steps) if lower else end), lower
 
 
 def _on_bounds(problem: Posed, vector: Floats, held: NDArray[np.bool_]) -> Floats:
