@@ -3,7 +3,8 @@
 They come from an approximation of the posterior: that of the fit, and where it will not do one along the fit's ridge.
 How well they stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry
 2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from
-in its place (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907).
+too (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907); the draws of all approximations are weighted
+as those of one (Cornuet, Marin, Mira & Robert 2012, Scand. J. Stat. 39, 798).
 """
 
 from dataclasses import dataclass
@@ -20,14 +21,15 @@ from fits.problem.compiled import in_shares
 if TYPE_CHECKING:
     from fits.inference.mixture import Mixture
 
-FINITE, ROUNDS = 0.5, 4
-"""The Pareto shape below which the variance of weights is finite, and how many approximations are tried for it."""
+FINITE, ROUNDS = 0.5, 3
+"""The Pareto shape below which the variance of weights is finite, and how many mixtures are fitted for it."""
 
 UNRELIABLE = 0.7
 """The Pareto shape above which a part of the posterior may be missing. Below it draws by weight are good enough."""
 
 FEWEST = 50
-"""Draws that a mixture is fitted to are worth at least so many of the posterior; else weights are made more even."""
+"""Weighted draws are worth at least so many of the posterior, or another approximation is tried; those that a mixture
+is fitted to have weights that are made more even until they are."""
 
 SHARE = 50
 """Draws that a core evaluates at a time: however many there are, one program serves."""
@@ -37,12 +39,22 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Weighted:
-    """Draws of an approximation, unconstrained, (D, P), and the logarithms of posterior / approximation there, (D,);
+    """Draws of approximations, unconstrained, (D, P), and the logarithms of posterior / approximation there, (D,);
     shape: of the Pareto tail of the weights: above `UNRELIABLE` a part of the posterior may be missing."""
 
     positions: Floats
     log_weights: Floats
     shape: float
+
+    @property
+    def worth(self) -> float:
+        """How many draws of the posterior they are worth."""
+        total = logsumexp(self.log_weights)
+        return float(np.exp(-logsumexp(2.0 * (self.log_weights - total)))) if np.isfinite(total) else 0.0
+
+    def is_good(self, shape: float) -> bool:
+        """Whether there are enough of them, and their shape is below this."""
+        return self.shape < shape and self.worth >= FEWEST
 
     def resampled(self, generator: np.random.RandomState, count: int) -> Floats:
         """(count, P) draws of the posterior, unconstrained: the more even the weights, the fewer occur twice.
@@ -56,51 +68,59 @@ class Weighted:
 def weighted(
     fit: Fit, draws: int, generator: np.random.RandomState, *, good: float = FINITE, along_ridge: bool = False
 ) -> Weighted:
-    """Draws for a fit of a likelihood: of the approximation with the lowest shape, of up to `ROUNDS` and the first two.
+    """Draws for a fit of a likelihood: as many of each of several approximations, until they will do.
 
     good: the shape that is enough.
     along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians. Else
-        it is tried where the fit's own approximation is unreliable.
+        it is asked for where the fit's own approximation will not do.
     """
     from fits.inference.mixture import Mixture
 
-    first = (Mixture.of(fit) if along_ridge else None) or Approximation.of(fit)
-    best = found = _drawn(fit, first, draws, generator)
-    ridge = None if along_ridge or best.shape < UNRELIABLE else Mixture.of(fit)
-    if ridge is not None:
-        found = _drawn(fit, ridge, draws, generator)
-        best = min(found, best, key=_shape)
-    for _ in range(ROUNDS - 1):
-        if best.shape < good or not np.isfinite(found.log_weights).any():
+    ridge = Mixture.of(fit) if along_ridge else None
+    pool = _Pool(fit, draws, generator)
+    found = pool.add(ridge or Approximation.of(fit))
+    if not along_ridge and not found.is_good(UNRELIABLE) and (ridge := Mixture.of(fit)) is not None:
+        found = pool.add(ridge)
+    for _ in range(ROUNDS):
+        if found.is_good(good) or not np.isfinite(found.log_weights).any():
             break
         chosen = _chosen(_evened(found.log_weights), generator, draws)
-        found = _drawn(fit, Mixture.through(found.positions[chosen], generator), draws, generator)
-        best = min(found, best, key=_shape)
-    return best
+        found = pool.add(Mixture.through(found.positions[chosen], generator))
+    return found
 
 
-def _shape(found: Weighted) -> float:
-    return found.shape
+class _Pool:
+    """Draws of several approximations, weighted as those of the mixture of all."""
 
+    def __init__(self, fit: Fit, draws: int, generator: np.random.RandomState):
+        self.fit, self.draws, self.generator = fit, draws, generator
+        self.approximations: list[Approximation | Mixture] = []
+        self.positions = np.empty((0, len(fit.vector)))
+        self.inside = np.empty(0, bool)
+        self.heights = np.empty(0)
 
-def _drawn(
-    fit: Fit, approximation: "Approximation | Mixture", draws: int, generator: np.random.RandomState
-) -> Weighted:
-    import arviz
+    def add(self, approximation: "Approximation | Mixture") -> Weighted:
+        """All draws so far, those of this approximation among them."""
+        import arviz
 
-    from fits.inference.ensemble import log_posteriors
+        from fits.inference.ensemble import log_posteriors
 
-    if isinstance(approximation, Approximation):
-        positions, inside = approximation.draw(generator, draws), np.ones(draws, bool)
-    else:
-        positions, inside = approximation.draw_all(generator, draws)
-    (heights,) = in_shares(lambda part: [fit.problem.call(log_posteriors, part)], positions, SHARE)
-    weights = heights - approximation.log_density(positions)
-    weights = np.where(inside & np.isfinite(weights), weights, -np.inf)
-    if not np.isfinite(weights).any():
-        return Weighted(positions, weights, np.inf)
-    _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
-    return Weighted(positions, weights, float(shape))
+        if isinstance(approximation, Approximation):
+            positions, inside = approximation.draw(self.generator, self.draws), np.ones(self.draws, bool)
+        else:
+            positions, inside = approximation.draw_all(self.generator, self.draws)
+        (heights,) = in_shares(lambda part: [self.fit.problem.call(log_posteriors, part)], positions, SHARE)
+        self.approximations.append(approximation)
+        self.positions = np.concatenate([self.positions, positions])
+        self.inside = np.append(self.inside, inside)
+        self.heights = np.append(self.heights, heights)
+        densities = [one.log_density(self.positions) for one in self.approximations]
+        weights = self.heights - (logsumexp(densities, axis=0) - np.log(len(densities)))
+        weights = np.where(self.inside & np.isfinite(weights), weights, -np.inf)
+        if not np.isfinite(weights).any():
+            return Weighted(self.positions, weights, np.inf)
+        _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
+        return Weighted(self.positions, weights, float(shape))
 
 
 def _chosen(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:

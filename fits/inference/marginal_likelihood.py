@@ -37,7 +37,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
 
     Args:
         fit: of a likelihood.
-        draws: of each approximation, of which there are up to four.
+        draws: of each approximation, of which there are up to four (see `weighted`).
         seed: of the draws.
 
     Raises:
@@ -49,5 +49,6 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     total = float(logsumexp(found.log_weights))
     if not np.isfinite(total):
         return Evidence(-np.inf, np.inf, np.inf)
-    relative = np.exp(found.log_weights - total) * draws
-    return Evidence(total - float(np.log(draws)), float(np.std(relative) / np.sqrt(draws)), found.shape)
+    count = len(found.log_weights)
+    relative = np.exp(found.log_weights - total) * count
+    return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), found.shape)

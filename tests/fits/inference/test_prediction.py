@@ -18,7 +18,7 @@ from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reporting.predictions import UNRELIABLE, scores_table
-from tests.helpers.models import COUNT, design, line, line_fit
+from tests.helpers.models import COUNT, design, directions, line, line_fit, measured
 
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
 GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
@@ -160,3 +160,24 @@ def test_bad_requests_are_refused() -> None:
     at = predict(found, slices([30.0]))
     with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
         scores(at, found.problem.data)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.001])
+def test_of_a_product_the_bands_hold_though_its_factors_are_open(sigma) -> None:
+    """The posterior is a hyperbola, the narrower the less noise there is, far from what a fit's covariance tells."""
+
+    def product(stack, wi, wo):
+        return (stack["a"] * stack["b"] * (1.0 + 0.5 * wo[:, 2]))[:, None]
+
+    exact = np.asarray(product({"a": 2.0, "b": 0.45}, directions(100, 1), directions(100, 2)))
+    noise = sigma * np.random.default_rng(0).standard_normal(exact.shape)
+    data = measured(exact + noise, sigma)
+    found = fit({"a": Free(1.0, 0.1, 10.0), "b": Free(0.9, 0.0, 10.0)}, data, transport=product, starts=4)
+    at = predict(found, data, draws=1000)
+    expected = exact[:, 0] * sigma / np.sqrt(np.sum(exact**2))
+    ratio = at.model.sd[:, 0] / expected
+    # weights that are reliable are worth some hundred draws, 4 standard errors of whose deviation are 0.2; others make
+    # bands wider, never narrower
+    assert np.all(ratio > 0.8)
+    assert np.all(ratio < (1.2 if at.reliable else 10.0))
+    assert np.all(np.abs(at.model.mean - found.predicted)[:, 0] < at.model.sd[:, 0])

@@ -8,12 +8,17 @@ import pytest
 
 import layerjax as lj
 from fits.data.formats import read
+from fits.data.geometry import slices
 from fits.inference import starts as starts_module
 from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import ENDED
 from fits.inference.optimise import fit
 from fits.inference.starts import WORTH, run_starts
+from fits.problem.likelihood import Noise
+from fits.problem.parameters import Free
+from fits.problem.priors import LogUniform
 from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
 from tests.helpers.models import LOBE, LOBE_STACK, directions, lobe, measured, noisy_lobe
 from tests.helpers.places import EXAMPLES
@@ -113,3 +118,17 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
     assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)
+
+
+def test_a_fit_does_not_end_on_a_plateau():
+    """Of backward scattering `Statistical` knows nothing: the only start comes to rest where g is below 0."""
+    noise = Noise(relative=0.02, floor=1e-6, correlated=False)
+    haze, metal = lj.Medium(0.84, 1.0, lj.HenyeyGreenstein(0.13)), lj.Conductor(0.4, 3.2, 0.37)
+    data = simulate(lj.Stack([haze], metal), slices([10.0, 30.0, 50.0, 70.0]), lj.Statistical(), 0.02, 1e-6, seed=1)
+    thickness, index = Free(0.1, 1e-3, 5.0, LogUniform()), Free(1.5, 0.05, 9.0, LogUniform())
+    haze = lj.Medium(thickness, 1.0, lj.HenyeyGreenstein(Free(0.3, -0.6, 0.9)))
+    metal = lj.Conductor(index, Free(0.5, 0.01, 9.0, LogUniform()), Free(0.3, 0.02, 1.0))
+    found = fit(lj.Stack([haze], metal), data, transport=lj.Statistical(), noise=noise, starts=1)
+    truth = {"layers[0].thickness": 0.84, "layers[0].phase.g": 0.13, "base.ior": 0.4, "base.k": 3.2, "base.alpha": 0.37}
+    assert found.minima[0].cost <= cost_at(found.problem, truth)
+    assert not found.without_influence
