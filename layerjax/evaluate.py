@@ -22,7 +22,7 @@ from layerjax._numerics import horizon, safe_div
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
-from layerjax.directions import Vector, read_directions, split
+from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture
 from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
 from layerjax.stack import (
@@ -273,13 +273,17 @@ def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> 
     mixture = _of_parts(mixture) if shape else prepare(mixture, transport)
     wi = jnp.broadcast_to(wi, (*jnp.broadcast_shapes(shape, wi.shape[:-1]), 3))
     draws, choice, values = jax.random.split(key, 3)
-    found = mixture.weighed(lambda part, own: sample(part, wi, own, transport)[0], draws)
+    found = mixture.weighed(lambda part, own: sample(part, wi, own, transport)[:2], draws)
     pick = jax.random.uniform(choice, wi.shape[:-1], wi.dtype)
-    wo, passed = found[0][1], found[0][0]
-    for share, drawn in found[1:]:
+    passed, (wo, own) = found[0]
+    for share, (drawn, density) in found[1:]:
         wo = jnp.where((pick < passed)[..., None], wo, drawn)
+        own = jnp.where(pick < passed, own, density)
         passed = passed + share
-    density = pdf(mixture, wi, wo, transport)
+    # what a part draws that leaves nowhere must not count as a draw of the others
+    leaves = own > 0.0
+    wo = jnp.where(leaves[..., None], wo, jnp.stack(horizontal(split(wo)), axis=-1))
+    density = jnp.where(leaves, pdf(mixture, wi, wo, transport), 0.0)
     value = evaluate(mixture, wi, wo, transport, key=values)
     return wo, density, safe_div(value * jnp.abs(wo[..., 2:]), density[..., None])
 

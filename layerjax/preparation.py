@@ -34,7 +34,8 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
     """Do all the work that no direction is needed for, once.
 
     Args:
-        stack: the layered material; of a mixture each part is prepared, and a mixture of these is returned.
+        stack: the layered material; of a mixture each part is prepared, unless it is, and a mixture of these is
+            returned.
         transport: how light is carried. ``"auto"``: all orders of scattering. `SingleScattering` where nothing
             scatters light twice (a base under media that are known only to absorb), else `AddingDoubling`, which by
             measurement is nearer to the truth than the closed forms of `Statistical`.
@@ -43,7 +44,7 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
     if isinstance(stack, Mixture):
-        return stack.each(lambda part: prepare(part, transport))
+        return stack.each(lambda part: part if isinstance(part, Prepared) else prepare(part, transport))
     return prepare_at(stack, transport, lambda: None)
 
 

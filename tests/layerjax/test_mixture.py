@@ -165,3 +165,19 @@ def test_a_family_of_mixtures_is_no_mixture() -> None:
     family = lj.Mixture({"a": lj.Stack([], lj.Lambertian(free)), "b": PAINT}, [free, None])
     with pytest.raises(ValueError, match=r"a.base.albedo, weights.a not given a value"):
         lj.evaluate(family, WI, WO)
+
+
+@pytest.mark.parametrize("height", [-0.84, 0.84])
+def test_draws_are_those_of_the_albedo(height: float) -> None:
+    """From below one part reflects nothing: what is drawn of it must not count for the other. Prepared or not."""
+    mixed = lj.Mixture(
+        {"paint": lj.Stack([], lj.Lambertian(0.4)), "veil": lj.Stack([lj.Medium(0.5, 0.5)])}, [0.3, None]
+    )
+    count = 40_000
+    wi = jnp.broadcast_to(jnp.array([np.sqrt(1.0 - height**2), 0.0, height]), (count, 3))
+    wo, density, weight = lj.sample(mixed, wi, jax.random.key(0), lj.SingleScattering())
+    expected = sum(lj.albedo(mixed, wi[0], lj.SingleScattering()))
+    assert abs(weight.mean() - expected[0]) < 4.0 * weight.std() / np.sqrt(count)
+    again = lj.sample(lj.prepare(mixed, lj.SingleScattering()), wi, jax.random.key(0))
+    for one, other in zip(again, (wo, density, weight), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
