@@ -48,6 +48,7 @@ PACKAGES = [
     "layerjax.maps",
     "layerjax.preparation",
     "layerjax.evaluate",
+    "layerjax.mitsuba",
     "layerjax",
     "layerjax.precompute",
     "fits._files",
@@ -112,8 +113,8 @@ def test_imports_point_downward(path):
 
 @pytest.mark.parametrize("path", sources("layerjax"), ids=module_name)
 def test_layerjax_needs_jax_equinox_and_numpy_alone(path):
-    trains = {"optax"} if module_name(path) == "layerjax.precompute.learning" else set()  # inside a function there
-    known = {*sys.stdlib_module_names, "jax", "equinox", "numpy", "layerjax", *trains}
+    more = {"layerjax.precompute.learning": {"optax"}, "layerjax.mitsuba": {"mitsuba", "drjit"}}  # by extras
+    known = {*sys.stdlib_module_names, "jax", "equinox", "numpy", "layerjax", *more.get(module_name(path), ())}
     assert {name.split(".")[0] for name in imported(path)} <= known
 
 

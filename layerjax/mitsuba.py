@@ -1,0 +1,327 @@
+"""A BSDF plugin for Mitsuba 3: any stack, by any transport, with derivatives with respect to its numbers.
+
+Importing this module registers the plugin "layerjax" for the variant that is set, ``llvm_ad`` or ``cuda_ad`` in rgb or
+mono (import it after `mi.set_variant`, and call `register` after another). From then on Dr.Jit evaluates calls and
+loops as they come: JAX needs numbers, where a symbolic call has none to give.
+
+Needs the extra ``mitsuba``. Values are as Mitsuba has them, with the cosine; where radiance is carried its wi points to
+the viewer, and wo to the light.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, reduce
+from operator import or_
+from typing import Any
+
+import drjit as dr
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mitsuba as mi
+import numpy as np
+from jax import Array
+
+from layerjax import gallery
+from layerjax._parameters import leaves_with_names
+from layerjax._shapes import map_shape
+from layerjax.evaluate import evaluate, pdf, sample, unscattered
+from layerjax.mixture import Mixture, stacks_of
+from layerjax.preparation import choose_transport, prepare
+from layerjax.stack import Interface, Stack, require_numbers
+
+NAME = "layerjax"
+BATCHES = (1 << 8, 1 << 12, 1 << 16)
+"""Batches are filled up to one of these sizes, or to several of the last: each is compiled, and every bounce has
+another number of rays."""
+
+materials: dict[str, tuple[Stack | Mixture, Any]] = {}
+"""Stacks and their transports by the name that scenes have for them in ``material``, besides those of the gallery."""
+
+
+def bsdf(stack: Stack | Mixture, transport: Any = "auto", id: str = "layerjax") -> Any:
+    """A Mitsuba BSDF of a stack, for the dictionary of a scene.
+
+    Args:
+        stack: of 1 channel, or 3 (rgb variants); no map. It is lit and seen from both sides.
+        transport: see `layerjax.prepare`.
+        id: how names of its numbers begin in `mi.traverse`, such as ``coat.layers[0].alpha``.
+
+    Raises:
+        ValueError: a map, channels or a placeholder that it cannot take; or as `layerjax.prepare`.
+    """
+    properties = mi.Properties(NAME)
+    properties.set_id(id)
+    return _plugin(mi.variant())(properties, Material(stack, transport))
+
+
+def register() -> None:
+    """Register the plugin for the variant of Mitsuba that is set.
+
+    Raises:
+        ValueError: none is set, one without derivatives, a spectral or a polarized one.
+    """
+    variant = mi.variant() or "None"
+    if not variant.startswith(("llvm_ad_", "cuda_ad_")) or "spectral" in variant or "polarized" in variant:
+        raise ValueError(f"mitsuba: the variant is {variant}; it must be llvm_ad or cuda_ad, in rgb or mono")
+    for flag in (dr.JitFlag.SymbolicCalls, dr.JitFlag.SymbolicLoops):
+        dr.set_flag(flag, False)
+    mi.register_bsdf(NAME, _plugin(variant))
+
+
+class Material:
+    """A stack as the plugin holds it. numbers: arrays of Dr.Jit, by the names that `mi.traverse` shows."""
+
+    def __init__(self, stack: Stack | Mixture, transport: Any):
+        require_numbers(stack)
+        if map_shape(stack):
+            raise ValueError(f"mitsuba: the stack is a map of shape {map_shape(stack)}; it must be a single one")
+        self.colours = 1 if "_mono" in mi.variant() else 3
+        if stack.channels not in (1, self.colours):
+            raise ValueError(f"mitsuba: the stack has {stack.channels} channels, {mi.variant()} takes {self.colours}")
+        self.transport = choose_transport(stack, transport)
+        self.numbers = {name: _array(name, leaf) for name, leaf in leaves_with_names(stack)}
+        self._take(stack)
+        self.is_random = self.transport.random
+        parts = stacks_of(stack)
+        self.is_open = any(part.base is None for part in parts)
+        self.has_null = any(_has_null(part) for part in parts)
+        interfaces = [layer.ior for part in parts for layer in part.layers if isinstance(layer, Interface)]
+        self.eta = float(interfaces[-1]) if self.is_open and interfaces else 1.0
+
+    def _take(self, stack: Stack | Mixture) -> None:
+        self.stack, self.prepared = stack, prepare(stack, self.transport)
+
+    def update(self) -> None:
+        """Take over numbers that were changed.
+
+        Raises:
+            ValueError: one is out of its range.
+        """
+        found = self.with_numbers({name: jnp.asarray(np.array(value)) for name, value in self.numbers.items()})
+        _check(found)
+        self._take(found)
+
+    def with_numbers(self, values: dict[str, Array]) -> Any:
+        """The stack with these numbers, each in the shape that it has there, and its own where there is none."""
+        leaves = [jnp.reshape(values.get(name, leaf), leaf.shape) for name, leaf in leaves_with_names(self.stack)]
+        return jax.tree.unflatten(jax.tree.structure(self.stack), leaves)
+
+    def value(self, light: Any, viewer: Any, place: Any) -> Any:
+        """The BSDF in 1/sr without the cosine, a spectrum; place: what the key of a random transport is made of too."""
+
+        def found(numbers: Any, light: Any, viewer: Any, *place: Any) -> tuple[Array, ...]:
+            key = _key(light, viewer, *place) if self.is_random else None
+            if numbers:
+                values = evaluate(self.with_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
+            else:
+                values = evaluate(self.prepared, _rows(light), _rows(viewer), key=key)
+            return self._by_colour(values)
+
+        places = [place] if self.is_random and dr.width(place) else []
+        return mi.Spectrum(*_called(found, self._varying(), light, viewer, *places))
+
+    def passing(self, wi: Any) -> Any:
+        """Share of the light that passes without being scattered, a spectrum."""
+
+        def found(numbers: Any, wi: Any) -> tuple[Array, ...]:
+            return self._by_colour(unscattered(self.with_numbers(numbers), _rows(wi)))
+
+        return mi.Spectrum(*_called(found, self._varying(), wi))
+
+    def density(self, wi: Any, wo: Any) -> Any:
+        """Of `draw`, in 1/sr, without derivatives."""
+
+        def found(_: Any, wi: Any, wo: Any) -> tuple[Array, ...]:
+            return (pdf(self.prepared, _rows(wi), _rows(wo)),)
+
+        return _called(found, {}, dr.detach(wi), dr.detach(wo))[0]
+
+    def draw(self, wi: Any, uniform: Any) -> tuple[Any, Any]:
+        """Directions and their densities, without derivatives; uniform: numbers that the key is made of."""
+
+        def found(_: Any, wi: Any, uniform: Any) -> tuple[Array, ...]:
+            wo, density, _ = sample(self.prepared, _rows(wi), _key(wi, uniform))
+            return (*wo.T, density)
+
+        *wo, density = _called(found, {}, dr.detach(wi), dr.detach(uniform))
+        return mi.Vector3f(*wo), density
+
+    def _varying(self) -> dict[str, Any]:
+        """The numbers that derivatives are asked for."""
+        return {name: number for name, number in self.numbers.items() if dr.grad_enabled(number)}
+
+    def _by_colour(self, values: Array) -> tuple[Array, ...]:
+        return tuple(jnp.broadcast_to(values, (*values.shape[:-1], self.colours)).T)
+
+
+@cache
+def _plugin(variant: str) -> type:
+    """The class for this variant, which is that which is set."""
+
+    class Layered(mi.BSDF):
+        def __init__(self, properties: Any, material: Material | None = None):
+            mi.BSDF.__init__(self, properties)
+            self.material = _asked_for(properties) if material is None else material
+            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            kinds = [mi.BSDFFlags.GlossyReflection | sides]
+            kinds += [mi.BSDFFlags.GlossyTransmission | sides] if self.material.is_open else []
+            kinds += [mi.BSDFFlags.Null | sides] if self.material.has_null else []
+            self.m_components, self.m_flags = kinds, reduce(or_, kinds)
+
+        def traverse(self, callback: Any) -> None:
+            for name, number in self.material.numbers.items():
+                callback.put(name, number, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Any) -> None:
+            self.material.update()
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            return _sample(self.material, ctx, si, sample1, sample2, active)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return _evaluate(self.material, ctx, si, wo, active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return _both(self.material, ctx, si, wo, active)[1]
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            return _both(self.material, ctx, si, wo, active)
+
+        def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
+            share = self.material.passing(si.wi) if self.material.has_null else mi.Spectrum(0.0)
+            return dr.select(active, share, 0.0)
+
+        def to_string(self) -> str:
+            return f"{NAME}[{self.material.stack}, {self.material.transport}]"
+
+    return Layered
+
+
+def _asked_for(properties: Any) -> Material:
+    """The material that a scene names."""
+    name = properties.get("material", "")
+    if name not in (*materials, *gallery.names()):
+        known = ", ".join((*materials, *gallery.names()))
+        raise ValueError(f"material: {name!r} is neither in layerjax.mitsuba.materials nor in the gallery: {known}")
+    return Material(*(materials[name] if name in materials else (gallery.stack(name), "auto")))
+
+
+def _evaluate(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+    light, viewer = (wo, si.wi) if ctx.mode == mi.TransportMode.Radiance else (si.wi, wo)
+    active = active & _is_asked_for(material, ctx, si.wi, wo)
+    value = material.value(light, viewer, si.p) * dr.abs(mi.Frame3f.cos_theta(wo))
+    return dr.select(active, value, 0.0)
+
+
+def _both(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[Any, Any]:
+    """Value and density. Where light cannot go there is none of either: what is drawn there counts as not drawn."""
+    value = _evaluate(material, ctx, si, wo, active)
+    density = material.density(si.wi, wo) * (1.0 - _share_of_null(material, ctx, si))
+    active = active & _is_asked_for(material, ctx, si.wi, wo) & (material.is_random | (dr.max(value) > 0.0))
+    return value, dr.select(active, density, 0.0)
+
+
+def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any) -> tuple[Any, Any]:
+    """Directions are drawn without derivatives, and the value over their density has those of the value."""
+    null = _share_of_null(material, ctx, si)
+    wo, density = material.draw(si.wi, mi.Vector3f(sample1, *sample2))
+    density *= 1.0 - null
+    value = dr.select(density > 0.0, _evaluate(material, ctx, si, wo, active) / density, 0.0)
+    drawn = mi.BSDFSample3f(wo)
+    drawn.pdf = density
+    passes = wo.z * si.wi.z < 0.0
+    down = dr.select(si.wi.z > 0.0, material.eta, 1.0 / material.eta)
+    drawn.eta = dr.select(passes, down, 1.0)
+    glossy = dr.select(passes, +mi.BSDFFlags.GlossyTransmission, +mi.BSDFFlags.GlossyReflection)
+    drawn.sampled_type, drawn.sampled_component = mi.UInt32(glossy), dr.select(passes, mi.UInt32(1), mi.UInt32(0))
+    if material.has_null:
+        straight = sample1 < null
+        drawn.wo = dr.select(straight, -si.wi, drawn.wo)
+        drawn.pdf = dr.select(straight, null, drawn.pdf)
+        drawn.eta = dr.select(straight, 1.0, drawn.eta)
+        drawn.sampled_type = dr.select(straight, +mi.BSDFFlags.Null, drawn.sampled_type)
+        drawn.sampled_component = dr.select(straight, mi.UInt32(2), drawn.sampled_component)
+        value = dr.select(straight, material.passing(si.wi) / null, value)
+    drawn.pdf = dr.select(active, drawn.pdf, 0.0)
+    return drawn, dr.select(active & (drawn.pdf > 0.0), value, 0.0)
+
+
+def _is_asked_for(material: Material, ctx: Any, wi: Any, wo: Any) -> Any:
+    """Whether a context asks for light that is scattered from wi to wo."""
+    reflects = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
+    passes = material.is_open and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
+    return dr.select(wi.z * wo.z > 0.0, mi.Bool(reflects), mi.Bool(passes))
+
+
+def _share_of_null(material: Material, ctx: Any, si: Any) -> Any:
+    """How often light is drawn that passes straight."""
+    if not (material.has_null and ctx.is_enabled(mi.BSDFFlags.Null, 2)):
+        return mi.Float(0.0)
+    if not (ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) or ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)):
+        return mi.Float(1.0)
+    return dr.detach(dr.mean(material.passing(si.wi)))
+
+
+def _called(function: Callable[..., tuple[Array, ...]], numbers: dict[str, Any], *batches: Any) -> list[Any]:
+    """What a function of numbers and batches of vectors, lists of three arrays (N,), gives: arrays (N,)."""
+    if dr.flag(dr.JitFlag.SymbolicScope):
+        raise ValueError(
+            "mitsuba: a symbolic call; layerjax.mitsuba.register() turns calls and loops to evaluated ones"
+        )
+    count = max(dr.width(batch) for batch in batches)
+    size = next((size for size in BATCHES if size >= count), BATCHES[-1])
+    padded = -(-count // size) * size
+    place = dr.arange(mi.UInt32, padded)
+    filled = [[dr.gather(mi.Float, part, place % dr.width(part)) for part in batch] for batch in batches]
+
+    @dr.wrap(source="drjit", target="jax")
+    def wrapped(values: list[Array], *filled: list[Array]) -> tuple[Array, ...]:
+        given = dict(zip(numbers, values, strict=True))  # a dict on its way would be sorted
+        found = [
+            function(given, *([part[first : first + size] for part in batch] for batch in filled))
+            for first in range(0, padded, size)
+        ]
+        return tuple(jnp.concatenate(parts) for parts in zip(*found, strict=True))
+
+    found = wrapped(list(numbers.values()), *filled)
+    return [dr.gather(mi.Float, one.array, dr.arange(mi.UInt32, count)) for one in found]
+
+
+def _rows(vector: list[Array]) -> Array:
+    return jnp.stack(vector, axis=-1)
+
+
+def _key(*batches: list[Array]) -> Array:
+    """A random key of all bits of some numbers."""
+    bits = [jax.lax.bitcast_convert_type(jax.lax.stop_gradient(part), jnp.uint32) for one in batches for part in one]
+    seed = sum(jnp.sum(part, dtype=jnp.uint32) * jnp.uint32(2 * place + 1) for place, part in enumerate(bits))
+    return jax.random.key(seed)
+
+
+def _array(name: str, leaf: Array) -> Any:
+    """A number as Dr.Jit has it: one, or three, of a colour or an axis."""
+    kind = mi.Float if leaf.size == 1 else mi.Vector3f if name.endswith("axis") else mi.Color3f
+    return kind(*(float(number) for number in np.ravel(leaf)))
+
+
+def _has_null(stack: Stack) -> bool:
+    return stack.base is None and not any(isinstance(layer, Interface) for layer in stack.layers)
+
+
+def _check(module: Any) -> None:
+    """Refuse numbers out of range, as on construction."""
+    for field in dataclasses.fields(module):
+        value = getattr(module, field.name)
+        if "converter" in field.metadata:
+            field.metadata["converter"](value)
+        parts = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
+        for part in parts:
+            if isinstance(part, eqx.Module):
+                _check(part)
+    if hasattr(module, "__check_init__"):
+        module.__check_init__()
+
+
+if mi.variant() is not None:
+    register()
