@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from fits.problem.stack_file import read_problem as read_problem
     from fits.problem.stack_file import write_problem as write_problem
     from fits.reporting.html import report as report
+    from fits.reporting.render import render as render
     from fits.reporting.results import load_fit as load_fit
     from fits.reporting.results import load_posterior as load_posterior
     from fits.reporting.results import save_fit as save_fit
@@ -107,6 +108,7 @@ _HOMES = {
     "read_library": "structures.library",
     "leave_out": "inference.left_out",
     "Problem": "problem.problem",
+    "render": "reporting.render",
     "report": "reporting.html",
     "load_fit": "reporting.results",
     "load_posterior": "reporting.results",

@@ -14,3 +14,12 @@ def names_from(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
         return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
 
     return found
+
+
+def shown_by(function: str, of: Any) -> Any:
+    """`function` of what is above, such as ``"fits.reporting.notebook:fit_fragment"``, of this result.
+
+    Results know only by name what shows them: packages import downward, and a result that is not shown costs nothing.
+    """
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)(of)

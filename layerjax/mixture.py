@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from html import escape
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._drawn import below_each_other
 from layerjax._parameters import RANGES, Parameter, check_range, floating, is_placeholder
 from layerjax._shapes import Shape, axes_of_map, channel_count, map_shape
+from layerjax._shown import Shown, in_words
 from layerjax.stack import Stack
 
 WEIGHTS = "Mixture.weights"
@@ -25,7 +28,7 @@ _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")
 
 
-class Mixture(eqx.Module):
+class Mixture(Shown):
     """Stacks side by side, each covering a share of the area; no light passes from one to another.
 
     It stands wherever a `Stack` may. Its BSDF, albedo and what passes unscattered are the means of those of its parts;
@@ -65,6 +68,13 @@ class Mixture(eqx.Module):
     def channels(self) -> int:
         """Number of channels C of the values."""
         return channel_count(self)
+
+    def _repr_html_(self) -> str:
+        heads = [f"{name}: {_share_words(self.weights[name])}" for name in self.parts]
+        shown = [
+            part._repr_html_() if hasattr(part, "_repr_html_") else escape(repr(part)) for part in self.parts.values()
+        ]
+        return below_each_other(list(zip(heads, shown, strict=True)))
 
     def shares(self) -> dict[str, Array]:
         """Weights by name, that which is None worked out."""
@@ -121,6 +131,10 @@ def _by_name(parts: Mapping[str, Any], weights: Any) -> dict[str, Any]:
     if len(given) != len(parts) or not given:
         raise ValueError(f"{WEIGHTS}: {len(given)} given for {len(parts)} parts; each part must have one")
     return dict(zip(parts, given, strict=True))
+
+
+def _share_words(weight: Any) -> str:
+    return "the rest of the area" if weight is None else f"{in_words(weight, 4)} of the area"
 
 
 def _weight(name: str, value: Any) -> Any:

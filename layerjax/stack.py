@@ -12,8 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from layerjax._drawn import Row, picture
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
 from layerjax._shapes import channel_count
+from layerjax._shown import Shown, described
 from layerjax.channels import Channels, per_channel
 from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
@@ -21,7 +23,7 @@ from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Surface
 
 
-class Interface(eqx.Module):
+class Interface(Shown):
     """Rough dielectric interface of microfacets.
 
     ============ ====== ========== ======= ==========================================================================
@@ -42,7 +44,7 @@ class Interface(eqx.Module):
         check_facets("Interface", self.distribution, self.alpha)
 
 
-class Medium(eqx.Module):
+class Medium(Shown):
     """Plane-parallel medium that absorbs and scatters.
 
     ========= ====== ================== ================ ==========================================================
@@ -67,7 +69,7 @@ class Medium(eqx.Module):
         _check_phase("Medium", self.phase)
 
 
-class TurbidMedium(eqx.Module):
+class TurbidMedium(Shown):
     """A `Medium` by its thickness and its coefficients, as tissue and pigments are measured.
 
     ============ ====== ========== ======= ===========================================================================
@@ -108,7 +110,7 @@ def _check_phase(owner: str, phase: Any) -> None:
         raise ValueError(f"{owner}.phase: {phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction")
 
 
-class Stack(eqx.Module):
+class Stack(Shown):
     """Layers from top to bottom over a base.
 
     Numbers of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for every texel: see `layerjax._shapes` for how
@@ -142,6 +144,15 @@ class Stack(eqx.Module):
     def channels(self) -> int:
         """Number of channels C of the stack's values."""
         return channel_count(self)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            Row("interface" if isinstance(layer, Interface) else "medium", type(layer).__name__, described(layer))
+            for layer in self.layers
+        ]
+        last = "no base: light passes" if self.base is None else type(self.base).__name__
+        rows.append(Row("nothing" if self.base is None else "base", last, described(self.base)))
+        return picture(rows, f"A stack, from top to bottom: {', '.join(row.name for row in rows)}")
 
 
 def require_numbers(stack: Any) -> None:

@@ -20,6 +20,8 @@ PACKAGES = [
     "layerjax._numerics",
     "layerjax._parameters",
     "layerjax._shapes",
+    "layerjax._shown",
+    "layerjax._drawn",
     "layerjax.channels",
     "layerjax.directions",
     "layerjax._devices",

@@ -54,6 +54,9 @@ class Geometry(Pairs):
     wi: Floats
     wo: Floats
 
+    def __repr__(self) -> str:
+        return f"<Geometry: {len(self):,} pairs of directions>"
+
 
 def direction(theta: ArrayLike, phi: ArrayLike) -> Floats:
     """Unit vectors (..., 3) from polar angle and azimuth in degrees; a negative theta tilts to the opposite azimuth."""

@@ -85,6 +85,12 @@ class Measurements(Pairs):
             if (self.sigma[self.mask] == 0).any():
                 raise ValueError("sigma is 0 in a sample that is used, must be > 0 (sigma=None where it is unknown)")
 
+    def __repr__(self) -> str:
+        masked = int((~self.mask).sum())
+        left_out = f", {masked:,} of them masked" if masked else ""
+        name = self.source.path or f"{self.source.format} data"
+        return f"<Measurements: {len(self):,} readings{left_out}, of {', '.join(self.channels)}, from {name}>"
+
     def used(self) -> "Measurements":
         """Only the samples that take part in fits."""
         keep = self.mask

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from fits._lazy import shown_by
 from fits.inference.fit_result import Fit
 from fits.inference.foresight import Foresight, foresights
 from fits.inference.posterior import Posterior
@@ -63,6 +64,9 @@ class Comparison:
     sorted_by: str
     verdict: tuple[str, ...]
     notes: tuple[str, ...]
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("fits.reporting.notebook:comparison_fragment", self))
 
 
 def compare(

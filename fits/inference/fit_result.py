@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits._lazy import shown_by
 from fits.inference.identifiability import Combination
 from fits.problem.problem import Problem
 
@@ -101,6 +102,15 @@ class Fit:
     alone: Alone | None = None
     alone_parts: Mapping[str, Alone] = field(default_factory=dict)
     within: "tuple[Fit, str] | None" = None
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
+        )
+        return f"<Fit to {self.problem.count} readings: {values}; {self.status}>"
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("fits.reporting.notebook:fit_fragment", self))
 
     def part(self, name: str = "") -> "Fit":
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.

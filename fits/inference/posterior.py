@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from fits._lazy import shown_by
 from fits.inference.chain import MemoryChain
 from fits.inference.fit_result import Fit
 from fits.inference.length import BURN_IN, LONG_ENOUGH, STEADY, autocorrelation_times, long_enough
@@ -48,6 +49,14 @@ class Posterior:
     allow_short: bool = False
     status: str = ""
     divergences: int = 0
+
+    def __repr__(self) -> str:
+        steps, walkers = self.chain.shape[:2]
+        ended = "converged" if self.converged else "too short"
+        return f"<Posterior of {', '.join(self.names)}: {steps} steps of {walkers} walkers, {ended}>"
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("fits.reporting.notebook:posterior_fragment", self))
 
     def part(self, name: str) -> "Posterior":
         """What the posterior of a `Joint` says of one measurement. ValueError for a name that none has."""

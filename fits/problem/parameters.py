@@ -83,6 +83,12 @@ class Free:
         """() or (C,)."""
         return self.arrays()[0].shape
 
+    def __repr__(self) -> str:
+        words = [repr(value) for value in (self.start, self.low, self.high)]
+        words += [] if self.prior == Uniform() else [repr(self.prior)]
+        words += [] if self.smooth is None else [f"smooth={self.smooth!r}"]
+        return f"Free({', '.join(words)})"
+
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`start`, `low`, `high` at their common shape."""
         try:

@@ -15,10 +15,11 @@ import layerjax as lj
 from fits.problem.parameters import Free, is_free
 from fits.problem.values import shown
 from layerjax._parameters import PER_CHANNEL
+from layerjax._shown import Shown
 from layerjax.mixture import stacks_by_name
 
 
-class PowerLaw(eqx.Module):
+class PowerLaw(Shown):
     """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
 
     amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of

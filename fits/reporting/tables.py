@@ -174,7 +174,7 @@ def unresolved_table(fit: "Fit") -> Table:
 
 
 def posterior_table(posterior: "Posterior") -> Table:
-    """Median, 68 % interval, mean, autocorrelation time and effective sample size of each parameter."""
+    """Median, 68 % interval, mean, unit, autocorrelation time and effective sample size of each parameter."""
     summary = posterior.summary()
     time, effective = (
         np.ravel(posterior.autocorrelation_time),
@@ -185,8 +185,9 @@ def posterior_table(posterior: "Posterior") -> Table:
         median, low, high, mean, deviation = summary[name]
         width = (high - low) / 2.0
         words = (with_error(number, width)[0] for number in (median, low, high, mean))
-        rows.append((name, *words, f"{deviation:.2g}", f"{time[index]:.0f}", f"{effective[index]:.0f}"))
-    columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "autocorr. steps", "effective samples")
+        unit = posterior.fit.units[name]
+        rows.append((name, *words, f"{deviation:.2g}", unit, f"{time[index]:.0f}", f"{effective[index]:.0f}"))
+    columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "unit", "autocorr. steps", "effective samples")
     return Table("Posterior", columns, tuple(rows))
 
 

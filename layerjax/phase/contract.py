@@ -3,11 +3,11 @@
 import abc
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
 from layerjax._parameters import Parameter
+from layerjax._shown import Shown
 from layerjax.directions import Vector, add, combine, frame, scale
 from layerjax.normals.sggx import Kind
 from layerjax.quadrature import Rule, sphere_rule
@@ -21,7 +21,7 @@ class Flakes(NamedTuple):
     axis: Parameter
 
 
-class PhaseFunction(eqx.Module):
+class PhaseFunction(Shown):
     """Where a collision sends the light: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
 
     Directions come as components that point away from the collision (see `layerjax.directions`): light that goes

@@ -2,14 +2,14 @@
 
 import abc
 
-import equinox as eqx
 from jax import Array
 
+from layerjax._shown import Shown
 from layerjax.directions import Vector
 from layerjax.quadrature import Nodes, hemisphere_rule
 
 
-class Surface(eqx.Module):
+class Surface(Shown):
     """An opaque surface, lit and seen from above.
 
     Directions come as components (see `layerjax.directions`); callers guarantee that their z is positive. Values are
