@@ -6,7 +6,10 @@ from typing import Any
 from fits.cli.numbers import angle, count
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "klems", "fred")
+FORMATS = (
+    *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
+    *("fred", "astm", "pab", "alta", "speos", "ssdd"),
+)
 EXPORTS = ("rgl", "merl", "zemax", "klems", "csv")
 STRATA = ("bins", "flux")
 

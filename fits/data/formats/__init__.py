@@ -3,23 +3,55 @@
 `read` takes any of them, looks at the content first and at the name last, and gives `fits.Measurements`.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from fits.data.formats import csv, fred, merl, rgl, rxt, totals_csv, window_xml, zemax
+from fits.data.formats import (
+    alta,
+    astm,
+    csv,
+    fred,
+    lighttools,
+    merl,
+    pab,
+    rgl,
+    rxt,
+    speos,
+    ssdd,
+    totals_csv,
+    window_xml,
+    zemax,
+)
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, Quantity, check_quantity
 
-FORMATS = ("csv", "totals", "rxt", "merl", "rgl", "zemax", "klems", "fred")
+FORMATS = (
+    *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
+    *("fred", "astm", "pab", "alta", "speos", "ssdd"),
+)
+
+_TOLD: dict[str, Callable[[Path, Quantity], Measurements]] = {  # what they hold is told, or else the BSDF
+    "zemax": zemax.read,
+    "lighttools": lighttools.read,
+    "fred": fred.read,
+    "astm": astm.read,
+}
+_SAYING: dict[str, Callable[[Path], Measurements]] = {  # the file says what it holds
+    "klems": window_xml.read,
+    "tensortree": window_xml.read,
+    "pab": pab.read,
+    "alta": alta.read,
+    "speos": speos.read,
+    "ssdd": ssdd.read,
+}
 
 _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but have no reader here
     b"\x89HDF": "an HDF5 file",
     b"PK\x03\x04": "a zip archive (a spreadsheet?)",
     b"\xd0\xcf\x11\xe0": "an old Excel workbook",
-    b"LightTools": "a LightTools BSDF",
-    b"OPTIS": "an OPTIS (Speos) BSDF",
 }
 
 
@@ -34,15 +66,16 @@ def read(
     strata: Strata = "bins",
     seed: int = 0,
 ) -> Measurements:
-    """Read a measurement file: CSV, MERL binary, RGL tensor file, Zemax BSDF, WINDOW XML, FRED text, or iad's ``.rxt``.
+    """Read a measurement file: CSV, MERL, RGL, Zemax, LightTools, Speos, WINDOW XML, FRED, ASTM, pab, ALTA, SSDD, iad.
 
     Args:
         path: the file.
         format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
-            `read_slab`), "merl", "rgl", "zemax", "klems" or "fred"; None finds out from the content.
+            `read_slab`), "merl", "rgl", "zemax", "lighttools", "klems" and "tensortree" (both are XML of WINDOW and
+            Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
-            "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax and
-            FRED files hold "brdf" unless this says otherwise.
+            "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; all others say what they hold.
         geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
             directions at which the file has values.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
@@ -95,14 +128,13 @@ def _read_as(
         if checked not in (None, "brdf_cos"):
             raise ValueError(f"{path}: quantity is {checked!r}, an RGL file always holds 'brdf_cos'")
         return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
-    if kind == "zemax":
-        return zemax.read(path, checked or "brdf")
-    if kind == "klems":
-        if checked not in (None, "brdf"):
-            raise ValueError(f"{path}: quantity is {checked!r}, matrices of WINDOW always hold 'brdf'")
-        return window_xml.read(path)
-    if kind == "fred":
-        return fred.read(path, checked or "brdf")
+    if kind in _TOLD:
+        return _TOLD[kind](path, checked or "brdf")
+    if kind in _SAYING:
+        found = _SAYING[kind](path)
+        if checked not in (None, found.source.quantity):
+            raise ValueError(f"{path}: quantity is {checked!r}, this {kind} file says {found.source.quantity!r}")
+        return found
     raise ValueError(f"format is {kind!r}, must be one of {', '.join(FORMATS)}")
 
 
@@ -119,21 +151,38 @@ def sniff(path: Path) -> str:
         return "rgl"
     if merl.recognises(head) or path.suffix.lower() == ".binary":
         return "merl"
+    if speos.recognises(head):
+        return "speos"
+    if ssdd.recognises(head):
+        return "ssdd"
     if b"\0" in head:
         raise ValueError(
             f"{path}: unknown binary file, starts with {head[:8].hex(' ')} (formats: {', '.join(FORMATS)})"
         )
-    lines = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
-    lines = [line for line in lines if line and not line.startswith("#")]
+    return _sniff_text(path, head)
+
+
+def _sniff_text(path: Path, head: bytes) -> str:
+    """`sniff` for a file that holds no zero byte."""
+    every = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
+    if alta.recognises(every):
+        return "alta"
+    if pab.recognises(every):
+        return "pab"
+    lines = [line for line in every if line and not line.startswith("#")]
     first = lines[0] if lines else ""
     if first.startswith(rxt.FIRST):
         return "rxt"
     if window_xml.recognises(first):
-        return "klems"
+        return "tensortree" if b"tensortree" in head.lower() else "klems"
     if fred.recognises(first):
         return "fred"
+    if lighttools.recognises(lines):
+        return "lighttools"
     if zemax.recognises(lines):
         return "zemax"
+    if astm.recognises(lines):
+        return "astm"
     if totals_csv.recognises(first):
         return "totals"
     if csv.recognises(first) or path.suffix.lower() in (".csv", ".tsv"):

@@ -4,6 +4,10 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from fits.data.geometry import Floats
+
 ANY_NUMBER = (-math.inf, math.inf)
 
 
@@ -37,13 +41,13 @@ class Line:
         return [self.parse(cell, column, allowed) for column, cell in enumerate(self.text.split(), start=1)]
 
 
-def read_lines(path: Path) -> list[Line]:
-    """All lines of a UTF-8 text file; ValueError for an empty file or one that is not text."""
+def read_lines(path: Path, encoding: str = "utf-8-sig") -> list[Line]:
+    """All lines of a text file; ValueError for an empty file or one that is not text."""
     raw = path.read_bytes()
     if not raw.strip():
         raise ValueError(f"{path}: the file is empty")
     try:
-        text = raw.decode("utf-8-sig")
+        text = raw.decode(encoding)
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
     if "\0" in text:
@@ -54,6 +58,35 @@ def read_lines(path: Path) -> list[Line]:
 def content(lines: list[Line]) -> list[Line]:
     """The lines that are neither blank nor a # comment."""
     return [line for line in lines if line.text.strip() and not line.text.lstrip().startswith("#")]
+
+
+def rows(lines: list[Line], columns: int) -> Floats:
+    """The numbers of all lines, (lines, columns), split at blanks and commas; an error names line and column."""
+    cells = [line.text.replace(",", " ").split() for line in lines]
+    try:
+        numbers = np.array(cells, np.float64)
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape == (len(lines), columns) and np.isfinite(numbers).all():
+        return numbers
+    for line, found in zip(lines, cells, strict=True):  # which one it was
+        if len(found) != columns:
+            raise line.error(f"{plural(len(found), 'number')}, must be {columns}")
+    parsed = [[line.parse(*pair) for pair in _columns(found)] for line, found in zip(lines, cells, strict=True)]
+    return np.array(parsed, np.float64).reshape(-1, columns)
+
+
+def within(lines: list[Line], values: Floats, column: str | int, allowed: tuple[float, float]) -> None:
+    """ValueError at the first of values (lines,) that is out of the closed range `allowed`."""
+    low, high = allowed
+    bad = ~((values >= low) & (values <= high))
+    if bad.any():
+        at = int(np.argmax(bad))
+        raise lines[at].error(f"{values[at]:g} is not allowed, must be a number in [{low:g}, {high:g}]", column)
+
+
+def _columns(cells: list[str]) -> list[tuple[str, int]]:
+    return [(cell, column) for column, cell in enumerate(cells, start=1)]
 
 
 def plural(count: int, noun: str) -> str:

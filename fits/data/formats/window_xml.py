@@ -14,13 +14,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.data.formats import tensor_tree
+from fits.data.formats._window import COME, blocks, layer_of, number_of, text_of
 from fits.data.geometry import Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
 FIRST = ("<?xml", "<WindowElement")
-COME = {"front": 1.0, "back": -1.0}
-"""Of the side that light comes from: the sign of z."""
-
 CHANNELS = {"visible": "Y", "cie-x": "X", "cie-z": "Z"}
 _MOST_PATCHES = 2000
 
@@ -39,41 +38,38 @@ def recognises(first_line: str) -> bool:
 
 
 def read(path: Path) -> Measurements:
-    """Read such a file: all blocks of the visible, or X, Y and Z where it has these."""
-    layer = _layer(path)
-    incident = (_text(layer, "DataDefinition/IncidentDataStructure") or "").lower()
+    """Read such a file: all blocks of the visible, or X, Y and Z where it has these; and one of tensor trees."""
+    layer = layer_of(path)
+    incident = (text_of(layer, "DataDefinition/IncidentDataStructure") or "").lower()
+    if incident in tensor_tree.RANKS:
+        return tensor_tree.read(path, layer, tensor_tree.RANKS[incident])
     if incident not in ("columns", "rows"):
-        kind = "a tensor tree, which has no reader here" if incident.startswith("tensortree") else "neither"
-        raise ValueError(f"{path}: IncidentDataStructure is {incident!r}, must be Columns or Rows ({kind})")
+        raise ValueError(
+            f"{path}: IncidentDataStructure is {incident!r}, must be Columns, Rows, TensorTree3 or TensorTree4"
+        )
     bases = {basis.name.lower(): basis for basis in _bases(path, layer)}
-    blocks: dict[str, dict[str, Floats]] = {}
+    matrices: dict[str, dict[str, Floats]] = {}
     used: dict[str, tuple[Basis, Basis]] = {}
     for data in layer.iter("WavelengthData"):
-        channel = CHANNELS.get((_text(data, "Wavelength") or "").lower())
+        channel = CHANNELS.get((text_of(data, "Wavelength") or "").lower())
         if channel is None:
             continue
-        for block in data.iter("WavelengthDataBlock"):
-            name = (_text(block, "WavelengthDataDirection") or "").lower()
-            kind, _, side = name.partition(" ")
-            if kind not in ("transmission", "reflection") or side not in COME:
-                raise ValueError(
-                    f"{path}: WavelengthDataDirection is {name!r}, must be Transmission or Reflection, Front or Back"
-                )
+        for name, block in blocks(path, data):
             pair = _of(path, bases, block, "ColumnAngleBasis"), _of(path, bases, block, "RowAngleBasis")
             come, leave = pair if incident == "columns" else pair[::-1]
             matrix = _matrix(path, block, name, len(pair[1].directions), len(pair[0].directions))
             if used.setdefault(name, (come, leave)) != (come, leave):
                 raise ValueError(f"{path}: {name} has different angle bases in different wavelengths")
-            blocks.setdefault(channel, {})[name] = matrix if incident == "columns" else matrix.T
-    if "Y" not in blocks:
+            matrices.setdefault(channel, {})[name] = matrix if incident == "columns" else matrix.T
+    if "Y" not in matrices:
         raise ValueError(f"{path}: no WavelengthData of 'Visible'")
-    colours = tuple(one for one in ("X", "Y", "Z") if blocks.get(one, {}).keys() == blocks["Y"].keys())
+    colours = tuple(one for one in ("X", "Y", "Z") if matrices.get(one, {}).keys() == matrices["Y"].keys())
     chosen = colours if len(colours) == len(CHANNELS) else ("Y",)
-    return _readings(path, [blocks[one] for one in chosen], used, chosen if len(chosen) > 1 else channel_names(1))
+    return _readings(path, [matrices[one] for one in chosen], used, chosen if len(chosen) > 1 else channel_names(1))
 
 
 def _readings(
-    path: Path, blocks: list[dict[str, Floats]], used: dict[str, tuple[Basis, Basis]], channels: tuple[str, ...]
+    path: Path, matrices: list[dict[str, Floats]], used: dict[str, tuple[Basis, Basis]], channels: tuple[str, ...]
 ) -> Measurements:
     wi, wo, values, mask = [], [], [], []
     for name, (come, leave) in used.items():
@@ -86,7 +82,7 @@ def _readings(
         pairs = np.broadcast_arrays(one[None], other[:, None])
         wi.append(pairs[0].reshape(-1, 3))
         wo.append(pairs[1].reshape(-1, 3))
-        values.append(np.stack([block[name].ravel() for block in blocks], axis=-1))
+        values.append(np.stack([block[name].ravel() for block in matrices], axis=-1))
         straight = through & (np.abs(pairs[0] + pairs[1]).max(axis=-1) < 1e-9)
         mask.append(~straight.ravel())
     notes = (
@@ -99,32 +95,16 @@ def _readings(
     return Measurements(parts[0], parts[1], parts[2], None, parts[3], channels, source)
 
 
-def _layer(path: Path) -> ElementTree.Element:
-    """The layer of the file, without namespaces."""
-    try:
-        root = ElementTree.fromstring(path.read_bytes())
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise ValueError(f"{path}: not well-formed XML: {error}") from None
-    for element in root.iter():
-        element.tag = str(element.tag).rpartition("}")[2]
-    layer = root.find("Optical/Layer")
-    if root.tag != "WindowElement" or layer is None:
-        raise ValueError(
-            f"{path}: an XML file of <{root.tag[:40]}>, must be a <WindowElement> with <Optical> and <Layer>"
-        )
-    return layer
-
-
 def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
     found = []
     for basis in layer.iterfind("DataDefinition/AngleBasis"):
-        name = _text(basis, "AngleBasisName")
+        name = text_of(basis, "AngleBasisName")
         if not name:
             raise ValueError(f"{path}: an AngleBasis without AngleBasisName")
         directions: list[Floats] = []
         for ring in basis.iter("AngleBasisBlock"):
-            low, high = (_number(path, ring, f"ThetaBounds/{bound}Theta") for bound in ("Lower", "Upper"))
-            count = _number(path, ring, "nPhis")
+            low, high = (number_of(path, ring, f"ThetaBounds/{bound}Theta") for bound in ("Lower", "Upper"))
+            count = number_of(path, ring, "nPhis")
             if not (0.0 <= low < high <= 90.0 and 1 <= count <= _MOST_PATCHES and count == int(count)):
                 raise ValueError(f"{path}: {name}: a ring from {low:g} to {high:g} degrees in {count:g} patches")
             theta = 0.0 if count == 1 and low == 0.0 else 0.5 * (low + high)
@@ -138,7 +118,7 @@ def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
 
 
 def _of(path: Path, bases: dict[str, Basis], block: ElementTree.Element, tag: str) -> Basis:
-    name = (_text(block, tag) or "").lower()
+    name = (text_of(block, tag) or "").lower()
     if name not in bases:
         raise ValueError(
             f"{path}: {tag} is {name!r}, must be one of {', '.join(bases) or 'none that the file defines'}"
@@ -147,7 +127,7 @@ def _of(path: Path, bases: dict[str, Basis], block: ElementTree.Element, tag: st
 
 
 def _matrix(path: Path, block: ElementTree.Element, name: str, rows: int, columns: int) -> NDArray[np.float64]:
-    words = (_text(block, "ScatteringData") or "").replace(",", " ").split()
+    words = (text_of(block, "ScatteringData") or "").replace(",", " ").split()
     if len(words) != rows * columns:
         raise ValueError(f"{path}: {name}: {len(words)} numbers, must be {rows} x {columns}")
     try:
@@ -157,16 +137,3 @@ def _matrix(path: Path, block: ElementTree.Element, name: str, rows: int, column
     if not np.isfinite(matrix).all():
         raise ValueError(f"{path}: {name}: holds {matrix[~np.isfinite(matrix)][0]}, must be finite")
     return matrix
-
-
-def _number(path: Path, parent: ElementTree.Element, tag: str) -> float:
-    text = _text(parent, tag) or ""
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{path}: {tag} is {text[:40]!r}, must be a number") from None
-
-
-def _text(parent: ElementTree.Element, tag: str) -> str | None:
-    text = parent.findtext(tag)
-    return None if text is None else text.strip()

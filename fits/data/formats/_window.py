@@ -1,0 +1,51 @@
+"""What the readers of XML files of LBNL WINDOW and Radiance share: the layer, its blocks, and texts in it."""
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
+from pathlib import Path
+
+COME = {"front": 1.0, "back": -1.0}
+"""Of the side that light comes from: the sign of z. WINDOW's front is the top."""
+
+
+def layer_of(path: Path) -> ElementTree.Element:
+    """The layer of the file, without namespaces."""
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, LookupError, ValueError) as error:
+        raise ValueError(f"{path}: not well-formed XML: {error}") from None
+    for element in root.iter():
+        element.tag = str(element.tag).rpartition("}")[2]
+    layer = root.find("Optical/Layer")
+    if root.tag != "WindowElement" or layer is None:
+        raise ValueError(
+            f"{path}: an XML file of <{root.tag[:40]}>, must be a <WindowElement> with <Optical> and <Layer>"
+        )
+    return layer
+
+
+def number_of(path: Path, parent: ElementTree.Element, tag: str) -> float:
+    """The number in the element of this tag."""
+    text = text_of(parent, tag) or ""
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"{path}: {tag} is {text[:40]!r}, must be a number") from None
+
+
+def text_of(parent: ElementTree.Element, tag: str) -> str | None:
+    """The text in the element of this tag; None if there is none."""
+    text = parent.findtext(tag)
+    return None if text is None else text.strip()
+
+
+def blocks(path: Path, data: ElementTree.Element) -> Iterator[tuple[str, ElementTree.Element]]:
+    """The blocks of one wavelength, each with its name: "transmission" or "reflection", and "front" or "back"."""
+    for block in data.iter("WavelengthDataBlock"):
+        name = (text_of(block, "WavelengthDataDirection") or "").lower()
+        kind, _, side = name.partition(" ")
+        if kind not in ("transmission", "reflection") or side not in COME:
+            raise ValueError(
+                f"{path}: WavelengthDataDirection is {name!r}, must be Transmission or Reflection, Front or Back"
+            )
+        yield name, block
