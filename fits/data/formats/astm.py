@@ -20,7 +20,7 @@ import numpy as np
 
 from fits.data.formats._text import Line, plural, read_lines, rows, within
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, direction
-from fits.data.measurements import Measurements, Quantity, Source, to_bsdf
+from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
 
 _ANGLES = ("theta_i", "phi_i", "theta_s", "phi_s")
 _NOT_VALUES = ("theta", "phi", "beta", "alpha", "psi", "angle", "polar", "cos")
@@ -37,7 +37,8 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     """Read such a file, whose numbers are `quantity`. Errors as in `fits.read`."""
     lines = [line for line in read_lines(path) if line.text.strip()]
     at = _vars(path, lines)
-    columns = [name.strip() for name in re.split(r"[,\s]+", lines[at].text.strip()[4:].strip(" ,\t="))]
+    named = lines[at].text.strip()[4:].strip(" ,\t=")
+    columns = [name.strip() for name in (named.split(",") if "," in named else named.split())]
     names = [name.lower() for name in columns]
     channels = _channels(lines[at], columns)
     body = lines[at + 1 :]
@@ -63,7 +64,8 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
         notes.append(f"{plural(int((values < 0).any(axis=1).sum()), 'sample')} below zero, kept as measured")
     if not used.all():
         notes.append(f"masked: {plural(int((~used).sum()), 'sample')} in the tangent plane")
-    return Measurements(wi, wo, values, None, used, channels, Source(str(path), "astm", quantity, tuple(notes)))
+    source = Source(str(path), "astm", quantity, tuple(notes))
+    return Measurements(wi, wo, values, None, used, _names(channels), source)
 
 
 def _vars(path: Path, lines: list[Line]) -> int:
@@ -75,6 +77,15 @@ def _vars(path: Path, lines: list[Line]) -> int:
         if not words or not _KEY.match(words[0].rstrip(":")):
             raise line.error(f"{line.text.strip()[:40]!r} found, must be a key in capitals; VARS ends the header")
     raise ValueError(f"{path}: no line 'VARS theta_i,phi_i,theta_s,phi_s,...' that names the columns")
+
+
+def _names(channels: tuple[str, ...]) -> tuple[str, ...]:
+    """Channels as they are called elsewhere."""
+    if [name.lower() for name in channels] == ["r", "g", "b"]:
+        return channel_names(3)
+    if len(channels) == 1:
+        return channel_names(1)
+    return tuple(re.sub(r"^([\d.]+)\s*nm$", r"\1 nm", name) for name in channels)
 
 
 def _channels(line: Line, columns: list[str]) -> tuple[str, ...]:

@@ -68,8 +68,9 @@ def test_disk_has_the_area_of_the_square() -> None:
     square = np.stack([u, v], axis=-1)
     np.testing.assert_allclose(np.hypot(*disk(square).T), abs(2 * square - 1).max(axis=1), atol=1e-12)
     step = 1e-6
-    du = (disk(square + [[step, 0]]) - disk(square - [[step, 0]])) / (2 * step)
-    dv = (disk(square + [[0, step]]) - disk(square - [[0, step]])) / (2 * step)
+    along, across = np.array([step, 0.0]), np.array([0.0, step])
+    du = (disk(square + along) - disk(square - along)) / (2 * step)
+    dv = (disk(square + across) - disk(square - across)) / (2 * step)
     area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
     assert np.median(abs(area - np.pi)) < 1e-6
     edges = np.array([[1.0, 0.5], [0.5, 1.0], [0.0, 0.5], [0.5, 0.5]])
