@@ -83,7 +83,9 @@ def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "fit a stack to measured data and write a result directory with a report",
         "layerjax fit slices.csv --stack coat.toml --out result --mask-grazing 80 --starts 32",
     )
-    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf, FRED text or .rxt")
+    parser.add_argument(
+        "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
+    )
     parser.add_argument("--stack", required=True, metavar="TOML", help="the stack, with its free parameters")
     parser.add_argument("--out", required=True, metavar="DIR", help="result directory to write")
     parser.add_argument("--starts", type=count, default=32, metavar="N", help="starting points (default: %(default)s)")
@@ -191,7 +193,9 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "look for the stack behind data: stacks grow layer by layer, and are ranked by what they foretell",
         "layerjax search slices.csv --out stacks --noise 0.03 --calibration 0.1",
     )
-    parser.add_argument("data", metavar="DATA", help="measurements: csv, MERL .binary, Zemax .bsdf or FRED text")
+    parser.add_argument(
+        "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
+    )
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
     parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
     parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
@@ -221,7 +225,9 @@ def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "say what is in a measurement file, and draw it",
         "layerjax info slices.csv",
     )
-    parser.add_argument("data", metavar="FILE", help="measurements: csv, MERL .binary, Zemax .bsdf, FRED text or .rxt")
+    parser.add_argument(
+        "data", metavar="FILE", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
+    )
     parser.add_argument(
         "--out", metavar="PNG", help="picture to draw (default: FILE's name as .png, in the current directory)"
     )
@@ -236,7 +242,9 @@ def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "write measurements as csv in this project's convention",
         "layerjax convert AnoBlackNiTEonSteel.bsdf steel.csv",
     )
-    parser.add_argument("data", metavar="IN", help="measurements: csv, MERL .binary, Zemax .bsdf, FRED text or .rxt")
+    parser.add_argument(
+        "data", metavar="IN", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
+    )
     parser.add_argument("out", metavar="OUT", help="file to write; its name ends in .csv")
     add_reading(parser)
     add_force(parser, "overwrite the file")

@@ -35,7 +35,7 @@ def recognises(lines: list[str]) -> bool:
 
 def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     """Read such a file, whose numbers are `quantity`. Errors as in `fits.read`."""
-    lines = [line for line in read_lines(path) if line.text.strip()]
+    lines = [line for line in read_lines(path, "latin-1") if line.text.strip()]
     at = _vars(path, lines)
     named = lines[at].text.strip()[4:].strip(" ,\t=")
     columns = [name.strip() for name in (named.split(",") if "," in named else named.split())]

@@ -30,7 +30,7 @@ def recognises(lines: list[str]) -> bool:
 
 def read(path: Path) -> Measurements:
     """Read such a file; the quantity is what it says. Errors as in `fits.read`."""
-    lines = [line for line in read_lines(path) if line.text.strip()]
+    lines = [line for line in read_lines(path, "latin-1") if line.text.strip()]
     header = [line for line in lines if line.text.startswith("#")]
     body = [line for line in lines if not line.text.startswith("#")]
     said: dict[str, tuple[Line, list[str]]] = {}

@@ -159,9 +159,12 @@ def _data(path: Path, raw: bytes, place: int, number: int, line: Line, block: _B
     while len(body) < count:
         if place >= len(raw):
             raise ValueError(f"{path}: the file ends where {plural(count, 'line')} of data are expected (truncated?)")
-        found, place, number = _line(path, raw, place, number)
-        if found.text and not found.text.startswith("#"):
-            body.append(found)
+        wanted = count - len(body)
+        for piece in raw[place:].split(b"\n", wanted)[:wanted]:
+            number, place = number + 1, place + len(piece) + 1
+            words = piece.decode("utf-8", "replace").strip()
+            if words and not words.startswith("#"):
+                body.append(Line(path, number, words))
     block.values = rows(body, width)
     return place, number
 

@@ -79,6 +79,8 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
         notes.append(f"masked: {plural(int((~measured).sum()), 'zero')} above the horizon, not measured")
     if len(rotation) > 1 or file.choices["symmetry"] != "planesymmetrical":
         notes.append("SampleRotation and ScatterAzimuth taken as counter-clockwise, seen from the lit side")
+    if len(rotation) > 1:
+        notes.append("the sample's x of Zemax is at right angles to the plane of incidence at SampleRotation 0")
     if btdf:
         notes.append("BTDF: AngleOfIncidence taken as the angle of straight transmission, equal to theta_i")
     channels = _CHANNELS[file.choices["spectralcontent"]]

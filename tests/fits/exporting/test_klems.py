@@ -137,7 +137,7 @@ def test_axes_are_not_turned(tmp_path: Path) -> None:
 FAULTS = {
     "no XML": (b"</WindowElement>", b"</WindowElemen>", "not well-formed XML"),
     "another file": (b"WindowElement", b"Drawing", "an XML file of <Drawing>"),
-    "structure": (b">Columns<", b">TensorTree4<", "tensor tree, which has no reader here"),
+    "structure": (b">Columns<", b">TensorTree5<", "IncidentDataStructure is 'tensortree5'"),
     "basis": (b"<RowAngleBasis>LBNL", b"<RowAngleBasis>LBL", "RowAngleBasis is"),
     "patches": (b"<nPhis>8<", b"<nPhis>7<", "must be 144 x 144"),
     "ring": (b"<UpperTheta>15<", b"<UpperTheta>150<", "a ring from 5 to 150 degrees"),
