@@ -79,14 +79,17 @@ def recognises(head: bytes) -> bool:
 
 def read(path: Path) -> Measurements:
     """Read such a file; channels are wavelengths where it has several that differ. Errors as in `fits.read`."""
-    if not path.read_bytes().startswith(MAGIC):
+    raw = path.read_bytes()
+    if not raw.startswith(MAGIC):
         raise ValueError(f"{path}: a Speos BSDF starts with 'OPTIS - ...'")
+    mode = raw.partition(b"\n")[2][:1]
+    if mode == b"1":
+        raise ValueError(f"{path}, line 2: a binary file, which has no reader here; Speos' viewers save it as text")
+    if mode != b"0":
+        raise ValueError(f"{path}, line 2: must be 0 for text, or 1 for binary")
     lines = Rows(path, read_lines(path, "latin-1"))
     title = lines.text("the title").text.lower()
-    mode = lines.text("0 for text or 1 for binary")
-    if mode.text.strip() != "0":
-        kind = "a binary file, which has no reader here; Speos' viewer saves it as text" if mode.text[:1] == "1" else ""
-        raise mode.error(f"the mode is {mode.text.strip()[:10]!r}, must be 0{f' ({kind})' if kind else ''}")
+    lines.text("the mode")
     lines.text("a comment")
     lines.skip_text(lines.whole("the length of the description", (0, 1_000_000)))
     if "anisotropic" in title:

@@ -142,7 +142,8 @@ def test_isotropic_by_formula(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("v8.0\n0", "v8.0\n1"), "line 2: the mode is '1'.*binary"),
+        (("v8.0\n0", "v8.0\n1"), "line 2: a binary file, which has no reader here"),
+        (("v8.0\n0", "v8.0\n2"), "line 2: must be 0 for text, or 1 for binary"),
         (("Anisotropic BSDF", "Something"), "the title is"),
         (("1\t0\n1\n", "0\t0\n1\n"), "line 8: neither reflection nor transmission"),
         (("1\n10.0", "1\n95.0"), "line 13, column 1: 95.0 is not allowed"),
