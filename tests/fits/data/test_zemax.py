@@ -145,6 +145,20 @@ def test_channels_rotations_and_quantity(tmp_path):
     assert data.source.quantity == "reflectance_factor"
 
 
+@pytest.mark.parametrize("symmetry", ["PlaneSymmetrical", "ASymmetrical", "Asymmetrical4D"])
+def test_all_symmetries_are_read_as_they_stand(tmp_path, symmetry):
+    """Two rotations of the sample, azimuths beyond 180: the light turns by the rotation, the lobe with it."""
+    header = _header(symmetry, rotations="2\n0 30").replace("0 90 180", "0 120 240")
+    data = _read(tmp_path, header + "Monochrome\n" + BLOCK.replace("DataEnd\n", "") + BLOCK.split("DataBegin\n")[1])
+    assert len(data) == 16
+    np.testing.assert_allclose(data.phi_i, np.repeat([180, 150], 8))
+    np.testing.assert_allclose(data.theta_o[:8], data.theta_o[8:])
+    np.testing.assert_allclose((data.phi_o[:8] - data.phi_o[8:]) % 360, 30)
+    # azimuths 120 and 240 lie on either side of the plane of incidence
+    np.testing.assert_allclose(data.wo[2] * [1, -1, 1], data.wo[3], atol=1e-12)
+    assert abs(data.wo[2, 1]) > 0.3
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
