@@ -10,7 +10,7 @@ FORMATS = (
     *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
     *("fred", "astm", "pab", "alta", "speos", "ssdd"),
 )
-EXPORTS = ("rgl", "merl", "zemax", "klems", "csv")
+EXPORTS = ("rgl", "merl", "zemax", "klems", "openpbr", "csv")
 STRATA = ("bins", "flux")
 
 

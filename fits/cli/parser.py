@@ -292,7 +292,7 @@ def _add_export(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = command(
         commands,
         "export",
-        "write a material for renderers (Mitsuba, pbrt) or for optical design (Zemax, LightTools)",
+        "write a material for renderers (Mitsuba, pbrt, MaterialX) or for optical design (Zemax, LightTools)",
         "layerjax export result --to rgl --out coat.bsdf",
     )
     parser.add_argument(
@@ -300,7 +300,9 @@ def _add_export(commands: "argparse._SubParsersAction[_Parser]") -> None:
         metavar="DIR|TOML|NAME",
         help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
     )
-    parser.add_argument("--to", required=True, choices=EXPORTS, help="rgl: Mitsuba's and pbrt's tensor file")
+    parser.add_argument(
+        "--to", required=True, choices=EXPORTS, help="rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX"
+    )
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     parser.add_argument(
         "--wavelengths", type=length, nargs="+", metavar="NM", help="of the channels: an rgl file is spectral then"

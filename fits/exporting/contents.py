@@ -48,18 +48,23 @@ def agreement(material: Material, look_up: Callable[[Floats, Floats], Floats]) -
     )
 
 
-def pairs() -> tuple[Floats, Floats]:
-    """Pairs of directions up to 80 degrees from the normal: anywhere, and around the mirror direction."""
-    u = qmc.Sobol(4, rng=np.random.default_rng(7)).random(2 * PAIRS)
-    wi, anywhere = (_direction(u[:, place], u[:, place + 1]) for place in (0, 2))
-    mirrored = wi * np.array([-1.0, -1.0, 1.0])
-    away = AROUND * u[:, 2:3] ** 2
-    turn = 2.0 * np.pi * u[:, 3]
-    near = mirrored + away * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
-    near /= np.linalg.norm(near, axis=-1, keepdims=True)
-    wo = np.where(np.arange(len(u))[:, None] < PAIRS, anywhere, near)
+def pairs(count: int = PAIRS, seed: int = 7) -> tuple[Floats, Floats]:
+    """Pairs of directions up to 80 degrees from the normal: `count` anywhere, as many around the mirror direction."""
+    u = qmc.Sobol(4, rng=np.random.default_rng(seed)).random(2 * count)
+    wi = _direction(u[:, 0], u[:, 1])
+    wo = views(wi, u[:, 2], u[:, 3])
     kept = wo[:, 2] >= STEEPEST
     return wi[kept], wo[kept]
+
+
+def views(wi: Floats, u: Floats, v: Floats) -> Floats:
+    """A direction for each wi (N, 3) from numbers in [0, 1]: anywhere for the first half, then near the mirror."""
+    mirrored = wi * np.array([-1.0, -1.0, 1.0])
+    away = AROUND * u[:, None] ** 2
+    turn = 2.0 * np.pi * v
+    near = mirrored + away * np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=-1)
+    near /= np.linalg.norm(near, axis=-1, keepdims=True)
+    return np.where(2 * np.arange(len(u))[:, None] < len(u), _direction(u, v), near)
 
 
 def _direction(u: Floats, v: Floats) -> Floats:

@@ -14,19 +14,28 @@ from fits.data.geometry import Floats
 from fits.exporting import klems, merl, rgl, slices, zemax
 from fits.exporting.contents import Contents
 from fits.exporting.material import Material, material_of
+from fits.exporting.openpbr import document as openpbr
 from fits.inference.fit_result import Fit
 
-To = Literal["rgl", "merl", "zemax", "klems", "csv"]
+To = Literal["rgl", "merl", "zemax", "klems", "openpbr", "csv"]
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
     "merl": merl.contents,
     "zemax": zemax.contents,
     "klems": klems.contents,
+    "openpbr": openpbr.contents,
     "csv": slices.contents,
 }
 
-ENDINGS: dict[str, str] = {"rgl": ".bsdf", "merl": ".binary", "zemax": ".bsdf", "klems": ".xml", "csv": ".csv"}
+ENDINGS: dict[str, str] = {
+    "rgl": ".bsdf",
+    "merl": ".binary",
+    "zemax": ".bsdf",
+    "klems": ".xml",
+    "openpbr": ".mtlx",
+    "csv": ".csv",
+}
 """What names of files end in."""
 
 
@@ -55,8 +64,8 @@ def export(
         material: a stack or a mixture of numbers, or a fit, of which the best values are written.
         path: the file; its name ends as `ENDINGS` says.
         to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
-            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "csv": slices in this project's
-            convention.
+            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "openpbr": the OpenPBR surface in
+            MaterialX that resembles it most (extra `materialx`). "csv": slices in this project's convention.
         transport: carries the light; None: that of the fit, or "auto".
         wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
         name: what the material is called in the file; None: after the file.
@@ -64,7 +73,8 @@ def export(
 
     Raises:
         ValueError: the format cannot hold the material (the number of channels, or an axis that breaks the symmetry it
-            needs), a transport that is random or does not carry the stack, or a file that is there without `force`.
+            needs, or for "openpbr" light that passes), a transport that is random or does not carry the stack, an extra
+            that is not installed, or a file that is there without `force`.
     """
     if to not in get_args(To):
         raise ValueError(f"to is {to!r}, must be one of {', '.join(get_args(To))}")
