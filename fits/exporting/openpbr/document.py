@@ -66,8 +66,10 @@ def inputs(surface: Surface) -> dict[str, float | tuple[float, float, float]]:
     for name in RANGES:
         if name in used_by(surface):
             given[name] = _color(getattr(surface, name)) if name in COLORS else _number(getattr(surface, name))
-    if {"metal", "diffuse"} <= set(lobes) and "gloss" not in lobes:
-        given["specular_ior"] = given.get("coat_ior", 1.0)  # as what lies above: then there is no gloss
+    if "gloss" not in lobes and "diffuse" in lobes:
+        # MaterialX's shaders dim what lies below a gloss even where it has no weight, but little below the roughest
+        given.setdefault("specular_roughness", 1.0)
+        given["specular_ior"] = given.get("coat_ior", 1.0)  # as what lies above
     return given
 
 

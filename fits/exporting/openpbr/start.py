@@ -11,6 +11,7 @@ import layerjax as lj
 from fits.exporting.openpbr.surface import EDGE, Lobe, Surface
 from fits.problem.parameters import Free
 from layerjax.fresnel import conductor, schlick
+from layerjax.phase.contract import Flakes
 
 IOR = (1.0, 3.0)
 RANGES = {
@@ -73,8 +74,8 @@ def used_by(surface: Surface) -> set[str]:
 def _kinds(stack: lj.Stack) -> Iterator[Surface]:
     """Over a diffuse base one mirror is the gloss, and a second the coat above it; over a metal the first is the coat.
 
-    A coat over diffuse without gloss would be the same by the specification, but MaterialX's shaders dim the base below
-    a gloss of no weight, at grazing light by a tenth.
+    A coat over diffuse without gloss has the same lobes by the specification, but MaterialX's shaders dim what lies
+    below a gloss even where it has no weight.
     """
     mirrors = list(_mirrors(stack))
     metallic = isinstance(stack.base, lj.Conductor)
@@ -92,8 +93,11 @@ def _kinds(stack: lj.Stack) -> Iterator[Surface]:
     if mirrors:
         given["specular_ior"], given["specular_roughness"] = mirrors[-1]
     yield Surface((*coat, "gloss", "diffuse") if mirrors else ("diffuse",), **given)
-    if stack.base is None and mirrors:  # flakes so deep that they hide what is below: they may be of metal
-        yield Surface(("metal",), 0.5, base_metalness=1.0, specular_roughness=mirrors[-1][1])
+    if any(_flat(layer) is not None for layer in stack.layers):  # flakes that lie flat look like a metal
+        below: tuple[Lobe, ...] = ("metal",) if stack.base is None else ("metal", "diffuse")
+        yield Surface(
+            (*coat, *below), **given | {"base_color": 0.5, "base_metalness": 1.0 if stack.base is None else MOSTLY}
+        )
 
 
 def _mirrors(stack: lj.Stack) -> Iterator[tuple[float, float]]:
@@ -101,9 +105,15 @@ def _mirrors(stack: lj.Stack) -> Iterator[tuple[float, float]]:
     for layer in stack.layers:
         if isinstance(layer, lj.Interface):
             yield _number(layer.ior), _number(layer.alpha) ** 0.5
-        elif layer.phase.flakes is not None and layer.phase.flakes.kind == "surface":
+        elif (flakes := _flat(layer)) is not None:
             root = _number(0.04 if layer.f0 is None else layer.f0) ** 0.5
-            yield (1.0 + root) / max(1.0 - root, 0.5), _number(layer.phase.flakes.alpha) ** 0.5
+            yield (1.0 + root) / max(1.0 - root, 0.5), _number(flakes.alpha) ** 0.5
+
+
+def _flat(layer: Any) -> Flakes | None:
+    """The flakes of a medium, if they lie about the normal as the facets of a surface do."""
+    flakes: Flakes | None = None if isinstance(layer, lj.Interface) else layer.phase.flakes
+    return flakes if flakes is not None and flakes.kind == "surface" else None
 
 
 def _metal(base: lj.Conductor, stack: lj.Stack) -> dict[str, Any]:
