@@ -53,15 +53,20 @@ def write_measurements(data: Measurements, arguments: Namespace) -> int:
 
 
 def render(arguments: Namespace) -> int:
-    """Draw a material of the gallery, or of a file."""
+    """Draw a material of the gallery, or of a file, or the best of a saved fit."""
     require_free_place(arguments, ".png", "pictures")
     use_jax()
     from fits.reporting.plots.data import as_png
     from fits.reporting.render import render as run_render
+    from fits.reporting.results import load_fit
 
     name = arguments.material
-    stack, transport = _material(name)
-    figure = run_render(stack, transport, title=Path(name).stem.replace("_", " "), size=arguments.size)
+    if Path(name).is_dir():
+        fit = load_fit(name)
+        stack, transport = fit.stack, fit.problem.transport
+    else:
+        stack, transport = _material(name)
+    figure = run_render(stack, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
     write_bytes(arguments.out, as_png(figure), force=arguments.force)
     print(f"{arguments.out}: {name}")
     return DONE

@@ -281,7 +281,9 @@ def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "layerjax render window_shade --out window_shade.png",
     )
     parser.add_argument(
-        "material", metavar="NAME|TOML", help="a material of the gallery, or a stack (free parameters at their start)"
+        "material",
+        metavar="DIR|TOML|NAME",
+        help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
     )
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
     parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")

@@ -36,17 +36,17 @@ def _current_name(form: Form) -> Form:
 class VMFDiffuse(Surface):
     """Rough diffuse surface, from Lambertian to porous.
 
-    ========= ======== ============ ======= ======================================================================
-    parameter symbol   range        default meaning
-    ========= ======== ============ ======= ======================================================================
-    albedo    c        [0, 1]               albedo of a flake, per channel
-    roughness r        [0, 1]               flakes have the concentration k = 2 / log(1 - sqrt(r))^2
-    form               "paper"      "paper" the paper's fit; light scattered four and more times by Eq. (9) with
-                       | "literal"          the exponent atan(X erf(C)) ("paper") or atan(X) erf(C) as printed
-                       | "all_orders"       ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
-                                            of what such flakes reflect in all orders ("all_orders", once called
-                                            "transport", which is still taken for it)
-    ========= ======== ============ ======= ======================================================================
+    ========= ====== ================ ======= ======================================================================
+    parameter symbol range            default meaning
+    ========= ====== ================ ======= ======================================================================
+    albedo    c      [0, 1]                   albedo of a flake, per channel
+    roughness r      [0, 1]                   flakes have the concentration k = 2 / log(1 - sqrt(r))^2
+    form             "paper" or       "paper" the paper's fit; light scattered four and more times by Eq. (9) with
+                     "literal" or             the exponent atan(X erf(C)) ("paper") or atan(X) erf(C) as printed
+                     "all_orders"             ("literal"; 3 % of that part, 0.0017 in value, at most); or a table
+                                              of what such flakes reflect in all orders ("all_orders", once called
+                                              "transport", which is still taken for it)
+    ========= ====== ================ ======= ======================================================================
 
     The fits follow the flakes' own reflection to 1 to 4 % (root mean square), and do not conserve energy: at albedo 1
     they reflect 0.90 to 1.14 of the light, up to albedo 0.95 less than 1 everywhere. Under layers that send nearly all

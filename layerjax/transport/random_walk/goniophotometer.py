@@ -29,18 +29,18 @@ from layerjax.transport.random_walk.walk import Walk
 class Goniogram(eqx.Module):
     """Shares of the incident power, with standard errors; the channel axis is last.
 
-    ============================= ================================= ==================================================
-    field                         shape                             meaning
-    ============================= ================================= ==================================================
-    energy, energy_error          (..., 2, polar, azimuth, C)       scattered into each bin, on wi's side and on the
-                                                                    other
-    orders, orders_error          (..., 2, orders, C)               by order 1, 2, ... of scattering; the last holds
-                                                                    all higher orders too
-    albedo, albedo_error          (..., 2, C)                       scattered to wi's side and to the other
-    unscattered, unscattered_error (..., C)                         passed without an event
-    cosines                       (polar + 1,)                      edges of the bins in cos(theta) >= 0, from 0 to 1
-    azimuths                      (azimuth + 1,)                    edges of the bins in phi, from 0 to 2 pi
-    ============================= ================================= ==================================================
+    ============================== ================================= =================================================
+    field                          shape                             meaning
+    ============================== ================================= =================================================
+    energy, energy_error           (..., 2, polar, azimuth, C)       scattered into each bin, on wi's side and on the
+                                                                     other
+    orders, orders_error           (..., 2, orders, C)               by order 1, 2, ... of scattering; the last holds
+                                                                     all higher orders too
+    albedo, albedo_error           (..., 2, C)                       scattered to wi's side and to the other
+    unscattered, unscattered_error (..., C)                          passed without an event
+    cosines                        (polar + 1,)                      edges of the bins in cos(theta) >= 0, from 0 to 1
+    azimuths                       (azimuth + 1,)                    edges of the bins in phi, from 0 to 2 pi
+    ============================== ================================= =================================================
 
     What is missing from 1 was absorbed, or lost to masking. A bin's mean of f |cos| is its energy over its solid angle.
     """

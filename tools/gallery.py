@@ -1,0 +1,98 @@
+"""python -m tools.gallery: write docs/gallery.md; with --pictures the pictures too, which takes some minutes."""
+
+import argparse
+import io
+from pathlib import Path
+from typing import Any
+
+import jax
+from PIL import Image
+
+from fits.problem.tables import material_to_dict
+from fits.reporting.plots.data import as_png
+from fits.reporting.render import render
+from layerjax import gallery
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "gallery.md"
+PICTURES = ROOT / "docs" / "gallery"
+
+SPHERE, WIDTH, QUALITY = 256, 1000, 88
+"""Pixels of a sphere and of a picture, and how well a JPEG keeps it: about 70 kB each."""
+
+BEGINNING = """\
+# Gallery
+
+The materials of `layerjax.gallery`, after the scenes of Wang et al. 2022. Where the paper has a map (of orientation,
+thickness or colour) a constant stands, which the remark says. `python -m tools.gallery --pictures` makes this page and
+its pictures again.
+
+`layerjax.gallery.stack("padauk")` is such a stack in Python; `gallery = "padauk"` stands for its layers in a stack file,
+and the commands take the name:
+
+```sh
+layerjax render padauk --out padauk.png
+layerjax export padauk --to rgl --out padauk.bsdf
+```
+
+Each picture has spheres under a lamp from the front, from the side and, where light passes, from behind; the lobes in the
+plane of incidence; and the BSDF in that plane as a map of the light's angle by the viewer's. All orders of scattering are
+carried.
+"""
+
+
+def page() -> str:
+    """The text of docs/gallery.md."""
+    parts = [BEGINNING]
+    for name in gallery.names():
+        material = gallery.material(name)
+        tables = material_to_dict(material.build())
+        alt = f"{name}: spheres, lobes and a map of the BSDF"
+        parts.append(f"## {name}\n\n{material.source}: {material.remark}.\n\n![{alt}](gallery/{name}.jpg)\n")
+        parts.append(f"```python\n{_stack(tables)}\n```\n")
+    return "\n".join(parts)
+
+
+def _stack(tables: dict[str, Any]) -> str:
+    layers = "".join(f"        {_call(layer)},\n" for layer in tables["layers"])
+    base = _call(tables["base"]) if "base" in tables else "None"
+    return f"lj.Stack(\n    layers=[\n{layers}    ],\n    base={base},\n)"
+
+
+def _call(table: dict[str, Any]) -> str:
+    """What makes the part that a table of a stack file says."""
+    words = (f"{key}={_value(value)}" for key, value in table.items() if key not in ("kind", "shape"))
+    shape = [repr(table["shape"]).replace("'", '"')] if "shape" in table else []
+    return f"lj.{table['kind']}({', '.join([*shape, *words])})"
+
+
+def _value(value: Any) -> str:
+    return _call(value) if isinstance(value, dict) else repr(value).replace("'", '"')
+
+
+def picture(name: str) -> bytes:
+    """The picture of a material, a JPEG."""
+    drawn = Image.open(io.BytesIO(as_png(render(gallery.stack(name), size=SPHERE))))
+    height = round(drawn.height * WIDTH / drawn.width)
+    small = drawn.convert("RGB").resize((WIDTH, height), Image.Resampling.LANCZOS)
+    file = io.BytesIO()
+    small.save(file, "jpeg", quality=QUALITY, subsampling=0, optimize=True)
+    return file.getvalue()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tools.gallery", description=__doc__)
+    parser.add_argument("--pictures", action="store_true", help="draw the pictures as well")
+    if parser.parse_args().pictures:
+        jax.config.update("jax_enable_x64", True)
+        PICTURES.mkdir(exist_ok=True)
+        for name in gallery.names():
+            path = PICTURES / f"{name}.jpg"
+            path.write_bytes(picture(name))
+            print(path.relative_to(ROOT))
+    PAGE.write_text(page())
+    print(PAGE.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()
