@@ -26,7 +26,7 @@ extensions = [
     "sphinx_copybutton",
     "tools.site",
 ]
-exclude_patterns = ["_build", "_cache", "**.ipynb_checkpoints"]
+exclude_patterns = ["_build", "_cache", "jupyter_execute", "**.ipynb_checkpoints"]
 default_role = "py:obj"  # docstrings name things in single quotes
 
 # notebooks run at build, and again only where their content has changed; -D nb_execution_mode=off leaves it out

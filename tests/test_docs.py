@@ -10,14 +10,11 @@ import layerjax
 from tools import papers
 
 ROOT = Path(__file__).parents[1]
-PAGES = (
-    "CONTRIBUTING.md",
-    "CHANGELOG.md",
-    "docs/errata.md",
-    "docs/formats.md",
-    "docs/papers.md",
-    "docs/which_transport.md",
-)
+MADE = ("_build", "benchmarks", "project", "jupyter_execute")
+"""Folders of docs that are made from what stands elsewhere."""
+
+DOCS = (path.relative_to(ROOT) for path in sorted((ROOT / "docs").rglob("*.md")))
+PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", *(str(path) for path in DOCS if path.parts[1] not in MADE))
 AGAIN = "python -m tools.papers makes docs/papers.md again"
 
 

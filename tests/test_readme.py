@@ -1,4 +1,4 @@
-"""What the README shows works as printed."""
+"""What the README and the guides show works as printed."""
 
 import re
 import textwrap
@@ -9,16 +9,27 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+GUIDES = ROOT / "docs" / "guides"
+PAGES = [ROOT / "README.md", *sorted(GUIDES.glob("*.md"))]
+LATER = {"which_stack"}
+"""Pages whose code begins with results of the commands above it."""
 
 
-def blocks(language):
-    return [textwrap.dedent(block) for block in re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)]
+def blocks(language, pages=PAGES):
+    """What stands in fences of that language, with the name of the page and which of its blocks it is."""
+    found = [(page.stem, re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)) for page in pages]
+    return [
+        pytest.param(textwrap.dedent(block), id=f"{name}-{index}")
+        for name, texts in found
+        if name not in LATER
+        for index, block in enumerate(texts)
+    ]
 
 
-@pytest.mark.parametrize("code", blocks("python"), ids=lambda code: code.split("\n", 1)[0])
+@pytest.mark.parametrize("code", blocks("python"))
 def test_python_blocks_run(code, monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+    exec(compile(code, "page.md", "exec"), {"__name__": "page"})
 
 
 @pytest.mark.parametrize("text", blocks("toml"))

@@ -27,17 +27,17 @@ The materials of `layerjax.gallery`, after the scenes of Wang et al. 2022. Where
 thickness or colour) a constant stands, which the remark says. `python -m tools.gallery --pictures` makes this page and
 its pictures again.
 
-`layerjax.gallery.stack("padauk")` is such a stack in Python; `gallery = "padauk"` stands for its layers in a stack file,
-and the commands take the name:
+`layerjax.gallery.stack("padauk")` is such a stack in Python; `gallery = "padauk"` stands for its layers in a stack
+file, and the commands take the name:
 
 ```sh
 layerjax render padauk --out padauk.png
 layerjax export padauk --to rgl --out padauk.bsdf
 ```
 
-Each picture has spheres under a lamp from the front, from the side and, where light passes, from behind; the lobes in the
-plane of incidence; and the BSDF in that plane as a map of the light's angle by the viewer's. All orders of scattering are
-carried.
+Each picture has spheres under a lamp from the front, from the side and, where light passes, from behind; the lobes in
+the plane of incidence; and the BSDF in that plane as a map of the light's angle by the viewer's. All orders of
+scattering are carried.
 """
 
 

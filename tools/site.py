@@ -153,7 +153,7 @@ def _source_pages(app: Sphinx) -> Iterator[tuple[str, dict[str, Any], str]]:
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             name = path.relative_to(ROOT).as_posix()
-            code = bridge.highlight_block(path.read_text(), "python", lineanchors="line", anchorlinenos=True)
+            code = bridge.highlight_block(path.read_text(), "python", lineanchors="line")
             title = f"Source of {name}"
             body = f'<h1 id="source">{title}</h1>\n{code}'
             yield f"source/{name.removesuffix('.py')}", {"title": title, "body": body}, "page.html"

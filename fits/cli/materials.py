@@ -59,11 +59,14 @@ def render(arguments: Namespace) -> int:
     from fits.reporting.plots.data import as_png
     from fits.reporting.render import render as run_render
     from fits.reporting.results import load_fit
+    from layerjax import Transport
 
     name = arguments.material
     if Path(name).is_dir():
         fit = load_fit(name)
-        stack, transport = fit.stack, fit.problem.transport
+        fit.require_one("render")
+        used = fit.problem.transport
+        stack, transport = fit.stack, used if isinstance(used, Transport) else None
     else:
         stack, transport = _material(name)
     figure = run_render(stack, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)

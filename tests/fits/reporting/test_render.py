@@ -1,11 +1,14 @@
 """Pictures of materials: what a pixel shows, and the command."""
 
+import equinox as eqx
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import layerjax as lj
 from fits.cli.parser import main
 from fits.reporting.render import SKY, SUN, _display, _sky, _sphere, render
+from fits.reporting.results import save_fit
 
 WHITE = lj.Stack([], lj.Lambertian(1.0))
 SINGLE = lj.SingleScattering()
@@ -61,3 +64,19 @@ def test_the_command(tmp_path, capsys) -> None:
         assert main(["render", *words]) == 2
         assert complaint in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["haze.png", "haze.toml"]
+
+
+def test_the_best_of_a_fit_is_drawn(tmp_path, coat_fit, monkeypatch) -> None:
+    drawn = []
+
+    def draw(stack, transport, **_):
+        drawn.append((stack, transport))
+        return Figure()
+
+    monkeypatch.setattr("fits.reporting.render.render", draw)
+    save_fit(coat_fit, tmp_path / "result")
+    assert main(["render", str(tmp_path / "result"), "--out", str(tmp_path / "coat.png")]) == 0
+    assert (tmp_path / "coat.png").exists()
+    ((stack, transport),) = drawn
+    assert eqx.tree_equal(stack, coat_fit.stack, rtol=1e-12)
+    assert transport == coat_fit.problem.transport
