@@ -31,9 +31,9 @@ from layerjax.preparation import choose_transport, prepare
 from layerjax.stack import Interface, Stack, require_numbers
 
 NAME = "layerjax"
-BATCHES = (1 << 8, 1 << 12, 1 << 16)
-"""Batches are filled up to one of these sizes, or to several of the last: each is compiled, and every bounce has
-another number of rays."""
+BATCHES = (1 << 8, 1 << 12, 1 << 15)
+"""Batches are cut to the largest of these sizes that they hold, and the last piece is filled up: each size is compiled
+once, where every bounce has another number of rays."""
 
 materials: dict[str, tuple[Stack | Mixture, Any]] = {}
 """Stacks and their transports by the name that scenes have for them in ``material``, besides those of the gallery."""
@@ -270,7 +270,7 @@ def _called(function: Callable[..., tuple[Array, ...]], numbers: dict[str, Any],
             "mitsuba: a symbolic call; layerjax.mitsuba.register() turns calls and loops to evaluated ones"
         )
     count = max(dr.width(batch) for batch in batches)
-    size = next((size for size in BATCHES if size >= count), BATCHES[-1])
+    size = max((size for size in BATCHES if size <= count), default=BATCHES[0])
     padded = -(-count // size) * size
     place = dr.arange(mi.UInt32, padded)
     filled = [[dr.gather(mi.Float, part, place % dr.width(part)) for part in batch] for batch in batches]

@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 GUIDES = ROOT / "docs" / "guides"
 PAGES = [ROOT / "README.md", *sorted(GUIDES.glob("*.md"))]
-LATER = {"which_stack"}
-"""Pages whose code begins with results of the commands above it."""
+LATER = {"which_stack", "renderers"}
+"""Pages whose code begins with results of the commands above it, or needs an extra."""
 
 
 def blocks(language, pages=PAGES):

@@ -82,7 +82,7 @@ def render(
             figure.suptitle(title)
         above, below = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.15), squeeze=False))
         for axes, name in zip(above.subplots(1, len(lights), squeeze=False)[0], lights, strict=True):
-            axes.imshow(_sphere(stack, prepared, LIGHTS[name], size), interpolation="none")
+            axes.imshow(_display(sphere(stack, prepared, LIGHTS[name], size)), interpolation="none")
             axes.set_title(name)
             axes.set_axis_off()
         left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
@@ -100,8 +100,17 @@ def _require_air_below(stack: lj.Stack) -> None:
         )
 
 
-def _sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
-    """Colours of the pixels, (size, size, 3) in 0 to 1."""
+def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
+    """Radiance of the pixels, (size, size, 3), linear.
+
+    An irradiance of pi `SUN` across the light, a sky of radiance `SKY`, a viewer far away, and a picture 1.04 times as
+    wide as the sphere.
+
+    Args:
+        stack, prepared: the material, and what `layerjax.prepare` made of it.
+        light: towards it, of any length: x to the right, y up, z towards the viewer.
+        size: pixels along each side, each the mean of `SAMPLES` by `SAMPLES` points.
+    """
     number = SAMPLES * size
     place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04
     x, y = np.meshgrid(place, -place)
@@ -118,8 +127,7 @@ def _sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float
     colour = seen if seen.shape[-1] == 3 else np.repeat(seen.mean(axis=-1, keepdims=True), 3, axis=-1)
     picture = np.full((number, number, 3), SKY)
     picture[inside] = colour
-    picture = picture.reshape(size, SAMPLES, size, SAMPLES, 3).mean(axis=(1, 3))
-    return _display(picture)
+    return picture.reshape(size, SAMPLES, size, SAMPLES, 3).mean(axis=(1, 3))
 
 
 def _sky(stack: lj.Stack | lj.Mixture, prepared: Prepared, wo: Floats) -> Floats:

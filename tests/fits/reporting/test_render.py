@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 import layerjax as lj
 from fits.cli.parser import main
-from fits.reporting.render import SKY, SUN, _display, _sky, _sphere, render
+from fits.reporting.render import SKY, SUN, _display, _sky, render, sphere
 from fits.reporting.results import save_fit
 
 WHITE = lj.Stack([], lj.Lambertian(1.0))
@@ -17,7 +17,7 @@ SINGLE = lj.SingleScattering()
 def test_a_white_sphere_shows_the_cosine() -> None:
     """The pixel in the middle, lit from the viewer and from 60 degrees; a pixel is flat to 1e-3."""
     for light, cosine in (((0.0, 0.0, 1.0), 1.0), ((np.sqrt(0.75), 0.0, 0.5), 0.5)):
-        picture = _sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65)
+        picture = _display(sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65))
         np.testing.assert_allclose(picture[32, 32], _display(np.asarray(SUN * cosine + SKY)), atol=2e-3)
     np.testing.assert_allclose(picture[0, 0], _display(np.asarray(SKY)))  # beside the sphere
 
