@@ -281,9 +281,8 @@ def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> 
         own = jnp.where(pick < passed, own, density)
         passed = passed + share
     # what a part draws that leaves nowhere must not count as a draw of the others
-    leaves = own > 0.0
-    wo = jnp.where(leaves[..., None], wo, jnp.stack(horizontal(split(wo)), axis=-1))
-    density = jnp.where(leaves, pdf(mixture, wi, wo, transport), 0.0)
+    wo = jnp.where((own > 0.0)[..., None], wo, jnp.stack(horizontal(split(wo)), axis=-1))
+    density = pdf(mixture, wi, wo, transport)
     value = evaluate(mixture, wi, wo, transport, key=values)
     return wo, density, safe_div(value * jnp.abs(wo[..., 2:]), density[..., None])
 
