@@ -116,7 +116,13 @@ def test_mitsuba_accepts_the_draws(mi: Any, name: str, tmp_path: Path, monkeypat
         extra = f'<string name="material" value="{name}"/>'
         sample, density = mi.chi2.BSDFAdapter("layerjax", extra, wi=wi, ctx=context)
         test = mi.chi2.ChiSquareTest(
-            domain=mi.chi2.SphericalDomain(), sample_func=sample, pdf_func=density, sample_dim=3, res=101, ires=8
+            domain=mi.chi2.SphericalDomain(),
+            sample_func=sample,
+            pdf_func=density,
+            sample_dim=3,
+            res=51,
+            ires=8,
+            sample_count=200_000,
         )
         with contextlib.redirect_stdout(io.StringIO()):
             passed = test.run(significance_level=0.01 / len(LIGHTS) / len(STACKS))
