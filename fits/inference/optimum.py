@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.inference.descent import PROMISE, ROUGHLY, here
-from fits.inference.starts import End, Solver, least_squares_end, polished, unit_of
+from fits.inference.starts import WORTH_OF_COST, End, Solver, least_squares_end, polished, unit_of
 from fits.inference.uncertainty import Uncertainty, uncertainty
 from fits.problem.posed import Posed
 
@@ -52,7 +52,7 @@ def optimum(
         lowest = _followed(problem, lowest, promise)
     found = uncertainty(problem, lowest.vector, lowest.cost)
     if solver == "least_squares" and check and found.without_influence:
-        lowest, lower = _off_the_plateau(problem, lowest, found)
+        lowest, lower = _off_the_plateau(problem, lowest, found, promise)
         found = uncertainty(problem, lowest.vector, lowest.cost) if lower else found
     if solver == "least_squares" and ((check and found.at_bound.any()) or not lowest.converged):
         lowest, improved = polished(problem, lowest)
@@ -70,15 +70,15 @@ def _followed(problem: Posed, end: End, promise: float) -> End:
     return closer._replace(steps=end.steps + closer.steps) if closer.cost <= end.cost else end
 
 
-def _off_the_plateau(problem: Posed, end: End, found: Uncertainty) -> tuple[End, bool]:
+def _off_the_plateau(problem: Posed, end: End, found: Uncertainty, promise: float) -> tuple[End, bool]:
     """The end, or where it goes on to if what has no influence there, or is at a bound, begins anew; and whether it is.
 
     No step leads off a plateau: every start may end on one though another minimum is far lower.
     """
     stuck = np.isin(problem.names, found.without_influence) | found.at_bound
     point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, end.vector))
-    other = least_squares_end(problem, point, promise=ROUGHLY)
-    lower = other.cost < end.cost - ROUGHLY
+    other = least_squares_end(problem, point, promise=promise)
+    lower = other.cost < end.cost - (ROUGHLY if problem.objective == "likelihood" else WORTH_OF_COST * end.cost)
     return (other._replace(steps=end.steps + other.steps) if lower else end), lower
 
 

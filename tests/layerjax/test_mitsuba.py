@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
@@ -229,7 +228,9 @@ def test_the_same_numbers_draw_the_same(mi: Any) -> None:
     uniform = np.random.default_rng(0).random((3, count))
     found = [
         np.array(made.sample(mi.BSDFContext(), at(mi, rows(count, 5)), mi.Float(one), mi.Point2f(two))[0].wo)
-        for one, two in ((uniform[0], uniform[1:]), (uniform[0], uniform[1:]), (uniform[0][::-1], uniform[1:]))
+        for one, two in ((uniform[0], uniform[1:]), (uniform[0], uniform[1:]), (1.0 - uniform[0], uniform[1:]))
     ]
     np.testing.assert_array_equal(found[0], found[1])
-    assert np.any(found[0] != found[2]) or jax.default_backend() != "cpu"
+    leaves = abs(found[0][2]) > 0.0  # from below the coat reflects nothing, and draws no direction
+    assert np.mean(leaves) > 0.3
+    assert not np.any(np.all(found[0] == found[2], axis=0)[leaves])
