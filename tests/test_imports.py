@@ -59,6 +59,7 @@ PACKAGES = [
     "fits.data",
     "fits.problem",
     "fits.inference",
+    "fits.maps",
     "fits.reporting",
     "fits.structures",
     "fits.exporting",

@@ -41,6 +41,9 @@ class Free:
     `smooth` holds channels together: the standard deviation of the difference between neighbours (of the logarithms for
     `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root of the distance
     in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at the bounds.
+
+    `shared` says that all texels of a map have this number in common, see `fits.fit_map`; in a fit of one material it
+    says nothing.
     """
 
     start: float | tuple[float, ...]
@@ -48,6 +51,7 @@ class Free:
     high: float | tuple[float, ...]
     prior: Prior
     smooth: float | tuple[float, ...] | None
+    shared: bool = False
 
     __layerjax_placeholder__: ClassVar[bool] = True
 
@@ -58,11 +62,15 @@ class Free:
         high: float | Sequence[float],
         prior: Prior | None = None,
         smooth: float | Sequence[float] | None = None,
+        shared: bool = False,
     ):
         prior = Uniform() if prior is None else prior
         if not isinstance(prior, Prior):
             raise ValueError(f"Free.prior is {shown(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None")
+        if not isinstance(shared, bool):
+            raise ValueError(f"Free.shared is {shown(shared)}; it must be True or False")
         object.__setattr__(self, "prior", prior)
+        object.__setattr__(self, "shared", shared)
         for field, value in (("start", start), ("low", low), ("high", high), ("smooth", smooth)):
             object.__setattr__(self, field, value if value is None else _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
@@ -87,6 +95,7 @@ class Free:
         words = [repr(value) for value in (self.start, self.low, self.high)]
         words += [] if self.prior == Uniform() else [repr(self.prior)]
         words += [] if self.smooth is None else [f"smooth={self.smooth!r}"]
+        words += ["shared=True"] if self.shared else []
         return f"Free({', '.join(words)})"
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

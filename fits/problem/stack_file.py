@@ -9,6 +9,7 @@
     kind = "Medium"
     thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
     phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
+    f0 = { start = 0.04, low = 0.0, high = 0.2, shared = true }     # `smooth` and `shared`: see `Free`
 
     [base]
     kind = "Lambertian"

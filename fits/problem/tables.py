@@ -42,7 +42,7 @@ _TRANSPORTS: _Kinds = {
 _LAWS: _Kinds = {"PowerLaw": PowerLaw}
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
 SHARED = "correlated"
-_FREE_KEYS = ("start", "low", "high", "prior", "smooth")
+_FREE_KEYS = ("start", "low", "high", "prior", "smooth", "shared")
 
 
 MATERIAL = ("gallery", "layers", "base", "mixture")
@@ -206,8 +206,9 @@ def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
     bounds = {key: numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
     prior = cast(Prior, _build(f"{where}.prior", table["prior"], _PRIORS)) if "prior" in table else None
     smooth = numbers(f"{where}.smooth", table["smooth"], ANY) if "smooth" in table else None
+    shared = truth(f"{where}.shared", table["shared"]) if "shared" in table else False
     try:
-        return Free(**bounds, prior=prior, smooth=smooth)
+        return Free(**bounds, prior=prior, smooth=smooth, shared=shared)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 
@@ -290,7 +291,7 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 def to_plain(value: Any) -> Any:
     if isinstance(value, Free):
         table = {key: getattr(value, key) for key in _FREE_KEYS}
-        left_out = {"prior": Uniform(), "smooth": None}
+        left_out = {"prior": Uniform(), "smooth": None, "shared": False}
         return {key: to_plain(entry) for key, entry in table.items() if key not in left_out or entry != left_out[key]}
     if isinstance(value, str | bool | int):
         return value
