@@ -25,7 +25,7 @@ import numpy as np
 from fits._files import write_text
 from fits.data import geometry
 from fits.data.formats._text import Line, content, plural, read_lines
-from fits.data.geometry import Floats
+from fits.data.geometry import Floats, Geometry
 from fits.data.measurements import QUANTITIES, Measurements, Quantity, Source, channel_names, check_quantity, to_bsdf
 from fits.data.totals import Totals
 
@@ -69,19 +69,9 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     chosen = _QUANTITY_OF[kind]
 
     written_here = lines[0].text == _FIRST_LINE
-
-    theta_i = table.column("theta_i", _BELOW_TOO if written_here else _ABOVE)
-    if "phi_i" in table.names or "phi_o" in table.names:
-        phi_i, phi_o = table.column("phi_i", _PHI), table.column("phi_o", _PHI)
-        theta_o = table.column("theta_o", _BELOW_TOO)
-        notes = []
-    else:
-        phi_i, phi_o = np.full(len(body), geometry.LIGHT_AZIMUTH), np.zeros(len(body))
-        theta_o = table.column("theta_o", _SIGNED)
-        notes = ["no azimuth columns: theta_o is signed, in the plane of incidence, positive on the mirror side"]
+    wi, wo, notes = _directions(table, written_here)
     if kind != chosen:
         notes.append(f"{_named(list(channels.values()))} taken for {_MEANING[chosen]}")
-    wi, wo = geometry.direction(theta_i, phi_i), geometry.direction(theta_o, phi_o)
 
     values = to_bsdf(np.stack([table.column(name) for name in channels.values()], axis=-1), wo, chosen)
     used = table.column("used", (0.0, 1.0)) == 1 if "used" in table.names else np.ones(len(body), bool)
@@ -105,6 +95,16 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
         notes.append(f"{plural(int((values < 0).any(axis=1).sum()), 'sample')} below zero, kept as measured")
     source = _source(path, lines, chosen, notes, written_here)
     return Measurements(wi, wo, values, sigma, used, tuple(channels), source)
+
+
+def read_directions(path: Path) -> Geometry:
+    """The directions of a CSV, one pair a line, whether it holds values or not. Errors as in `fits.read`."""
+    lines = read_lines(path)
+    rows = content(lines)
+    if not rows:
+        raise ValueError(f"{path}: the file holds only comments, must have a header line")
+    wi, wo, _ = _directions(Table(rows[0], rows[1:]), lines[0].text == _FIRST_LINE)
+    return Geometry(wi, wo)
 
 
 def write_csv(measurements: Measurements, path: str | Path, force: bool = False) -> None:
@@ -155,6 +155,20 @@ def csv_text(measurements: Measurements) -> str:
     for *numbers, used in zip(*columns, measurements.mask, strict=True):
         writer.writerow([*(repr(float(number)) for number in numbers), int(used)])
     return text.getvalue()
+
+
+def _directions(table: "Table", written_here: bool) -> tuple[Floats, Floats, list[str]]:
+    """Unit vectors towards light and viewer, (N, 3) each, and what is to be noted of them."""
+    theta_i = table.column("theta_i", _BELOW_TOO if written_here else _ABOVE)
+    notes = []
+    if "phi_i" in table.names or "phi_o" in table.names:
+        phi_i, phi_o = table.column("phi_i", _PHI), table.column("phi_o", _PHI)
+        theta_o = table.column("theta_o", _BELOW_TOO)
+    else:
+        phi_i, phi_o = np.full(len(theta_i), geometry.LIGHT_AZIMUTH), np.zeros(len(theta_i))
+        theta_o = table.column("theta_o", _SIGNED)
+        notes = ["no azimuth columns: theta_o is signed, in the plane of incidence, positive on the mirror side"]
+    return geometry.direction(theta_i, phi_i), geometry.direction(theta_o, phi_o), notes
 
 
 class Table:
