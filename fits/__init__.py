@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from fits.inference.prediction import Scores as Scores
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
+    from fits.maps.fitted_map import FittedMap as FittedMap
+    from fits.maps.fitted_map import open_map as open_map
     from fits.problem.correlated import Correlated as Correlated
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
@@ -72,6 +74,8 @@ _HOMES = {
     "Exported": "exporting.export",
     "export": "exporting.export",
     "Fit": "inference.fit_result",
+    "FittedMap": "maps.fitted_map",
+    "open_map": "maps.fitted_map",
     "Foresight": "inference.foresight",
     "read": "data.formats",
     "write_csv": "data.formats.csv",

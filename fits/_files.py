@@ -57,8 +57,8 @@ def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any], force: bool = False) -> None:
     """Write a JSON file that holds a checksum of itself; numbers that are not finite become "nan", "inf", "-inf"."""
-    plain = _plain(content)
-    write_text(path, json.dumps(plain | {CHECKSUM: _checksum(plain)}, indent=1) + "\n", force)
+    written = plain(content)
+    write_text(path, json.dumps(written | {CHECKSUM: _checksum(written)}, indent=1) + "\n", force)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -85,13 +85,14 @@ def _checksum(content: Mapping[str, Any]) -> str:
     return f"{zlib.crc32(json.dumps(content).encode()):08x}"
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The value as JSON holds it: mappings, lists and words; numbers that are not finite are "nan", "inf", "-inf"."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if hasattr(value, "tolist"):
-        return _plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist())
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -145,7 +145,16 @@ def test_importing_layerjax_loads_only_jax_equinox_numpy():
 
 
 def test_importing_fits_pays_for_nothing_unused():
-    assert not loaded_by("import fits") & {"arviz", "matplotlib", "jaxopt", "h5py", "rich", "emcee", "optimistix"}
+    assert not loaded_by("import fits") & {
+        "arviz",
+        "matplotlib",
+        "jaxopt",
+        "h5py",
+        "zarr",
+        "rich",
+        "emcee",
+        "optimistix",
+    }
 
 
 @pytest.mark.parametrize("room", [fits, fits.problem, fits.inference, fits.reporting], ids=lambda room: room.__name__)
