@@ -76,8 +76,8 @@ def _libraries() -> Any:
 
 
 def cores() -> int:
-    """Of this machine."""
-    return os.cpu_count() or 1
+    """That this process may use, of this machine."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_room() -> None:
