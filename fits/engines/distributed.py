@@ -1,0 +1,203 @@
+"""Tasks by the workers of a dask.distributed cluster, wherever they are.
+
+A worker takes one task at a time; those of several threads share a process, which its libraries may not bear.
+"""
+
+import asyncio
+import pickle
+import threading
+import time
+import uuid
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from contextlib import contextmanager, suppress
+from itertools import islice
+from typing import Any
+
+from fits.engines.failures import MOST_DEATHS, Failure, attempt, one_line
+from fits.engines.worker import precision, take_after
+
+IN_FLIGHT = 4
+"""Tasks for each thread of a worker that the scheduler knows of."""
+
+WAITED = 60.0
+"""Seconds for the first worker."""
+
+COUNTED = 5.0
+"""Seconds after which workers are counted again: some clusters grow."""
+
+RETRIES = 3
+"""Of a task that ends by an error which is neither its own nor the death of its worker."""
+
+AGAIN, LATER = object(), object()
+"""In the place of an outcome, where the task is to be done once more."""
+
+
+def run_distributed(
+    work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], client: Any
+) -> Iterator[tuple[int, Any]]:
+    """See `fits.engines.run`."""
+    try:
+        import cloudpickle
+        from distributed import Client
+    except ImportError:
+        raise ValueError('client= needs distributed: pip install "layerjax[distributed]"') from None
+    if not isinstance(client, str | Client) or getattr(client, "asynchronous", False):
+        raise ValueError(f"client is {client!r}; it must be a distributed.Client, or the address of a scheduler")
+    try:
+        payload = cloudpickle.dumps((work, shared))
+        packed = [cloudpickle.dumps(task) for task in tasks]
+    except Exception as error:  # of any kind, as each class has its own
+        raise ValueError(f"what tasks need cannot be pickled for the workers: {one_line(error)}") from None
+    return _results(payload, packed, client)
+
+
+def _results(payload: bytes, tasks: list[bytes], given: Any) -> Iterator[tuple[int, Any]]:
+    if not tasks:
+        return
+    with _connected(given) as client:
+        run = _Run(client, payload, tasks)
+        try:
+            yield from run.results()
+        finally:
+            with suppress(Exception):  # of a scheduler that has gone
+                client.cancel(list(run.running), force=True)
+
+
+@contextmanager
+def _connected(given: Any) -> Iterator[Any]:
+    """A client; one of our own for an address, and it ends with the block."""
+    from distributed import Client
+
+    if not isinstance(given, str):
+        yield given
+        return
+    try:
+        client = Client(given, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"{given}: there is no scheduler ({one_line(error)})") from None
+    try:
+        yield client
+    finally:
+        with suppress(Exception):
+            client.close(timeout=1)
+
+
+class _Run:
+    """Tasks on their way through a scheduler."""
+
+    def __init__(self, client: Any, payload: bytes, tasks: list[bytes]):
+        self.client, self.payload, self.tasks = client, payload, tasks
+        self.name = f"layerjax-{uuid.uuid4().hex[:12]}"
+        self.running: dict[Any, int] = {}
+        self.losses: Counter[int] = Counter()
+        self.suspects: list[int] = []
+        self.shared: Any = None
+        self.room, self.counted = 1, float("-inf")
+
+    def results(self) -> Iterator[tuple[int, Any]]:
+        """Tasks a few at a time; in the end, each alone, those that were in hand where workers died too often."""
+        with self._reached():
+            self.client.wait_for_workers(1, timeout=WAITED)
+        yield from self._through(list(range(len(self.tasks))), alone=False)
+        for index in self.suspects:
+            yield from self._through([index], alone=True)
+
+    def _through(self, indices: list[int], alone: bool) -> Iterator[tuple[int, Any]]:
+        from distributed import as_completed
+
+        left = iter(indices)
+
+        def begin() -> list[Any]:
+            with self._reached():
+                return [self._submit(index) for index in islice(left, self._room() - len(self.running))]
+
+        completed = as_completed(begin())
+        for future in completed:
+            index = self.running.pop(future)
+            outcome = self._outcome(future, index, alone)
+            future.release()
+            if outcome is AGAIN:
+                with self._reached():
+                    completed.add(self._submit(index))
+            completed.update(begin())
+            if outcome is not AGAIN and outcome is not LATER:
+                yield index, outcome
+
+    def _outcome(self, future: Any, index: int, alone: bool) -> Any:
+        """The result of a task that has ended, its failure, or when it is to be done once more."""
+        from distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker as killed:
+            if alone:
+                return Failure(f"its worker died {getattr(killed, 'allowed_failures', MOST_DEATHS) + 1} times")
+            self.suspects.append(index)  # the worker may have died of a task beside it
+            return LATER
+        except (futures.CancelledError, asyncio.CancelledError):
+            self._require_scheduler()
+            self.losses[index] += 1
+            self.shared = None  # it may be lost as well
+            return AGAIN if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
+        except ImportError as error:
+            raise ValueError(
+                f"the workers of {self._address()} lack what this process has: {one_line(error)}"
+            ) from None
+        except OSError:
+            self._require_scheduler()
+            raise  # of the task: the disk is full
+
+    def _submit(self, index: int) -> Any:
+        if self.shared is None:  # a task, not scattered data: it is done again where the workers that had it are killed
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message="Sending large graph")
+                self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.losses.total()}")
+        name = f"{self.name}-{index}-{self.losses[index]}-{self.suspects.count(index)}"
+        given = (self.shared, self.name, self.tasks[index], precision())
+        future = self.client.submit(perform, *given, key=name, retries=RETRIES, pure=False)
+        self.running[future] = index
+        return future
+
+    def _room(self) -> int:
+        """Tasks that may be on their way."""
+        if time.monotonic() - self.counted > COUNTED:
+            self.room = IN_FLIGHT * max(1, sum(self.client.nthreads().values()))
+            self.counted = time.monotonic()
+        return self.room
+
+    def _address(self) -> str:
+        return str(getattr(self.client.scheduler, "address", "the cluster"))
+
+    def _require_scheduler(self) -> None:
+        if self.client.status != "running":
+            raise OSError(f"{self._address()}: the scheduler has gone away") from None
+
+    @contextmanager
+    def _reached(self) -> Iterator[None]:
+        """Errors on the way to the scheduler name it."""
+        try:
+            yield
+        except TimeoutError:
+            self._require_scheduler()
+            raise OSError(f"{self._address()}: no worker came within {WAITED:g} s") from None
+        except (OSError, RuntimeError, ValueError) as error:
+            self._require_scheduler()
+            raise OSError(f"{self._address()}: {one_line(error)}") from None
+
+
+_kept: dict[str, Any] = {}
+_keeping = threading.Lock()
+
+
+def perform(payload: bytes, name: str, task: bytes, double: bool | None) -> Any:
+    """A task in a worker; of each run that has this name it is set up, and unpacks what tasks share, once."""
+    with _keeping:
+        if name not in _kept:
+            take_after(double)
+            _kept.clear()
+            _kept[name] = pickle.loads(payload)
+        work, shared = _kept[name]
+    return attempt(work, shared, pickle.loads(task))

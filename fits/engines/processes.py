@@ -1,0 +1,194 @@
+"""Tasks by processes of this machine, each on a core of its own: a worker that is killed costs what it had in hand."""
+
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import connection, current_process, get_context, resource_tracker
+from pathlib import Path
+from typing import Any
+
+from fits.engines.failures import MOST_DEATHS, Failure
+from fits.engines.worker import READY, Raised, environment, serve
+
+AGAIN = 78
+"""Exit code of a worker that runs its parent's script to the point where that started workers."""
+
+SHORT = 1 << 14
+"""Bytes that fit into the pipe by which a process is started; of more there is a file."""
+
+PATIENCE = 5.0
+"""Seconds that a worker has to end when there is nothing left to do."""
+
+_environ = threading.Lock()
+
+
+def run_processes(
+    work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], processes: int
+) -> Iterator[tuple[int, Any]]:
+    """See `fits.engines.run`."""
+    if getattr(current_process(), "_inheriting", False):  # a script without `if __name__ == "__main__":`
+        sys.exit(AGAIN)
+    payload = _pickled((work, shared), "what tasks share")
+    packed = [_pickled(task, "a task") for task in tasks]
+    return _results(payload, packed, min(processes, len(tasks)))
+
+
+def _pickled(what: Any, called: str) -> bytes:
+    try:
+        return pickle.dumps(what, protocol=pickle.HIGHEST_PROTOCOL)
+    except Exception as error:  # of any kind, as each class has its own
+        raise ValueError(
+            f"{called} cannot be pickled for other processes ({' '.join(str(error).split())}): lambdas and functions "
+            "inside of functions cannot, such as a transport of that kind; processes=1 works with them"
+        ) from None
+
+
+class _Worker:
+    """A process on a core, this end of the pipe to it, and the index of the task that it has or gets first."""
+
+    def __init__(self, payload: bytes | str, core: int | None, index: int):
+        self.core, self.index, self.ready = core, index, False
+        self.pipe, theirs = connection.Pipe()
+        self.process = get_context("spawn").Process(target=serve, args=(theirs, payload, core), daemon=True)
+        try:
+            with _as_workers_start():
+                self.process.start()
+        finally:
+            theirs.close()  # it is theirs alone: once it is closed they have gone
+
+    def send(self, task: bytes) -> None:
+        with suppress(OSError):  # it has gone, as its pipe will tell
+            self.pipe.send_bytes(task)
+
+    def receive(self) -> bytes | None:
+        """What it has sent; None: it has gone."""
+        try:
+            return self.pipe.recv_bytes()
+        except (EOFError, OSError):
+            self.process.kill()
+            self.process.join()
+            return None
+
+    def end(self) -> None:
+        self.pipe.close()
+        self.process.kill()
+        self.process.join()
+
+
+class _Pool:
+    """Workers, and the tasks that are left for them."""
+
+    def __init__(self, payload: bytes | str, tasks: list[bytes]):
+        self.payload, self.tasks = payload, tasks
+        self.left = iter(range(len(tasks)))
+        self.deaths: Counter[int] = Counter()
+        self.workers: list[_Worker] = []
+        self.finished: list[_Worker] = []
+
+    def start(self, core: int | None, index: int) -> None:
+        self.workers.append(_Worker(self.payload, core, index))
+
+    def hear(self, worker: _Worker) -> tuple[int, Any] | None:
+        """Take what a worker says, or that it has gone, and give it what comes next; returns what has ended."""
+        index, message = worker.index, worker.receive()
+        if message is None:
+            return self._replace(worker)
+        if message == READY:
+            worker.ready = True
+            worker.send(self.tasks[index])
+            return None
+        outcome = pickle.loads(message)
+        if isinstance(outcome, Raised):
+            raise outcome.error
+        following = next(self.left, None)
+        if following is None:
+            worker.pipe.close()  # it ends by itself
+            self.workers.remove(worker)
+            self.finished.append(worker)
+        else:
+            worker.index = following
+            worker.send(self.tasks[following])
+        return index, outcome
+
+    def _replace(self, worker: _Worker) -> tuple[int, Any] | None:
+        """Another in the place of one that has gone, with the same task, unless that has cost enough of them."""
+        self.workers.remove(worker)
+        worker.pipe.close()
+        code, index = worker.process.exitcode or 0, worker.index
+        if not worker.ready and code > 0:
+            raise ValueError(_cannot_start(code))
+        self.deaths[index] += 1
+        lost = self.deaths[index] >= MOST_DEATHS
+        following = next(self.left, None) if lost else index
+        if following is not None:
+            self.start(worker.core, following)
+        return (index, Failure(f"its worker died {MOST_DEATHS} times ({_death(code)})")) if lost else None
+
+    def end(self, patience: float) -> None:
+        """Those that have nothing left to do have so many seconds, all others none."""
+        end = time.monotonic() + patience
+        for worker in self.finished:
+            worker.process.join(max(0.0, end - time.monotonic()))
+        for worker in (*self.workers, *self.finished):
+            worker.end()
+
+
+def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    with tempfile.TemporaryDirectory(prefix="layerjax-") as folder:
+        path = Path(folder) / "shared.pickle"
+        if len(payload) > SHORT:
+            path.write_bytes(payload)
+        pool, patience = _Pool(payload if len(payload) <= SHORT else str(path), tasks), 0.0
+        try:
+            for number, index in zip(range(count), pool.left, strict=False):
+                pool.start(cores[number % len(cores)], index)
+            while pool.workers:
+                heard = connection.wait([worker.pipe for worker in pool.workers])
+                workers = [worker for worker in pool.workers if worker.pipe in heard]
+                yield from [ended for worker in workers if (ended := pool.hear(worker)) is not None]
+            patience = PATIENCE
+        finally:
+            pool.end(patience)
+
+
+@contextmanager
+def _as_workers_start() -> Iterator[None]:
+    """Within it, a process starts with what a worker needs, and deaf to Ctrl-C, which is for its parent."""
+    resource_tracker.ensure_running()  # its start would make the process hear again
+    masks = hasattr(signal, "pthread_sigmask")
+    with _environ:
+        before = dict(os.environ)
+        heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
+        try:
+            os.environ.update(environment())
+            yield
+        finally:
+            for name in set(os.environ) - set(before):
+                del os.environ[name]
+            os.environ.update(before)
+            if heard is not None:
+                signal.pthread_sigmask(signal.SIG_SETMASK, heard)
+
+
+def _cannot_start(code: int) -> str:
+    guard = 'what the script does must stand under `if __name__ == "__main__":`'
+    if code == AGAIN:
+        return f"each worker process runs the script that asks for it: {guard}, or processes must be 1"
+    return f"a worker process cannot start (exit code {code}, and what it says is above): {guard}"
+
+
+def _death(code: int) -> str:
+    if code >= 0:
+        return f"exit code {code}"
+    with suppress(ValueError):
+        name = signal.Signals(-code).name
+        return f"{name}, which systems send where memory is short" if name == "SIGKILL" else name
+    return f"signal {-code}"

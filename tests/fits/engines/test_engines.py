@@ -1,0 +1,224 @@
+"""Tasks end alike whoever does them, and one that fails costs itself alone."""
+
+import errno
+import multiprocessing
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fits.engines import Failure, run
+from fits.engines.processes import _death
+from tests.helpers import tasks
+from tests.helpers.places import ROOT
+
+ENGINES: dict[str, dict[str, Any]] = {"threads": {}, "processes": {"processes": 2}}
+
+
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest) -> dict[str, Any]:
+    return ENGINES[request.param]
+
+
+@pytest.fixture(autouse=True)
+def no_child() -> Iterator[None]:
+    """Whatever happens, no process is left behind."""
+    yield
+    assert multiprocessing.active_children() == []
+
+
+def running(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_results_come_as_they_end(engine: dict[str, Any]) -> None:
+    found = list(run(tasks.square, 5, range(12), **engine))
+    assert sorted(found) == [(index, index * index + 5) for index in range(12)]
+
+
+def test_nothing_to_do_is_done_at_once(engine: dict[str, Any]) -> None:
+    assert list(run(tasks.square, 5, [], **engine)) == []
+
+
+def test_fewer_than_one_process_is_refused_before_anything_is_asked_for() -> None:
+    with pytest.raises(ValueError, match="processes is 0; it must be at least 1"):
+        run(tasks.square, 5, [1], processes=0)
+
+
+def test_a_task_that_fails_costs_itself_alone(engine: dict[str, Any]) -> None:
+    found = dict(run(tasks.picky, None, [0, 1, 2, 5], **engine))
+    assert found[0] == 0
+    assert found[3] == 5
+    assert found[1] == Failure("task is 1; it must not be")
+    assert found[2] == Failure("there.csv: no such file or directory")
+
+
+def test_a_full_disk_ends_the_run(engine: dict[str, Any]) -> None:
+    with pytest.raises(OSError, match="No space left") as error:
+        list(run(tasks.picky, None, [0, 3, 5], **engine))
+    assert (error.value.errno, error.value.filename) == (errno.ENOSPC, "full.csv")
+
+
+def test_a_mistake_ends_the_run_and_says_where(engine: dict[str, Any]) -> None:
+    with pytest.raises(TypeError, match="a mistake in the code") as error:
+        list(run(tasks.picky, None, [0, 4, 5], **engine))
+    if engine:
+        assert "in picky" in "".join(error.value.__notes__)
+
+
+def test_a_task_that_kills_its_worker_costs_itself_alone(tmp_path: Path) -> None:
+    found = dict(run(tasks.deadly, str(tmp_path / "tried"), range(6), processes=2))
+    assert found.pop(2) == Failure("its worker died 3 times (SIGKILL, which systems send where memory is short)")
+    assert found == {index: index for index in (0, 1, 3, 4, 5)}
+    tried = Counter((tmp_path / "tried").read_text().split())
+    assert tried == {"2": 3, "0": 1, "1": 1, "3": 1, "4": 1, "5": 1}
+
+
+def test_workers_may_be_killed_at_any_moment(tmp_path: Path) -> None:
+    """As they start, while they work, and between: each loses what it has in hand, which is done again."""
+    generator, over = random.Random(3), threading.Event()
+    killed = []
+
+    def killer() -> None:
+        while not over.wait(0.2 + 0.3 * generator.random()) and len(killed) < 8:
+            for child in generator.sample(multiprocessing.active_children(), 1):
+                if child.pid is not None:
+                    os.kill(child.pid, signal.SIGKILL)
+                    killed.append(child.pid)
+
+    thread = threading.Thread(target=killer)
+    found = run(tasks.slow, str(tmp_path), range(30), processes=2)
+    thread.start()
+    try:
+        results = dict(found)
+    finally:
+        over.set()
+        thread.join()
+    assert len(killed) >= 4
+    failed = {index for index, result in results.items() if isinstance(result, Failure)}
+    assert len(failed) <= 1  # three of eight kills may meet one task
+    assert {index: results[index] for index in results if index not in failed} == {
+        index: index * index for index in range(30) if index not in failed
+    }
+
+
+def test_whoever_leaves_the_loop_ends_the_workers_at_once(tmp_path: Path) -> None:
+    found = run(tasks.slow, str(tmp_path), range(1000), processes=2)
+    next(found)
+    began = time.monotonic()
+    found.close()  # type: ignore[attr-defined]
+    assert time.monotonic() - began < 1.0
+    assert multiprocessing.active_children() == []
+
+
+def test_what_cannot_be_sent_is_named(engine: dict[str, Any]) -> None:
+    transport = lambda stack, wi, wo: None  # noqa: E731
+    if not engine:
+        assert list(run(tasks.nothing, {"transport": transport}, [1])) == [(0, None)]
+        return
+    with pytest.raises(ValueError, match=r"what tasks share cannot be pickled.*lambda.*processes=1 works"):
+        run(tasks.nothing, {"transport": transport}, [1], **engine)
+    with pytest.raises(ValueError, match="a task cannot be pickled"):
+        run(tasks.nothing, None, [transport], **engine)
+    with pytest.raises(ValueError, match="the result of a task, a function, cannot be pickled"):
+        list(run(tasks.unpicklable, None, [1], **engine))
+
+
+def test_a_worker_is_set_as_its_parent_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Precision and compile cache; one core each, deaf to Ctrl-C; what is large goes by a file."""
+    import jax
+
+    large = np.arange(10_000.0)
+    found = [result for _, result in run(tasks.surroundings, large, [0, 1], processes=2)]
+    for seen in found:
+        assert seen["total"] == 64.0**3
+        assert seen["double"]
+        assert seen["cache"] == jax.config.values["jax_compilation_cache_dir"]
+        assert seen["least"] == 0.2
+        assert "--xla_cpu_multi_thread_eigen=false" in seen["flags"].split()
+        assert seen["interrupts"]
+        np.testing.assert_array_equal(seen["shared"], large)
+    allowed = os.sched_getaffinity(0)
+    assert {core for seen in found for core in seen["cores"]} <= allowed
+    assert all(len(seen["cores"]) == 1 for seen in found)
+    assert "--xla_cpu_multi_thread_eigen=false" not in os.environ.get("XLA_FLAGS", "")
+
+
+SCRIPT = """
+import sys, time
+from fits.engines import run
+from tests.helpers import tasks
+{guard}for found in run(tasks.slow, {folder!r}, range({count}), processes=2):
+    {indent}print(*found, flush=True)
+"""
+
+
+def script(folder: Path, guard: bool, count: int) -> list[str]:
+    line = 'if __name__ == "__main__":\n    ' if guard else ""
+    text = SCRIPT.format(folder=str(folder), count=count, guard=line, indent="    " * guard)
+    (folder / "script.py").write_text(text)
+    return [sys.executable, str(folder / "script.py")]
+
+
+def begun(words: list[str]) -> subprocess.Popen[str]:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
+    try:
+        return subprocess.Popen(
+            words, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        )
+    finally:
+        signal.signal(signal.SIGINT, ours)
+
+
+def test_a_script_that_has_no_main_guard_is_told_so(tmp_path: Path) -> None:
+    with begun(script(tmp_path, guard=False, count=4)) as process:
+        output, error = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert output == ""
+    assert error.count("Traceback") == 1
+    last = error.strip().splitlines()[-1]
+    assert last.startswith("ValueError: each worker process runs the script that asks for it")
+    assert '`if __name__ == "__main__":`' in last
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=lambda sent: sent.name)
+def test_workers_end_with_their_parent(tmp_path: Path, sent: signal.Signals) -> None:
+    """Ctrl-C goes to all processes of a terminal; a parent that is killed can tell nobody."""
+    with begun(script(tmp_path, guard=True, count=10_000)) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        workers = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
+        assert any(map(running, workers))
+        if sent == signal.SIGINT:
+            os.killpg(process.pid, sent)
+        else:
+            process.kill()
+        process.wait(timeout=10)
+        end = time.monotonic() + 10
+        while any(map(running, workers)):
+            assert time.monotonic() < end, "a worker lingers"
+            time.sleep(0.01)
+        error = process.stderr.read()
+    assert process.returncode == -sent
+    assert error.count("KeyboardInterrupt") == (sent == signal.SIGINT)
+
+
+def test_deaths_are_told_by_name() -> None:
+    assert _death(-signal.SIGSEGV) == "SIGSEGV"
+    assert _death(1) == "exit code 1"
+    assert _death(-99) == "signal 99"

@@ -1,0 +1,69 @@
+"""Work for engines to do, importable by the processes that do it."""
+
+import errno
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+
+def square(shared: Any, task: int) -> int:
+    """Squares and adds what is shared; odd tasks take longer, so that they end in another order."""
+    time.sleep(0.01 * (task % 2))
+    return task * task + int(shared)
+
+
+def picky(shared: Any, task: int) -> int:
+    """Refuses some tasks, each in a way of its own."""
+    if task == 1:
+        raise ValueError("task is 1;\n it must not be")
+    if task == 2:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "there.csv")
+    if task == 3:
+        raise OSError(errno.ENOSPC, "No space left on device", "full.csv")
+    if task == 4:
+        raise TypeError("a mistake in the code")
+    return task
+
+
+def nothing(shared: Any, task: Any) -> None:
+    """What it costs to ask."""
+
+
+def deadly(shared: str, task: int) -> int:
+    """The task that is given kills its worker whenever it is tried; all leave a line in a file."""
+    with open(shared, "a") as file:
+        file.write(f"{task}\n")
+    if task == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return task
+
+
+def slow(shared: str, task: int) -> int:
+    """Tells its process in a file, takes a while, and squares."""
+    Path(shared, f"{os.getpid()}").touch()
+    time.sleep(0.15)
+    return task * task
+
+
+def unpicklable(shared: Any, task: Any) -> Any:
+    return lambda: task
+
+
+def surroundings(shared: Any, task: Any) -> dict[str, Any]:
+    """What JAX is set to where the task runs, after it has computed."""
+    import jax
+    import jax.numpy as jnp
+
+    total = float(jax.jit(lambda x: (x @ x).sum())(jnp.ones((64, 64))))
+    return {
+        "total": total,
+        "double": jnp.zeros(1).dtype == jnp.float64,
+        "cache": jax.config.values["jax_compilation_cache_dir"],
+        "least": jax.config.values["jax_persistent_cache_min_compile_time_secs"],
+        "flags": os.environ.get("XLA_FLAGS", ""),
+        "cores": sorted(os.sched_getaffinity(0)),
+        "interrupts": signal.getsignal(signal.SIGINT) == signal.SIG_IGN,
+        "shared": shared,
+    }
