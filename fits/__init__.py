@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from fits.inference.prediction import Scores as Scores
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
+    from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
     from fits.problem.correlated import Correlated as Correlated
@@ -74,6 +75,7 @@ _HOMES = {
     "Exported": "exporting.export",
     "export": "exporting.export",
     "Fit": "inference.fit_result",
+    "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
     "Foresight": "inference.foresight",

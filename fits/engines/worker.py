@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 
 from fits.engines.failures import attempt
 
-FLAGS = ("--xla_cpu_multi_thread_eigen=false", "intra_op_parallelism_threads=1")
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LEAST_COMPILE = 1.0
 """Programs that took so many seconds to compile are kept."""
@@ -39,10 +38,7 @@ class Raised(NamedTuple):
 
 def environment() -> dict[str, str]:
     """Variables of a worker process that are not those of this one."""
-    found = dict.fromkeys(ONE_THREAD, "1")
-    given = os.environ.get("XLA_FLAGS", "").strip()
-    if not given or given.startswith("-"):  # else it names a file
-        found["XLA_FLAGS"] = " ".join((given, *(flag for flag in FLAGS if flag not in given))).strip()
+    found = dict.fromkeys(ONE_THREAD, "1")  # XLA has as many as cores that it may run on; its flags change results
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
         found["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax = sys.modules.get("jax")

@@ -6,7 +6,7 @@
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, get_args
 
@@ -70,6 +70,10 @@ class Problem(Posed):
 
     def __post_init__(self) -> None:
         _ = self._assembled  # now, so that what does not fit together is refused where it was given
+
+    def __getstate__(self) -> dict[str, Any]:
+        # what it was made from: a model knows parts of its trees by identities, which do not outlive a process
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     @cached_property
     def _assembled(self) -> Assembled:

@@ -1,0 +1,281 @@
+"""A fit for every texel of a map, chunk by chunk, into a store."""
+
+import math
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+import zarr
+
+import layerjax
+from fits._files import locked
+from fits.engines import Failure, run
+from fits.maps.chunk_files import Block, grid
+from fits.maps.fitted_map import FittedMap, is_store, open_map
+from fits.maps.identity import digest, require_same
+from fits.maps.inputs import Readings, readings
+from fits.maps.job import Job, Task, part_of, work
+from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
+from fits.maps.store import KEY, clean, create, left
+from fits.problem.instrument import Instrument
+from fits.problem.likelihood import Noise, Objective
+from fits.problem.model import Transport
+from fits.problem.parameters import Free
+from fits.progress import Progress
+
+if TYPE_CHECKING:
+    from fits.data.geometry import Geometry
+
+MOST_PARAMETERS = 32
+
+
+def fit_map(
+    stack: Any,
+    geometry: "Geometry | Any",
+    values: Any,
+    out: str | Path,
+    noise: Noise | None = None,
+    client: Any = None,
+    *,
+    transport: Transport = "auto",
+    scale: float | Free | None = None,
+    objective: Objective = "likelihood",
+    instrument: Instrument | None = None,
+    sigma: Any = None,
+    mask: Any = None,
+    starts: int = 8,
+    seed: int = 0,
+    sample: int = 64,
+    chunk: int = 1024,
+    processes: int = 1,
+    tabulate: bool | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> FittedMap:
+    """Fit a stack to the readings of every texel of a map, into a zarr store that grows chunk by chunk.
+
+    A sample of the texels is fitted first, from many starts: it says at which resolution an exact transport has to be
+    solved, what numbers are that all texels share (`Free(..., shared=True)`, a joint fit of the sample, held from then
+    on: errors of the others are conditional on them), and where all other fits begin. Every texel then begins where the
+    likeliest of the sample ended, and is begun again, from others of these ends, from its neighbours within the chunk
+    and from points all over the box, only where its chi-square says that it ended poorly: a second minimum that fits as
+    well is not looked for. What is in the store is not done again, and the result does not depend on who did the work.
+
+    Args:
+        stack: holds `Free` where each texel has a number of its own, or all share one.
+        geometry, values, sigma, mask: see `fits.maps.inputs.readings`: arrays or files, values (..., N, C) in 1/sr.
+        out: directory of the store, made here, or begun by an earlier call with the same arguments.
+        noise: as in `fits.fit`, but independent; a floor that it leaves out is one for the whole map.
+        client: a `distributed.Client`, or the address of a scheduler, whose workers see `out` under the same path.
+        transport, scale, objective, instrument: as in `fits.fit`. There can be no instrument where texels have
+            directions of their own.
+        starts, seed: of each of the first few fits of the sample.
+        sample: texels of it.
+        chunk: texels that are fitted and written together.
+        processes: 1: threads of this process, one a core; of more each has a core of its own.
+        tabulate: whether an exact transport is replaced by a table over the box of the parameters, made once; None:
+            for maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
+        force: throw away a store of other arguments, and begin anew.
+        progress: called with ("sample" or "map", done, all, note).
+
+    Returns:
+        The store, opened: values and standard errors by name, reduced chi-square and flags of each texel.
+
+    Raises:
+        ValueError: arguments that do not fit together, a store of others, one that another process writes, or chunks
+            that could not be read or done: all others are.
+        OSError: of the store, such as a full disk: chunks that are in it stay.
+    """
+    for name, number in {"starts": starts, "sample": sample, "chunk": chunk}.items():
+        if number < 1:
+            raise ValueError(f"{name} is {number}; it must be at least 1")
+    path, found = Path(out), readings(values, geometry, sigma=sigma, mask=mask)
+    if instrument is not None and found.geometry is None:
+        raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
+    rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
+    settings = {"starts": starts, "seed": seed, "sample": sample, "chunk": chunk, "tabulate": tabulate}
+    identity = {name: digest(one) for name, one in {"stack": stack, "noise": noise, **rest}.items()}
+    identity |= {"settings": digest(sorted(settings.items(), key=str)), "readings": found.digest()}
+    identity["precision"] = str(np.dtype(jnp.result_type(float)))
+    with locked(path.with_name(f"{path.name}.lock"), str(path)):
+        root = _begun(path, identity, force)
+        prepared = _prepared(root, found, stack, noise, rest, settings, progress)
+        if root is None:
+            root = _created(path, prepared, found, identity, settings, stack)
+        if GROUP not in root:
+            save(prepared, root)
+        prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
+        failures = _run(path, root, prepared, found, settings, client, processes, progress)
+    if failures:
+        more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
+        raise ValueError(f"{path}: {failures[0]}{more}; all other chunks are done, and another run does these")
+    return open_map(path)
+
+
+def _begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | None:
+    """The store that is there, if it is of the same fit."""
+    if not os.path.lexists(path):
+        return None
+    if not is_store(path):
+        raise ValueError(f"{path}: is there, and is no fitted map; it must be the store of one, or not be there")
+    root = zarr.open_group(path, mode="r+")
+    about: Any = root.metadata.attributes[KEY]
+    if force and about["digests"] != dict(identity):
+        shutil.rmtree(path)
+        return None
+    require_same(path, about["digests"], identity)
+    clean(path)
+    if GROUP in root and "expected" not in root[GROUP].attrs:  # it was killed while it wrote this
+        shutil.rmtree(path / GROUP)
+    return root
+
+
+def _prepared(
+    root: zarr.Group | None,
+    found: Readings,
+    stack: Any,
+    noise: Noise | None,
+    rest: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    progress: Progress | None,
+) -> Prepared:
+    if root is not None and GROUP in root:
+        return load(root, found, stack, noise, **rest)
+    some, places = sampled(found, settings["sample"], 1)
+    problem = prototype(some, found, stack, noise, **rest)
+    if len(problem.names) > MOST_PARAMETERS:
+        raise ValueError(f"stack: {len(problem.names)} parameters are free; of a map at most {MOST_PARAMETERS} can be")
+    enough = some.readings >= len(problem.names)
+    if not enough.any():
+        raise ValueError(f"values: no texel has as many readings as there are free parameters, {len(problem.names)}")
+    return prepare(
+        problem,
+        found,
+        some.rows(enough),
+        places[enough],
+        starts=settings["starts"],
+        seed=settings["seed"],
+        size=settings["chunk"],
+        table=settings["tabulate"],
+        progress=progress,
+    )
+
+
+def _created(
+    path: Path,
+    prepared: Prepared,
+    found: Readings,
+    identity: Mapping[str, str],
+    settings: Mapping[str, Any],
+    stack: Any,
+) -> zarr.Group:
+    problem, reduced = prepared.problem, prepared.reduced[np.isfinite(prepared.reduced)]
+    shared = {}
+    if prepared.shared is not None:
+        errors = prepared.shared.errors
+        shared = {name: {"value": value, "error": errors[name]} for name, value in prepared.shared.values.items()}
+    about = {
+        "version": layerjax.__version__,
+        "digests": dict(identity),
+        "samples": found.samples,
+        "channels": list(problem.data.channels),
+        "stack": repr(stack),
+        "transport": repr(problem.transport),
+        "noise": repr(problem.noise),
+        "settings": dict(settings),
+        "pilot": {
+            "texels": len(prepared.texels),
+            "reduced_chi_square": float(np.median(reduced)) if reduced.size else math.nan,
+            "poor_above": prepared.starts.expected,
+        },
+        "numerical": {**prepared.words, "error": prepared.numerical_error},
+        "shared": shared,
+    }
+    return create(
+        path,
+        names=problem.names,
+        units=problem.units,
+        shape=found.shape,
+        chunk=tile(found.shape, settings["chunk"]),
+        attributes=about,
+        numerical=prepared.numerical_error is not None,
+    )
+
+
+def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
+    """The shape of a chunk of at most so many texels, as square as the last axes of a map allow."""
+    sides, left_over = [1] * len(shape), texels
+    if len(shape) > 1:
+        sides[-1] = min(shape[-1], max(math.isqrt(texels), texels // shape[-2]))
+        left_over //= sides[-1]
+    for axis in reversed(range(len(shape) - 1 if len(shape) > 1 else 1)):
+        sides[axis] = max(1, min(shape[axis], left_over))
+        left_over //= sides[axis]
+    return tuple(sides)
+
+
+def _run(
+    path: Path,
+    root: zarr.Group,
+    prepared: Prepared,
+    found: Readings,
+    settings: Mapping[str, Any],
+    client: Any,
+    processes: int,
+    progress: Progress | None,
+) -> list[str]:
+    """Fit the chunks that are left; what became of those that could not be."""
+    blocks = left(root)
+    every = len(list(grid(found.shape, tile(found.shape, settings["chunk"]))))
+    here = client is None and processes == 1
+    source = found if here else found.portable
+    job = Job(
+        str(path.resolve()),
+        prepared.problem,
+        prepared.starts,
+        prepared.least,
+        settings["chunk"],
+        prepared.numerical_error,
+        source,
+    )
+    failures = []
+    tasks, unreadable = _tasks(blocks, found, source is None)
+    failures += unreadable
+    done = every - len(blocks)
+    _tell(progress, done, every, "")
+    poor = fitted = 0
+    for index, result in run(work, job, tasks, processes=processes, client=client):
+        if isinstance(result, Failure):
+            failures.append(f"{_words(tasks[index].block)}: {result.error}")
+        else:
+            fitted, poor = fitted + result["fitted"], poor + result["poor"]
+        done += 1
+        share = f"{100.0 * poor / fitted:.1f} % poor" if fitted else ""
+        _tell(progress, done, every, share)
+    return failures
+
+
+def _tasks(blocks: list[Block], found: Readings, with_readings: bool) -> tuple[list[Task], list[str]]:
+    """One for each chunk, with its readings where workers cannot read them; and what cannot be read."""
+    if not with_readings:
+        return [Task(block) for block in blocks], []
+    tasks, failures = [], []
+    for block in blocks:
+        try:
+            tasks.append(Task(block, part_of(found, block)))
+        except ValueError as error:
+            failures.append(str(error))
+    return tasks, failures
+
+
+def _words(block: Block) -> str:
+    return f"chunk [{', '.join(f'{one.start}:{one.stop}' for one in block)}]"
+
+
+def _tell(progress: Progress | None, done: int, every: int, note: str) -> None:
+    if progress is not None:
+        progress("map", done, every, note)
