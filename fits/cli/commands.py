@@ -13,6 +13,7 @@ import numpy as np
 
 from fits._files import write_bytes, write_text, write_together
 from fits.cli.interrupts import hint
+from fits.cli.map_reports import report_map
 from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
@@ -23,6 +24,7 @@ from fits.cli.predictions import predict as predict
 from fits.cli.reading import measurements
 from fits.cli.setting import use_jax
 from fits.data.totals import Totals
+from fits.maps.fitted_map import is_store
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -156,7 +158,9 @@ def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
 
 
 def report(arguments: Namespace) -> int:
-    """Write the report of a saved fit again, if asked for beside others."""
+    """Write the report of a saved fit again, if asked for beside others; or that of a fitted map."""
+    if is_store(arguments.directory):
+        return report_map(arguments)
     use_jax()
     from fits.reporting import results
     from fits.reporting.html import report as write_page

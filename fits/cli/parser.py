@@ -157,15 +157,21 @@ def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser = command(
         commands,
         "report",
-        "write the report and the pictures of a result directory again",
+        "write the report and the pictures of a result directory again, or the report of a fitted map",
         "layerjax report result --compare other_result",
     )
-    parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
+    parser.add_argument(
+        "directory", metavar="DIR", help="result directory of `layerjax fit`, or the store of `layerjax fit-map`"
+    )
     parser.add_argument(
         "--compare", nargs="+", default=(), metavar="DIR2", help="results for the same data to compare with"
     )
-    parser.add_argument("--out", metavar="HTML", help="write the report to this file, and leave DIR as it is")
-    add_force(parser, "overwrite the file of --out")
+    parser.add_argument(
+        "--out",
+        metavar="HTML",
+        help="write the report to this file, and leave DIR as it is (default of a map: beside it)",
+    )
+    add_force(parser, "overwrite the file of --out, or the page beside a map")
 
 
 def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:

@@ -1,19 +1,20 @@
 """One HTML file that holds all of a fit: what was fitted, the values, and how far they can be trusted."""
 
-import base64
 import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
 from typing import TYPE_CHECKING, NamedTuple
 
 from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
 from fits.data.totals import Totals
+from fits.maps.fitted_map import FittedMap
 from fits.reporting import tables, verdicts
 from fits.reporting.data_tables import came_as
 from fits.reporting.diagnostics import ResidualStructure, residual_label, residual_structure, standardised
+from fits.reporting.maps.page import report as write_map_page
+from fits.reporting.pages import Pictures, document, image, made_with, section, sentences
 from fits.reporting.plots import data as pictures
 from fits.reporting.plots import model as model_pictures
 from fits.reporting.plots import parameters as parameter_pictures
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from fits.inference.posterior import Posterior
     from fits.inference.prediction import Prediction
 
-Pictures = Mapping[str, bytes]
-
 MOST_ANGLES = 24
 """Incidences that are named one by one."""
 
@@ -42,27 +41,8 @@ class Foretold(NamedTuple):
     prediction: "Prediction"
 
 
-_PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>$title</title>
-<style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; border-bottom: 1px solid #ddd; }
-table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; display: block; overflow-x: auto; }
-th, td { padding: 0.2rem 0.8rem 0.2rem 0; text-align: left; vertical-align: top; } td { border-top: 1px solid #eee; }
-.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-caption { text-align: left; font-weight: 600; white-space: nowrap; }
-figure { margin: 1rem 0; } img { max-width: 100%; } figcaption, .note { font-size: 13px; color: #555; }
-pre { background: #f6f6f6; padding: 0.8rem; font-size: 12.5px; overflow-x: auto; }
-.verdict { background: #fff6e5; border-left: 4px solid #E69F00; padding: 0.5rem 1rem; }
-.verdict.fine { background: #eef7f2; border-color: #009E73; }
-</style></head><body>
-$body
-</body></html>
-""")
-
-
 def report(
-    fit: "Fit",
+    fit: "Fit | FittedMap",
     posterior: "Posterior | None" = None,
     path: str | Path = "report.html",
     *,
@@ -71,10 +51,10 @@ def report(
     unseen: Measurements | None = None,
     force: bool = True,
 ) -> None:
-    """Writes the report of a fit to `path`, whole or not at all.
+    """Writes the report of a fit, or of a fitted map, to `path`, whole or not at all.
 
     Args:
-        fit: what the report is about.
+        fit: what the report is about; of a map, finished or not, nothing else is said but `path` and `force`.
         posterior: what `fits.sample` made of the fit, if it was sampled.
         path: HTML file to write, pictures inside.
         others: further fits of the same data, or their posteriors, by name, to be compared with this one.
@@ -84,8 +64,13 @@ def report(
 
     Raises:
         ValueError: `path` exists and `force` is False, `others` cannot be compared with this fit, or it is one of
-            several measurements (see `Fit.part`).
+            several measurements (see `Fit.part`); or a part of a map is damaged.
     """
+    if isinstance(fit, FittedMap):
+        if posterior is not None or others or unseen is not None:
+            raise ValueError("posterior, others, unseen: of a map there are none; it is reported by itself")
+        write_map_page(fit, path, force)
+        return
     fit.require_one("report")
     foretold = None if unseen is None else foretell(fit, posterior, unseen)
     images = draw(fit, posterior, others, name, foretold)
@@ -187,7 +172,7 @@ def page(
         from fits.inference.compare import compare
 
         sections.append(comparisonsection(compare({name: own, **others}), images))
-    sections.append(_made_with())
+    sections.append(made_with())
     return document(title, sections)
 
 
@@ -212,11 +197,6 @@ def comparisonsection(compared: "Comparison", images: Pictures) -> str:
         tables.html_table(tables.comparison_table(compared)),
         image(images, "comparison", "The fits beside the same data."),
     )
-
-
-def document(title: str, body: Sequence[str]) -> str:
-    """A whole page from its sections."""
-    return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
 
 
 def source_name(data: Measurements) -> str:
@@ -293,30 +273,3 @@ def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures) -> s
         image(images, "corner", "Samples of the posterior; orange: the best fit."),
         image(images, "trace", "Every walker; estimates use what is right of the orange line."),
     )
-
-
-def _made_with() -> str:
-    from fits.reporting.results import versions
-
-    words = [f"{package} {version}" for package, version in versions().items()]
-    return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
-
-
-def section(head: str, *parts: str) -> str:
-    """A part of a page under a heading; empty parts are left out."""
-    return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
-
-
-def sentences(words: Sequence[str]) -> str:
-    """A list of sentences."""
-    return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in words) + "</ul>"
-
-
-def image(images: Pictures, name: str, caption: str) -> str:
-    """A picture with its caption; nothing if there is none of this name."""
-    if name not in images:
-        return ""
-    content = base64.b64encode(images[name]).decode("ascii")
-    caption = html.escape(caption)
-    picture = f'<img alt="{caption}" src="data:image/png;base64,{content}">'
-    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"

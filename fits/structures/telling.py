@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fits.reporting import tables
-from fits.reporting.html import document, image, section, sentences, source_name
+from fits.reporting.html import source_name
+from fits.reporting.pages import document, image, section, sentences
 from fits.reporting.plots.data import CYCLE, GREY, STYLE, as_png
 from fits.reporting.verdicts import listed
 

@@ -227,10 +227,10 @@ def channel_colour(channel: str, index: int) -> str:
     return NAMED.get(channel, CYCLE[index % len(CYCLE)])
 
 
-def as_png(figure: Figure) -> bytes:
-    """The figure as the content of a PNG file."""
+def as_png(figure: Figure, trimmed: bool = True) -> bytes:
+    """The figure as the content of a PNG file. trimmed: without empty margins, else of the size that it has."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, bbox_inches="tight")
+    figure.savefig(buffer, format="png", dpi=130, bbox_inches="tight" if trimmed else None)
     return buffer.getvalue()
 
 

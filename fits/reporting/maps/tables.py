@@ -1,0 +1,153 @@
+"""Tables of a fitted map, for the terminal and the report."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fits.maps.fitted_map import FittedMap
+from fits.maps.store import FLAGS
+from fits.maps.summary import Quartiles, Summary, summarised
+from fits.reporting.tables import Table, with_error
+
+WORST = 12
+"""Texels that are shown of those with the largest chi-square."""
+
+WORDS = {
+    "fitted": "fitted",
+    "converged": "converged",
+    "at_bound": "at a bound",
+    "poor": "poor: chi-square above what noise and the pilot explain",
+    "restarted": "started again",
+    "masked": "masked",
+    "too_few_readings": "too few readings",
+    "failed": "failed: no finite value",
+    "unresolved": "a parameter is not resolved",
+}
+"""What is said of each flag."""
+
+
+def summary(map: FittedMap) -> tuple[Table, Table]:
+    """How many texels have which flag, and the quartiles of what was fitted."""
+    found = summarised(map)
+    return count_table(found), quartile_table(found, map)
+
+
+def count_table(found: Summary) -> Table:
+    """How many texels have each flag, and which share of the map."""
+    rows = [("of the map", found.texels, "")]
+    if found.there < found.texels:
+        rows.append(("there so far", found.there, share(found.there, found.texels)))
+    for flag, count in found.counts.items():
+        if count or flag in ("fitted", "converged"):
+            whole = found.texels if flag in ("fitted", "masked", "too_few_readings", "failed") else found.fitted
+            of = "" if whole == found.texels else " of the fitted"
+            rows.append((WORDS[flag], count, f"{share(count, whole)}{of}"))
+    for name, count in found.at_bound.items():
+        if count:
+            rows.append((f"at a bound: {name}", count, f"{share(count, found.fitted)} of the fitted"))
+    return Table("Texels", ("", "texels", "share"), tuple((words, f"{count:,}", part) for words, count, part in rows))
+
+
+def quartile_table(found: Summary, map: FittedMap) -> Table:
+    """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
+    rows = []
+    for name in map.names:
+        unit, missing = map.units[name], found.no_error[name]
+        note = f"{share(missing, found.fitted)} without error" if missing else ""
+        rows.append((name, *_words(found.values[name]), *_words(found.errors[name]), unit, note))
+    none = ("", "", "")
+    rows.append(("chi-square per degree of freedom", *_words(found.reduced_chi_square), *none, "1", ""))
+    rows.append(("readings", *_words(found.readings), *none, "1", ""))
+    if found.numerical_error is not None:
+        *quartiles, most = found.numerical_error
+        words = _words((quartiles[0], quartiles[1], quartiles[2]))
+        rows.append(("numerical error", *words, *none, "sigma", f"95 % below {most:.2g}"))
+    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit", "")
+    return Table("Quartiles over the fitted texels", columns, tuple(rows))
+
+
+def worst_table(map: FittedMap) -> Table:
+    """The fitted texels with the largest chi-square, worst first."""
+    flags = map.flags
+    places = worst(map.reduced_chi_square, (flags & FLAGS["fitted"]) != 0)
+    numbers = {name: (map.values[name][places], map.errors[name][places]) for name in map.names}
+    ratio, seen = map.reduced_chi_square[places], flags[places]
+    rows = []
+    for row, place in enumerate(np.transpose(places)):
+        pairs = (with_error(float(values[row]), float(errors[row])) for values, errors in numbers.values())
+        words = (value if error == "unknown" else f"{value} ± {error}" for value, error in pairs)
+        index = ", ".join(str(int(axis)) for axis in place)
+        told = ", ".join(_told(int(seen[row])))
+        rows.append((f"[{index}]", f"{ratio[row]:.4g}", *words, told))
+    columns = ("texel", "chi2/dof", *map.names, "flags")
+    note = f"Counted from 0, by {'row and column' if len(map.shape) == 2 else 'index'}; value ± standard error."
+    return Table("", columns, tuple(rows), note if rows else "")
+
+
+def worst(ratio: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Index arrays of at most `WORST` fitted texels with the largest values, largest first."""
+    ranked = np.where(fitted & np.isfinite(ratio), ratio, -np.inf).ravel()
+    count = min(WORST, int(np.count_nonzero(ranked > -np.inf)))
+    top = np.argpartition(-ranked, max(count - 1, 0))[:count]
+    return np.unravel_index(top[np.argsort(-ranked[top], kind="stable")], ratio.shape)
+
+
+def _told(bits: int) -> list[str]:
+    """What is worth telling of a texel that is fitted."""
+    usual = ("fitted", "converged")
+    found = [WORDS[flag].partition(":")[0] for flag, bit in FLAGS.items() if bits & bit and flag not in usual]
+    return found if bits & FLAGS["converged"] else ["not converged", *found]
+
+
+def shared_table(map: FittedMap) -> Table:
+    """The parameters that all texels have in common."""
+    rows = []
+    for name, one in dict(map.attributes.get("shared") or {}).items():
+        value, error = with_error(float(one["value"]), float(one.get("error", math.nan)))
+        rows.append((name, value, error, map.units.get(name, "")))
+    return Table("", ("parameter", "value", "error", "unit"), tuple(rows))
+
+
+_ELSEWHERE = {"kind", "format", "names", "units", "shape", "chunk", "numerical_error", "shared", "stack"}
+
+
+def made_table(map: FittedMap) -> Table:
+    """What the store says of how it was made, a row for each of its attributes."""
+    rows = [
+        ("store", str(map.path)),
+        ("texels", f"{_by(map.shape)}, in chunks of {_by(map.chunk)}"),
+        ("parameters", ", ".join(map.names)),
+    ]
+    for name, value in map.attributes.items():
+        if name not in _ELSEWHERE and value not in (None, "", {}, []):
+            rows.append((name.replace("_", " "), _in_words(value)))
+    return Table("", ("", ""), tuple(rows))
+
+
+def _by(sizes: Sequence[int]) -> str:
+    return " x ".join(str(size) for size in sizes)
+
+
+def _in_words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name.replace('_', ' ')} {_in_words(one)}" for name, one in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_in_words(one) for one in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def share(part: float, whole: float) -> str:
+    """A share in per cent; 0 and 100 are said only of none and all."""
+    if not whole:
+        return "none"
+    percent = 100.0 * part / whole
+    if part not in (0, whole) and f"{percent:.3g}" in ("0", "100"):
+        return "> 99.9 %" if percent > 50.0 else "< 0.1 %"
+    return "< 0.1 %" if 0.0 < percent < 0.1 else f"{percent:.3g} %"
+
+
+def _words(quartiles: Quartiles) -> tuple[str, str, str]:
+    low, middle, high = (f"{value:.4g}" if math.isfinite(value) else "" for value in quartiles)
+    return low, middle, high
