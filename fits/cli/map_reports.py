@@ -19,13 +19,11 @@ def report_map(arguments: Namespace) -> int:
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
     refuse_existing(str(out), arguments.force)
     map = open_map(arguments.directory)
-    from fits.maps.summary import summarised
     from fits.reporting.maps import page, tables, verdicts
     from fits.reporting.tables import print_table
 
     with show_progress() as progress:
-        page.report(map, out, arguments.force, progress)
-    found = summarised(map)
+        found = page.report(map, out, arguments.force, progress)
     for table in (tables.count_table(found), tables.quartile_table(found, map)):
         print_table(table, sys.stdout)
     for sentence in verdicts.in_short(found, map)[0]:

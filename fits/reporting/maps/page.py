@@ -21,14 +21,15 @@ MOST_CORRELATED = 100_000
 """Texels that correlations are taken over; of more, evenly spaced ones."""
 
 
-def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progress | None = None) -> None:
-    """Writes the report of a map to `path`, whole or not at all.
+def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progress | None = None) -> Summary:
+    """Writes the report of a map to `path`, whole or not at all; returns its numbers.
 
     Raises:
         ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
     """
     found = summarised(map)
     write_text(path, page(map, found, draw(map, progress)), force=force)
+    return found
 
 
 def draw(map: FittedMap, progress: Progress | None = None) -> dict[str, bytes]:

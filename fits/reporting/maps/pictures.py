@@ -148,7 +148,7 @@ def _picture(
         ground = mpl.colors.ListedColormap([ABSENT, OPEN])
         placed = _placed(values.shape, shown.steps)
         axes.imshow(missing, cmap=ground, vmin=0, vmax=1, interpolation="nearest", **placed)
-        image = axes.imshow(values, cmap=colours, norm=scale.norm, interpolation="nearest", **placed)
+        image = axes.imshow(values, cmap=colours, norm=scale.norm, **placed)
         _index_axes(axes)
         finite = values[np.isfinite(values)]
         below, above = bool(np.any(finite < scale.low)), bool(np.any(finite > scale.high))
