@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from fits.inference.prediction import Scores as Scores
     from fits.inference.prediction import scores as scores
     from fits.inference.sampling import sample as sample
+    from fits.many.files import FittedFiles as FittedFiles
+    from fits.many.files import fit_files as fit_files
+    from fits.many.searching import Searching as Searching
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
@@ -113,6 +116,9 @@ _HOMES = {
     "default_library": "structures.library",
     "read_library": "structures.library",
     "leave_out": "inference.left_out",
+    "fit_files": "many.files",
+    "FittedFiles": "many.files",
+    "Searching": "many.searching",
     "Problem": "problem.problem",
     "render": "reporting.render",
     "report": "reporting.html",

@@ -11,17 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import write_bytes, write_text, write_together
+from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
+from fits.cli.many import fit_many as fit_many
 from fits.cli.map_reports import report_map
 from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
 from fits.cli.materials import write_measurements
 from fits.cli.places import refuse_existing, require_free_place
-from fits.cli.predictions import held_out, print_scores
 from fits.cli.predictions import predict as predict
-from fits.cli.reading import measurements
+from fits.cli.predictions import print_scores
+from fits.cli.reading import measurements, reading
 from fits.cli.setting import use_jax
 from fits.data.totals import Totals
 from fits.maps.fitted_map import is_store
@@ -30,7 +31,6 @@ from fits.progress import show_progress
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
-    from fits.reporting.html import Foretold
 
 DONE, DOUBTFUL = 0, 1
 
@@ -38,54 +38,34 @@ DONE, DOUBTFUL = 0, 1
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     use_jax()
-    from fits.data.formats.csv import write_csv
     from fits.inference.nuts import require_blackjax
-    from fits.inference.optimise import again
-    from fits.inference.optimise import fit as run_fit
+    from fits.many.fitting import fit_into, require_posterior
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
     from fits.reporting.diagnostics import residual_structure, standardised
-    from fits.reporting.directories import check_directory, replacing, reserved
-    from fits.reporting.stored import HELD_OUT
+    from fits.reporting.directories import check_directory
 
     directory = Path(arguments.out)
     check_directory(directory, arguments.force)
-    data, unseen = held_out(measurements(arguments), arguments)
+    data, unseen = reading(arguments).parts(arguments.data)
     given = read_problem(arguments.stack)
-    objective = arguments.objective or given.objective
-    if arguments.sample and objective != "likelihood":
-        raise ValueError(f"--sample needs the objective 'likelihood': {objective!r} has no posterior")
-    if unseen is not None and objective != "likelihood":
-        raise ValueError(f"--hold-out needs the objective 'likelihood': {objective!r} says nothing of readings")
+    require_posterior(arguments.objective or given.objective, "--sample" if arguments.sample else None)
     if arguments.sample and arguments.sampler == "nuts":
         require_blackjax()
-    done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
-    with reserved(directory, arguments.force), show_progress() as progress, hint(kept):
-        result = run_fit(
-            given.stack,
+    with show_progress() as progress, hint(kept):
+        result, foretold = fit_into(
+            directory,
+            given,
             data,
-            transport=given.transport,
-            noise=given.noise,
-            scale=given.scale,
-            objective=objective,
-            instrument=given.instrument,
+            unseen,
+            objective=arguments.objective,
             starts=arguments.starts,
             seed=arguments.seed,
             solver=arguments.solver,
+            force=arguments.force,
             progress=progress,
-            checkpoint=done,
         )
-        progress("pictures and report", 0, 1)
-        with replacing(directory, arguments.force) as folder:
-            text = given.text if objective == given.objective else None
-            results.write_fit(result, folder, text)
-            if unseen is not None:
-                write_csv(unseen, folder / HELD_OUT)
-            foretold = write_report(folder, directory.resolve().name, result)
-        for starts in (done, again(done)):
-            starts.unlink(missing_ok=True)
-        progress("pictures and report", 1, 1)
     tables.print_table(tables.parameter_table(result), sys.stdout)
     structure = residual_structure(result.problem.data, standardised(result))
     for sentence in (*verdicts.outcome(result, structure), f"Report: {directory / results.REPORT}"):
@@ -106,6 +86,7 @@ def sample(arguments: Namespace) -> int:
 def _sample(directory: Path, arguments: Namespace) -> int:
     from fits.inference.sampling import sample as run_sampler
     from fits.reporting import results, tables, verdicts
+    from fits.reporting.report_files import write_report
 
     result = results.load_fit(directory)
     if not result.is_posterior:
@@ -164,6 +145,7 @@ def report(arguments: Namespace) -> int:
     use_jax()
     from fits.reporting import results
     from fits.reporting.html import report as write_page
+    from fits.reporting.report_files import write_report
     from fits.reporting.stored import held_out_of
 
     refuse_existing(arguments.out, arguments.force)
@@ -244,27 +226,6 @@ def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     require_free_place(arguments, ".csv", "measurements")
     return write_measurements(measurements(arguments), arguments)
-
-
-def write_report(
-    folder: Path,
-    name: str,
-    result: "Fit",
-    posterior: "Posterior | None" = None,
-    others: "dict[str, Fit | Posterior] | None" = None,
-) -> "Foretold | None":
-    """The report of a result directory, and its pictures as files beside it; what it says of readings held out."""
-    from fits.reporting import results
-    from fits.reporting.html import draw, foretell, page
-    from fits.reporting.stored import held_out_of
-
-    unseen = held_out_of(folder)
-    foretold = None if unseen is None else foretell(result, posterior, unseen)
-    images = draw(result, posterior, others, name, foretold)
-    text = page(result, posterior, images, others, name, foretold)
-    pictures = {f"{picture}.png": content for picture, content in images.items()}
-    write_together(folder, {**pictures, results.REPORT: text.encode()})
-    return foretold
 
 
 def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":

@@ -3,13 +3,14 @@
 import argparse
 from typing import Any
 
-from fits.cli.numbers import angle, count
+from fits.cli.numbers import angle, count, level, seed
 
 QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
 FORMATS = (
     *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
     *("fred", "astm", "pab", "alta", "speos", "ssdd"),
 )
+OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
 EXPORTS = ("rgl", "merl", "zemax", "klems", "openpbr", "csv")
 STRATA = ("bins", "flux")
 
@@ -77,3 +78,58 @@ def add_sampling(parser: argparse.ArgumentParser) -> None:
 def add_force(parser: argparse.ArgumentParser, what: str) -> None:
     """Leave to replace what is there."""
     parser.add_argument("--force", action="store_true", help=what)
+
+
+def add_fitting(parser: argparse.ArgumentParser) -> None:
+    """How a stack is fitted."""
+    parser.add_argument("--starts", type=count, default=32, metavar="N", help="starting points (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
+    parser.add_argument(
+        "--solver",
+        choices=("least_squares", "bounded"),
+        default="least_squares",
+        help="bounded: for best values that lie on a bound (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--objective",
+        choices=OBJECTIVES,
+        help="what is minimised; all but the likelihood give no posterior (default: the stack file's, or likelihood)",
+    )
+
+
+def add_only(parser: argparse.ArgumentParser, what: str) -> None:
+    """Which readings."""
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=(),
+        metavar="WHAT",
+        help=f"{what} these readings alone: incidence=10,50  plane=0  angle=-60:60  share=0.2  channel=red",
+    )
+
+
+def add_hold_out(parser: argparse.ArgumentParser) -> None:
+    """Which readings are kept for the end."""
+    parser.add_argument(
+        "--hold-out", nargs="+", default=(), metavar="WHAT", help="leave these readings out, and score their prediction"
+    )
+
+
+def add_searching(parser: "argparse._ActionsContainer") -> None:
+    """What is looked for, and how readings are believed."""
+    parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
+    parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
+    parser.add_argument("--instrument", metavar="TOML", help="a stack file, or any other, with an [instrument]")
+    parser.add_argument(
+        "--noise",
+        type=level,
+        metavar="REL",
+        help="relative noise beside the file's sigma (default: 0.05 without one)",
+    )
+    parser.add_argument(
+        "--calibration",
+        type=level,
+        default=0.0,
+        metavar="SD",
+        help="relative, of a common factor (default: it is exact)",
+    )

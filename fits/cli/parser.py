@@ -13,9 +13,19 @@ from typing import NoReturn
 
 from fits.cli.interrupts import raised_again
 from fits.cli.numbers import count, degrees, length, level, seed
-from fits.cli.options import EXPORTS, add_force, add_format, add_reading, add_sampling, command
-
-OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
+from fits.cli.options import (
+    EXPORTS,
+    add_fitting,
+    add_force,
+    add_format,
+    add_hold_out,
+    add_only,
+    add_reading,
+    add_sampling,
+    add_searching,
+    command,
+)
+from fits.cli.parser_many import add_fit_many
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -26,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         from fits.cli import commands
 
         with raised_again():
-            code = int(getattr(commands, arguments.command)(arguments))
+            code = int(getattr(commands, arguments.command.replace("-", "_"))(arguments))
         sys.stdout.flush()  # here, where a full disk or a reader that has gone can still be told
         return code
     except KeyboardInterrupt as interrupt:
@@ -66,6 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_report,
         _add_compare,
         _add_search,
+        add_fit_many,
         _add_info,
         _add_convert,
         _add_simulate,
@@ -88,24 +99,10 @@ def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("--stack", required=True, metavar="TOML", help="the stack, with its free parameters")
     parser.add_argument("--out", required=True, metavar="DIR", help="result directory to write")
-    parser.add_argument("--starts", type=count, default=32, metavar="N", help="starting points (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
-    parser.add_argument(
-        "--solver",
-        choices=("least_squares", "bounded"),
-        default="least_squares",
-        help="bounded: for best values that lie on a bound (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--objective",
-        choices=OBJECTIVES,
-        help="what is minimised; all but the likelihood give no posterior (default: the stack file's, or likelihood)",
-    )
+    add_fitting(parser)
     add_reading(parser)
-    _add_only(parser, "fit")
-    parser.add_argument(
-        "--hold-out", nargs="+", default=(), metavar="WHAT", help="leave these readings out, and score their prediction"
-    )
+    add_only(parser, "fit")
+    add_hold_out(parser)
     parser.add_argument("--sample", action="store_true", help="sample the posterior as well (see `layerjax sample`)")
     add_sampling(parser)
     add_force(parser, "replace DIR if it holds an earlier result")
@@ -138,19 +135,9 @@ def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
     )
     parser.add_argument("--at", metavar="FILE", help="in place of --incidence: readings, whose prediction is scored")
     add_format(parser)
-    _add_only(parser, "predict")
+    add_only(parser, "predict")
     parser.add_argument("--out", metavar="CSV", help="file to write; its name ends in .csv")
     add_force(parser, "overwrite the file")
-
-
-def _add_only(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        default=(),
-        metavar="WHAT",
-        help=f"{what} these readings alone: incidence=10,50  plane=0  angle=-60:60  share=0.2  channel=red",
-    )
 
 
 def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
@@ -203,22 +190,7 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
-    parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
-    parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
-    parser.add_argument("--instrument", metavar="TOML", help="a stack file, or any other, with an [instrument]")
-    parser.add_argument(
-        "--noise",
-        type=level,
-        metavar="REL",
-        help="relative noise beside the file's sigma (default: 0.05 without one)",
-    )
-    parser.add_argument(
-        "--calibration",
-        type=level,
-        default=0.0,
-        metavar="SD",
-        help="relative, of a common factor (default: it is exact)",
-    )
+    add_searching(parser)
     parser.add_argument("--starts", type=count, default=8, metavar="N", help="of each fit (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
     add_reading(parser)

@@ -2,7 +2,6 @@
 
 import sys
 from argparse import Namespace
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,51 +9,17 @@ import numpy as np
 
 from fits._files import write_text
 from fits.cli.places import require_free_place
-from fits.cli.reading import readings
+from fits.cli.reading import reading
 from fits.cli.setting import use_jax
 from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
+from fits.data.reading import of_channels
 from fits.data.selection import select
 
 if TYPE_CHECKING:
     from fits.inference.prediction import Prediction
 
 DONE = 0
-CHANNEL = "channel="
-
-
-def held_out(data: Measurements, arguments: Namespace) -> tuple[Measurements, Measurements | None]:
-    """What is fitted, and what is held out; None if nothing is."""
-    data, only = _channels(data, arguments.only)
-    keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
-    for words in only:
-        keep &= select(data, words)
-    for words in arguments.hold_out:
-        if words.startswith(CHANNEL):
-            raise ValueError(
-                f"--hold-out {words}: a fit says nothing of the colour of a channel that it has not seen; "
-                "--only channel=... fits some of the channels"
-            )
-        held |= select(data, words)
-    fitted = data.where(keep & ~held)
-    if data.mask.any() and not fitted.mask.any():
-        raise ValueError("--only and --hold-out leave nothing to fit")
-    for name, given in (("only", arguments.only), ("held out", arguments.hold_out)):
-        fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
-    if not arguments.hold_out:
-        return fitted, None
-    unseen = data.where(keep & held)
-    if not unseen.mask.any():
-        raise ValueError("--hold-out leaves nothing to score: what it holds out is masked, or not among --only")
-    return fitted, unseen
-
-
-def _channels(data: Measurements, selections: Sequence[str]) -> tuple[Measurements, list[str]]:
-    """The channels that selections ask for, and the selections that are left."""
-    for words in selections:
-        if words.startswith(CHANNEL):
-            data = data.of_channels([name.strip() for name in words.removeprefix(CHANNEL).split(",")])
-    return data, [words for words in selections if not words.startswith(CHANNEL)]
 
 
 def print_scores(prediction: "Prediction", readings: Measurements, title: str) -> None:
@@ -97,8 +62,7 @@ def predict(arguments: Namespace) -> int:
 
 
 def _predicted_readings(arguments: Namespace) -> Measurements:
-    data = readings(arguments.at, arguments)
-    data, only = _channels(data, arguments.only)
+    data, only = of_channels(reading(arguments).whole(arguments.at), arguments.only)
     for words in only:
         data = data.where(select(data, words))
     if not data.mask.any():

@@ -1,0 +1,50 @@
+"""Many files at once, on the command line."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+from fits.cli.interrupts import hint
+from fits.cli.reading import reading
+from fits.cli.searches import searching
+from fits.cli.setting import use_jax
+from fits.progress import show_progress
+
+DONE, DOUBTFUL = 0, 1
+
+
+def fit_many(arguments: Namespace) -> int:
+    """Fit every file by every stack, print what became of them, and write the table and its page."""
+    use_jax()
+    from fits.many.files import fit_files
+    from fits.many.inputs import PAGE, TABLE
+    from fits.many.page import SHOWN, overview, told
+    from fits.problem.compiled import cores
+    from fits.reporting.tables import print_table
+    from fits.structures.searching import STARTS
+
+    for name in ("library", "instrument", "noise"):
+        if not arguments.search and getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} is given without --search: a stack file says it itself")
+    out = Path(arguments.out)
+    again = f"{out} keeps what was fitted; the same command again goes on with it"
+    with show_progress() as progress, hint(again):
+        found = fit_files(
+            arguments.data,
+            arguments.stacks,
+            out,
+            processes=cores() if arguments.processes is None else arguments.processes,
+            client=arguments.scheduler,
+            search=searching(arguments, STARTS) if arguments.search else False,
+            **vars(reading(arguments)),
+            objective=arguments.objective,
+            starts=arguments.starts,
+            seed=arguments.seed,
+            solver=arguments.solver,
+            force=arguments.force,
+            progress=progress,
+        )
+    print_table(overview(found.rows, SHOWN), sys.stdout)
+    for sentence in (*told(found.rows, found.left_out), f"Table: {out / TABLE}", f"Report: {out / PAGE}"):
+        print(sentence)
+    return DONE if found.complete else DOUBTFUL

@@ -1,0 +1,44 @@
+"""What may be asked of many files at once."""
+
+import argparse
+from typing import Any
+
+from fits.cli.numbers import count
+from fits.cli.options import (
+    add_fitting,
+    add_force,
+    add_hold_out,
+    add_only,
+    add_reading,
+    add_searching,
+    command,
+)
+
+
+def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
+    """The options of ``layerjax fit-many``."""
+    parser = command(
+        commands,
+        "fit-many",
+        "fit every file of a folder by every one of several stacks, and write one table over all of them",
+        "layerjax fit-many scans --stacks coat.toml bare.toml --out fitted --processes 8",
+    )
+    parser.add_argument("data", nargs="+", metavar="FOLDER|FILE", help="measurements, see docs/formats.md")
+    parser.add_argument("--stacks", nargs="+", default=(), metavar="TOML", help="stacks, with their free parameters")
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="directory to write, or to go on with: DIR/FILE/STACK is a result"
+    )
+    parser.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",
+    )
+    add_fitting(parser)
+    add_reading(parser)
+    add_only(parser, "fit")
+    add_hold_out(parser)
+    group = parser.add_argument_group("looking for stacks")
+    group.add_argument("--search", action="store_true", help="look for the stack behind each file as well")
+    add_searching(group)
+    add_force(parser, "fit again what is there of another stack, other settings or another content of the file")
