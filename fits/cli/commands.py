@@ -15,6 +15,7 @@ from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
 from fits.cli.map_reports import report_map
+from fits.cli.maps import fit_map as fit_map
 from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate

@@ -8,6 +8,11 @@ def count(word: str) -> int:
     return int(_number(word, int, 1, None))
 
 
+def whole(word: str) -> int:
+    """A whole number, at least 0."""
+    return int(_number(word, int, 0, None))
+
+
 def seed(word: str) -> int:
     """A whole number that seeds a generator."""
     return int(_number(word, int, 0, 2**32 - 1))

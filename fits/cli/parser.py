@@ -26,6 +26,7 @@ from fits.cli.options import (
     command,
 )
 from fits.cli.parser_many import add_fit_many
+from fits.cli.parser_maps import add_fit_map
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -71,6 +72,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (
         _add_fit,
+        add_fit_map,
         _add_sample,
         _add_predict,
         _add_report,

@@ -1,0 +1,188 @@
+"""`layerjax fit-map`: what it asks of `fits.fit_map`, what it prints, and bad input in one line."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import layerjax as lj
+from fits.cli.parser import main
+from fits.maps.fitted_map import FittedMap
+from fits.maps.store import FLAGS
+from fits.problem.compiled import cores
+from fits.problem.likelihood import Noise
+from tests.helpers.commands import refused
+from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES
+from tests.helpers.painted_maps import numbers, stored, without
+
+WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
+
+
+def found(folder: Path, failing: int = 0, chunks: int | None = None) -> FittedMap:
+    """A store of ten texels: two masked, eight fitted, all but so many of these converged; or only its first chunks."""
+    made = numbers((2, 5))
+    place = np.arange(10.0).reshape(2, 5)
+    made["values/base.albedo"], made["errors/base.albedo"] = place.copy(), 0.5 * place
+    made["errors/base.albedo"][0, 0] = np.inf  # nothing holds it
+    made["reduced_chi_square"] = 100.0 + place
+    made["flags"][place < failing] &= ~np.uint16(FLAGS["converged"])
+    without(made, place >= 8, "masked")
+    return stored(folder / "found.zarr", made, (1, 5), chunks=chunks)
+
+
+class Called:
+    """In the place of `fits.fit_map`: keeps what it is called with."""
+
+    def __init__(self, then: Callable[[], Any]) -> None:
+        self.then, self.given = then, None
+
+    def __call__(self, stack: Any, geometry: Any, values: Any, out: Any, **options: Any) -> Any:
+        self.given = {"stack": stack, "geometry": geometry, "values": values, "out": out} | options
+        options["progress"]("texels", 5, 10)
+        return self.then()
+
+
+@pytest.fixture
+def place(work: Path) -> Path:
+    """A current directory with a map, its directions, and a stack file."""
+    np.save(work / "map.npy", VALUES)
+    np.save(work / "sigma.npy", SIGMA)
+    np.save(work / "mask.npy", MASK)
+    table = np.column_stack(list(ANGLES.values()))
+    np.savetxt(work / "view.csv", table, delimiter=",", header=",".join(ANGLES), comments="")
+    return work
+
+
+def _in_place(monkeypatch: pytest.MonkeyPatch, then: Callable[[], Any]) -> Called:
+    module = ModuleType("fits.maps.fit_map")
+    called = module.fit_map = Called(then)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fits.maps.fit_map", module)
+    return called
+
+
+def test_defaults_and_options_arrive(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = found(place)
+    called = _in_place(monkeypatch, lambda: made)
+    assert main(WORDS) == 0
+    assert called.given is not None
+    given = dict(called.given)
+    assert isinstance(given.pop("stack"), lj.Stack)
+    assert isinstance(given.pop("transport"), lj.SingleScattering)
+    assert callable(given.pop("progress"))
+    places = {"geometry": "view.csv", "values": "map.npy", "out": "coat.zarr", "sigma": None, "mask": None}
+    said = {"noise": Noise(), "scale": None, "objective": "likelihood", "instrument": None}
+    counts = {"starts": 8, "seed": 0, "sample": 64, "chunk": 1024, "processes": cores()}
+    assert given == {**places, **said, **counts, "client": None, "tabulate": None, "force": False}
+    more = "--sigma sigma.npy --mask mask.npy --noise 0.02 --starts 3 --seed 5 --sample 9 --chunk 100 --processes 3"
+    assert main([*WORDS, *more.split(), "--tabulate", "never", "--posterior", "200", "--force"]) == 0
+    changed = {name: value for name, value in called.given.items() if value != given.get(name)}
+    changed = {name: value for name, value in changed.items() if name not in ("stack", "transport", "progress")}
+    files = {"sigma": "sigma.npy", "mask": "mask.npy"}
+    counts = {"starts": 3, "seed": 5, "sample": 9, "chunk": 100, "processes": 3, "posterior": 200}
+    assert changed == {**files, **counts, "noise": Noise(relative=0.02), "tabulate": False, "force": True}
+    assert main([*WORDS, "--scheduler", "tcp://10.0.0.1:8786", "--tabulate", "always"]) == 0
+    assert (called.given["client"], called.given["processes"]) == ("tcp://10.0.0.1:8786", 1)
+    assert called.given["tabulate"] is True
+
+
+def test_the_stack_file_says_the_rest(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = found(place)
+    called = _in_place(monkeypatch, lambda: made)
+    text = (place / "coat.toml").read_text()
+    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\nshared = true\n"
+    (place / "coat.toml").write_text(text + more + "[instrument]\ndetector = 2.0\n")
+    assert main([*WORDS, "--noise", "0.03"]) == 0
+    assert called.given is not None
+    assert called.given["noise"] == Noise(relative=0.03, tails="student")
+    assert called.given["scale"].shared
+    assert called.given["instrument"].detector == 2.0
+
+
+def test_what_was_found_is_printed(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _in_place(monkeypatch, lambda: found(place))
+    assert main(WORDS) == 0
+    output = capsys.readouterr()
+    lines = [line for line in output.out.splitlines() if line.strip()]
+    rows = {line.split("  ")[0].strip(): line.split() for line in reversed(lines)}  # the first of each
+    assert rows["of the map"][-1] == "10"
+    assert rows["converged"][1] == "8"
+    assert rows["masked"][1] == "2"
+    # 0 to 7: quartiles 1.75, 3.5, 5.25; of the errors 0.5 to 3.5, the infinite one left out
+    assert rows["base.albedo"][1:8] == ["1.75", "3.5", "5.25", "1.25", "2", "2.75", "1"]
+    chi_square = next(line.split() for line in lines if line.strip().startswith("chi-square"))
+    assert [word for word in chi_square if word[0].isdigit()][:3] == ["101.8", "103.5", "105.2"]
+    assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012"]
+    assert "layerjax report coat.zarr" in output.out
+    assert "texels 5/10" in output.err
+
+
+@pytest.mark.parametrize(
+    ("failing", "chunks", "code"),
+    [(0, None, 0), (1, None, 1), (8, None, 1), (0, 1, 1)],
+    ids=["all", "7 of 8", "none", "unfinished"],
+)
+def test_a_map_that_did_not_converge_is_doubtful(
+    place: Path, monkeypatch: pytest.MonkeyPatch, failing: int, chunks: int | None, code: int
+) -> None:
+    _in_place(monkeypatch, lambda: found(place, failing, chunks))
+    assert main(WORDS) == code
+
+
+def test_an_interrupt_says_that_the_store_is_good(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    _in_place(monkeypatch, interrupted)
+    assert main(WORDS) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == ("layerjax: interrupted: coat.zarr keeps what is fitted; the same command again goes on with it")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"map.npy": "nowhere.npy"}, "nowhere.npy: no such file"),
+        ({"map.npy": "."}, "layerjax fit-many"),
+        ({"map.npy": "data.csv"}, "data.csv: ends in '.csv'"),
+        ({"map.npy": "mask.npy"}, r"mask.npy has shape (5, 4), the geometry 6 pairs"),
+        ({"view.csv": "nowhere.csv"}, "nowhere.csv: no such file"),
+        ({"view.csv": "coat.toml"}, "coat.toml, line"),
+        ({"coat.toml": "nowhere.toml"}, "nowhere.toml: no such file"),
+        ({"coat.zarr": "coat.h5"}, "coat.h5: a fitted map can be written as .zarr only"),
+        ({"coat.zarr": "no/such/coat.zarr"}, "no/such"),
+        ({"coat.zarr": "file.zarr"}, "file.zarr: is a file"),
+    ],
+)
+def test_bad_input_is_named(
+    place: Path, capsys: pytest.CaptureFixture[str], change: dict[str, str], message: str
+) -> None:
+    (place / "file.zarr").write_text("")
+    assert message in refused([change.get(word, word) for word in WORDS], capsys, place)
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["--starts", "0"],
+        ["--sample", "0"],
+        ["--chunk", "-1"],
+        ["--processes", "0"],
+        ["--posterior", "-1"],
+        ["--noise", "nan"],
+        ["--tabulate", "maybe"],
+        ["--processes", "2", "--scheduler", "tcp://x:1"],
+    ],
+)
+def test_bad_usage_exits_with_2(place: Path, capsys: pytest.CaptureFixture[str], more: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*WORDS, *more])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
