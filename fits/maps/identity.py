@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from fits.maps.sources import UNREADABLE
 from fits.problem.parameters import is_free
 
 
@@ -30,12 +31,19 @@ def require_same(path: Any, stored: Mapping[str, str], given: Mapping[str, str])
     Raises:
         ValueError: it names what differs.
     """
-    changed = [name for name in {**stored, **given} if stored.get(name) != given.get(name)]
+    changed = [name for name in {**stored, **given} if not alike(stored.get(name, ""), given.get(name, ""))]
     if changed:
         raise ValueError(
             f"{path}: holds a map fitted with another {', another '.join(changed)} "
             "(--force, or force=True, throws it away and begins anew)"
         )
+
+
+def alike(one: str, other: str) -> bool:
+    """Whether two fingerprints are the same, of which parts may be "?": of what could not be read at the time."""
+    parts = [each.split(",") for each in (one, other)]
+    same = all(a == b or UNREADABLE in (a, b) for a, b in zip(*parts, strict=False))
+    return same and len(parts[0]) == len(parts[1])
 
 
 def _named(function: Any) -> str:

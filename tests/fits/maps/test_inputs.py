@@ -289,4 +289,4 @@ def test_only_blocks_are_read(tmp_path: Path) -> None:
     found = readings(path, VIEW)
     assert found.shape == shape[:2]
     np.testing.assert_array_equal(found.read((slice(7, 9), slice(5, 8))), np.zeros((2, 3, N, 1)))
-    assert len(found.digest()) == 64
+    assert found.digest().count(",") > 60  # of blocks from all over it
