@@ -84,8 +84,8 @@ class Source:
         return self if own == self.dims else replace(self, array=self.array.transpose(*own), dims=own)
 
     def digest(self, leading: int) -> str:
-        """What tells it from another: hashes of shape and type, and of the blocks of its content; "?" for one that cannot
-        be read, see `fits.maps.identity.alike`.
+        """What tells it from another: hashes of shape and type, and of the blocks of its content; "?" for one that
+        cannot be read, see `fits.maps.identity.alike`.
 
         Of arrays above 64 MiB (as float64) the content of 64 blocks enters, spread evenly, of up to 64 texels each:
         what changes between them is not seen. leading: how many axes are of the map.

@@ -214,8 +214,10 @@ def test_a_damaged_chunk_of_readings_costs_itself(tmp_path, whole, geometry, val
     assert fits.open_map(tmp_path / "out.zarr").done == 0.75
     damaged.write_bytes(content)
     found = fitted(tmp_path / "out.zarr", geometry, path, mask)
-    for name in NAMES:
-        np.testing.assert_array_equal(found.values[name], whole.values[name])
+    assert found.done == 1.0
+    for name in NAMES:  # from other starts, as the sample lacked these texels: within what a converged fit leaves
+        apart = np.abs(found.values[name] - whole.values[name]) / whole.errors[name]
+        assert np.nanmax(apart) < 2e-3
 
 
 def test_a_full_disk_leaves_no_half_chunk(tmp_path, monkeypatch, whole, geometry, values, mask):
