@@ -140,9 +140,9 @@ def _arrow(
 ) -> _Arrow:
     whole = np.empty((sample.number, len(problem.names)))
     whole[:, places], whole[:, own] = at, vectors
-    cost, gradient, root, units = (np.asarray(part, float) for part in problem.call(_informed, whole, sample))
+    cost, gradient, root, units = (np.array(part, float) for part in problem.call(_informed, whole, sample))
     box, count = problem.model.box, sample.number
-    slopes = np.asarray(box.prior_slopes(), float)
+    slopes = np.array(box.prior_slopes(), float)
     residual = np.asarray(box.prior_residuals(jnp.asarray(whole[0])), float)
     of_prior = np.abs(slopes[:, places]).sum(axis=1) > 0  # once in all, not once a texel
     prior = slopes[of_prior][:, places]
