@@ -19,6 +19,7 @@ from fits.maps.fitted_map import FittedMap, is_store, open_map
 from fits.maps.identity import digest, require_same
 from fits.maps.inputs import Readings, readings
 from fits.maps.job import Job, Task, part_of, work
+from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
 from fits.maps.store import KEY, clean, create, left
 from fits.problem.instrument import Instrument
@@ -53,6 +54,7 @@ def fit_map(
     chunk: int = 1024,
     processes: int = 1,
     tabulate: bool | None = None,
+    posterior: int = 0,
     force: bool = False,
     progress: Progress | None = None,
 ) -> FittedMap:
@@ -79,6 +81,8 @@ def fit_map(
         processes: 1: threads of this process, one a core; of more each has a core of its own.
         tabulate: whether an exact transport is replaced by a table over the box of the parameters, made once; None:
             for maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
+        posterior: texels whose posteriors are sampled as well, see `FittedMap.posterior`: they tell how far standard
+            errors hold.
         force: throw away a store of other arguments, and begin anew.
         progress: called with ("sample" or "map", done, all, note).
 
@@ -90,9 +94,7 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    for name, number in {"starts": starts, "sample": sample, "chunk": chunk}.items():
-        if number < 1:
-            raise ValueError(f"{name} is {number}; it must be at least 1")
+    _check({"starts": starts, "sample": sample, "chunk": chunk}, {"posterior": posterior}, objective)
     path, found = Path(out), readings(values, geometry, sigma=sigma, mask=mask)
     if instrument is not None and found.geometry is None:
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
@@ -110,10 +112,21 @@ def fit_map(
             save(prepared, root)
         prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
         failures = _run(path, root, prepared, found, settings, client, processes, progress)
+        if posterior and not failures:
+            sample_texels(root, prepared, found, posterior, seed, progress)
     if failures:
         more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
         raise ValueError(f"{path}: {failures[0]}{more}; all other chunks are done, and another run does these")
     return open_map(path)
+
+
+def _check(counts: Mapping[str, int], extra: Mapping[str, int], objective: str) -> None:
+    for least, numbers in ((1, counts), (0, extra)):
+        for name, number in numbers.items():
+            if number < least:
+                raise ValueError(f"{name} is {number}; it must be at least {least}")
+    if extra["posterior"] and objective != "likelihood":
+        raise ValueError(f"posterior is {extra['posterior']}; it must be 0 with objective {objective!r}, no likelihood")
 
 
 def _begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | None:

@@ -16,6 +16,8 @@ from fits.maps.store import FLAGS, FORMAT, KEY, KIND, arrays_of
 if TYPE_CHECKING:
     import zarr
 
+    from fits.maps.posterior import Sampled
+
 Floats = NDArray[np.float64]
 
 ROOT = "zarr.json"
@@ -103,6 +105,13 @@ class FittedMap:
         if meaning not in FLAGS:
             raise ValueError(f"meaning: {meaning!r} given, must be one of {', '.join(FLAGS)}")
         return (self.flags & FLAGS[meaning]) != 0
+
+    @property
+    def posterior(self) -> "Sampled | None":
+        """Posteriors of a few texels beside their standard errors; None where `fit_map` was not asked for any."""
+        from fits.maps.posterior import sampled_of
+
+        return sampled_of(self)
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":
         if path not in self._types:

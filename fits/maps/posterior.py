@@ -1,0 +1,138 @@
+"""Posteriors of a few texels of a fitted map: how far the standard errors of all of them hold."""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from fits.data.measurements import Measurements
+from fits.inference.optimise import refit
+from fits.inference.sampling import sample
+from fits.maps.fitted_map import open_map
+from fits.maps.inputs import Readings
+from fits.maps.job import Part, completed, part_of
+from fits.maps.prepared import GOLDEN, Prepared
+from fits.maps.tabulated import Tabulated
+from fits.problem.problem import Problem
+from fits.progress import Progress
+
+if TYPE_CHECKING:
+    from fits.maps.fitted_map import FittedMap
+
+Floats = NDArray[np.float64]
+
+GROUP = "posterior"
+"""Of the store."""
+
+QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
+MOST_STEPS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Posteriors of T texels with P parameters.
+
+    Attributes:
+        names: of the parameters.
+        places: of the texels in the map, (T, rank).
+        mean, sd: (T, P).
+        quantiles: at `QUANTILES`, (T, P, 5).
+        shift: from the fitted value to the mean, in standard errors, (T, P).
+        ratio: standard deviation over standard error, (T, P): 1 where the error holds.
+        converged: whether the chain was long enough, (T,).
+    """
+
+    names: tuple[str, ...]
+    places: NDArray[np.int64]
+    mean: Floats
+    sd: Floats
+    quantiles: Floats
+    shift: Floats
+    ratio: Floats
+    converged: NDArray[np.bool_]
+
+
+def sample_texels(
+    root: zarr.Group, prepared: Prepared, readings: Readings, count: int, seed: int, progress: Progress | None
+) -> None:
+    """Sample the posteriors of `count` texels from all over a finished map, and keep them in its store.
+
+    What is there of as many texels is not done again.
+    """
+    path = Path(root.store.root)  # type: ignore[attr-defined]
+    fitted = open_map(path)
+    places = chosen(fitted, count)
+    if GROUP in root and dict(root[GROUP].attrs).get("texels") == len(places):
+        return
+    shutil.rmtree(path / GROUP, ignore_errors=True)
+    vectors, rows = np.stack([fitted.values[name][tuple(places.T)] for name in fitted.names], axis=1), []
+    for index, (place, vector) in enumerate(zip(places, vectors, strict=True)):
+        if progress is not None:
+            progress("posterior", index, len(places))
+        rows.append(_sampled(prepared, readings, tuple(int(at) for at in place), vector, seed))
+    if progress is not None:
+        progress("posterior", len(places), len(places))
+    group = root.create_group(GROUP)
+    group.create_array("places", data=places.astype(np.int64), compressors=None)
+    for name, arrays in zip(("mean", "sd", "quantiles", "converged"), zip(*rows, strict=True), strict=True):
+        group.create_array(name, data=np.stack(arrays), compressors=None)
+    group.attrs.update({"names": list(fitted.names), "quantiles": list(QUANTILES), "seed": seed, "texels": len(places)})
+
+
+def chosen(fitted: "FittedMap", count: int) -> NDArray[np.int64]:
+    """Places of texels that converged, evenly from all over the map, (T, rank)."""
+    candidates = np.argwhere(fitted.has("converged"))
+    turns = (np.arange(min(4 * count, len(candidates))) + 0.5) * GOLDEN % 1.0
+    picked = list(dict.fromkeys((turns * len(candidates)).astype(int).tolist()))[:count]
+    return candidates[sorted(picked)]
+
+
+def sampled_of(fitted: "FittedMap") -> Sampled | None:
+    """What a store holds of posteriors; None if there are none."""
+    root = zarr.open_group(fitted.path, mode="r")
+    if GROUP not in root or "texels" not in root[GROUP].attrs:  # written last
+        return None
+    group: Any = root[GROUP]
+    places, mean, sd, quantiles, converged = (
+        np.asarray(group[name][...]) for name in ("places", "mean", "sd", "quantiles", "converged")
+    )
+    at = tuple(places.T)
+    values, errors = (
+        np.stack([of[name][at] for name in fitted.names], axis=1) for of in (fitted.values, fitted.errors)
+    )
+    with np.errstate(all="ignore"):
+        shift, ratio = (mean - values) / errors, sd / errors
+    return Sampled(fitted.names, places, mean, sd, quantiles, shift, ratio, converged)
+
+
+def _sampled(
+    prepared: Prepared, readings: Readings, place: tuple[int, ...], vector: Floats, seed: int
+) -> tuple[Floats, Floats, Floats, np.bool_]:
+    part = part_of(readings, tuple(slice(at, at + 1) for at in place))
+    posterior = sample(refit(problem_at(prepared, part), vector), seed=seed, max_steps=MOST_STEPS, allow_short=True)
+    draws = posterior.samples
+    quantiles = np.quantile(draws, QUANTILES, axis=0).T
+    return draws.mean(axis=0), draws.std(axis=0), quantiles, np.bool_(posterior.converged)
+
+
+def problem_at(prepared: Prepared, part: Part) -> Problem:
+    """The problem of one texel, whose readings are a block of its own."""
+    problem = prepared.problem
+    values = part.values.reshape(-1, part.values.shape[-1])
+    used = np.all(np.isfinite(values), axis=-1)
+    sigma = None if part.sigma is None else part.sigma.reshape(values.shape)
+    if sigma is not None:
+        used &= np.all(np.isfinite(sigma), axis=-1)
+        sigma = np.where(used[:, None], sigma, 1.0)
+    own = part.wi is not None
+    wi, wo = (problem.data.wi, problem.data.wo)
+    if part.wi is not None and part.wo is not None:
+        wi, wo = part.wi.reshape(-1, 3), part.wo.reshape(-1, 3)
+    data = Measurements(wi, wo, np.where(used[:, None], values, 0.0), sigma, used, problem.data.channels)
+    alone = replace(problem, data=data)
+    table = problem.model.table if isinstance(problem.model, Tabulated) and used.all() else None
+    return completed(alone, own, table)
