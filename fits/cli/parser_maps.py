@@ -54,7 +54,11 @@ def _add_solving(parser: argparse.ArgumentParser) -> None:
         help="a table over the bounds in place of the transport (default: where it is exact enough)",
     )
     group.add_argument(
-        "--posterior", type=whole, default=0, metavar="N", help="draws of the posterior of each texel (default: none)"
+        "--posterior",
+        type=whole,
+        default=0,
+        metavar="N",
+        help="sample the posterior of N texels: how far errors hold (default: 0)",
     )
 
 

@@ -116,6 +116,7 @@ def page(map: FittedMap, found: Summary, images: Pictures) -> str:
             _values(map, images, part),
             _explained(images, part),
             _together(images),
+            _posterior(map),
             section("The worst texels", html_table(tables.worst_table(map))),
         ]
     sections += [_made(map), made_with()]
@@ -136,6 +137,11 @@ def _shared(map: FittedMap) -> str:
         return ""
     note = "<p>One value for all texels, from the sample that was fitted first.</p>"
     return section("Shared parameters", note, html_table(table))
+
+
+def _posterior(map: FittedMap) -> str:
+    table = tables.posterior_table(map)
+    return "" if table is None else section("How far the standard errors hold", html_table(table))
 
 
 def _values(map: FittedMap, images: Pictures, part: str) -> str:

@@ -110,6 +110,28 @@ def shared_table(map: FittedMap) -> Table:
     return Table("", ("parameter", "value", "error", "unit"), tuple(rows))
 
 
+def posterior_table(map: FittedMap) -> Table | None:
+    """How posteriors of a few texels compare with the fitted values and their errors; None where there are none."""
+    sampled = map.posterior
+    if sampled is None:
+        return None
+    rows = []
+    for place, name in enumerate(sampled.names):
+        ratios, shifts = (of[:, place][np.isfinite(of[:, place])] for of in (sampled.ratio, sampled.shift))
+        if not ratios.size:
+            rows.append((name, "", "", "", ""))
+            continue
+        range_, largest = f"{ratios.min():.3g} to {ratios.max():.3g}", f"{np.max(np.abs(shifts)):.2g}"
+        rows.append((name, f"{np.median(ratios):.3g}", range_, f"{np.median(shifts):.2g}", largest))
+    columns = ("parameter", "sd / error", "from ... to", "mean - value, errors", "at most")
+    note = (
+        f"{len(sampled.places)} texels from all over the map; {int(sampled.converged.sum())} of their chains converged. "
+        "Where sd / error is 1 and the means are the values, a standard error says all; where it is not, the posterior "
+        "is skewed, curved or cut off by a bound."
+    )
+    return Table("", columns, tuple(rows), note)
+
+
 _ELSEWHERE = {"kind", "format", "names", "units", "shape", "chunk", "numerical_error", "shared", "stack"}
 
 
