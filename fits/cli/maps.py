@@ -39,7 +39,7 @@ def fit_map(arguments: Namespace) -> int:
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
     local = arguments.scheduler is None
     more: dict[str, Any] = {"posterior": arguments.posterior} if arguments.posterior else {}
-    kept = f"{arguments.out} keeps what is fitted; the same command again goes on with it"
+    kept = f"what was fitted is in {arguments.out}; the same command again goes on with it"
     with show_progress() as progress, hint(kept):
         found = run_map(
             given.stack,

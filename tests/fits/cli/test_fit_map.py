@@ -143,7 +143,7 @@ def test_an_interrupt_says_that_the_store_is_good(
     _in_place(monkeypatch, interrupted)
     assert main(WORDS) == 130
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == ("layerjax: interrupted: coat.zarr keeps what is fitted; the same command again goes on with it")
+    assert last == ("layerjax: interrupted: what was fitted is in coat.zarr; the same command again goes on with it")
 
 
 @pytest.mark.parametrize(
