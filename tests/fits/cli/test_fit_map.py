@@ -11,12 +11,13 @@ import pytest
 
 import layerjax as lj
 from fits.cli.parser import main
-from fits.maps.fitted_map import FittedMap
+from fits.data.geometry import slices
+from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.store import FLAGS
 from fits.problem.compiled import cores
 from fits.problem.likelihood import Noise
 from tests.helpers.commands import refused
-from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES
+from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
 from tests.helpers.painted_maps import numbers, stored, without
 
 WORDS = ["fit-map", "map.npy", "--geometry", "view.csv", "--stack", "coat.toml", "--out", "coat.zarr"]
@@ -87,6 +88,26 @@ def test_defaults_and_options_arrive(place: Path, monkeypatch: pytest.MonkeyPatc
     assert main([*WORDS, "--scheduler", "tcp://10.0.0.1:8786", "--tabulate", "always"]) == 0
     assert (called.given["client"], called.given["processes"]) == ("tcp://10.0.0.1:8786", 1)
     assert called.given["tabulate"] is True
+
+
+def test_a_map_is_fitted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the function itself, from a file that holds the directions as well."""
+    thickness, albedo = np.array([[0.5, 0.8, 1.2]]), np.array([[0.3, 0.5, 0.6]])
+    view = slices(incidence=(10.0, 50.0), outgoing=np.arange(-60.0, 61.0, 20.0))
+    stack = lj.Stack([lj.Medium(thickness[..., None], 0.8)], lj.Lambertian(albedo[..., None]))
+    wi, wo = view.wi[:, None, None], view.wo[:, None, None]
+    exact = np.moveaxis(np.asarray(lj.evaluate(stack, wi, wo, lj.SingleScattering())), 0, 2)
+    hdf5_file(place / "map.h5", {"values": exact, "wi": view.wi, "wo": view.wo})
+    words = ["fit-map", "map.h5", "--stack", "coat.toml", "--out", "coat.zarr", "--noise", "0.02"]
+    words += ["--processes", "1", "--sample", "3", "--starts", "4", "--tabulate", "never"]
+    assert main(words) == 0
+    fitted = open_map("coat.zarr")
+    # readings without noise: how near a solver stops to the optimum is far below an error
+    for name, truth in (("layers[0].thickness", thickness), ("base.albedo", albedo)):
+        assert np.all(np.abs(fitted.values[name] - truth) < 0.05 * fitted.errors[name])
+    assert main(words) == 0  # nothing is left to do
+    capsys.readouterr()
+    assert "coat.zarr" in refused([*words, "--seed", "1"], capsys, place)
 
 
 def test_the_stack_file_says_the_rest(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
