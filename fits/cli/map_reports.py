@@ -24,8 +24,9 @@ def report_map(arguments: Namespace) -> int:
 
     with show_progress() as progress:
         found = page.report(map, out, arguments.force, progress)
-    for table in (tables.count_table(found), tables.quartile_table(found, map)):
-        print_table(table, sys.stdout)
+    print_table(tables.count_table(found), sys.stdout)
+    if found.fitted:
+        print_table(tables.quartile_table(found, map), sys.stdout)
     for sentence in verdicts.in_short(found, map)[0]:
         print(sentence)
     print(f"Report: {out}")

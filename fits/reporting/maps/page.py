@@ -56,6 +56,8 @@ def draw(map: FittedMap, progress: Progress | None = None) -> dict[str, bytes]:
         values = map.values[name]
         samples[name] = values.ravel()[sampled]
         images |= _parameter(map, name, values, fitted, shown)
+    if progress is not None:
+        progress("pictures", len(samples), len(samples))
     varying, correlation = _correlation(samples)
     if len(varying) > 1:
         images["correlation"] = as_png(matrix_picture(varying, correlation))

@@ -40,7 +40,7 @@ def count_table(found: Summary) -> Table:
     if found.there < found.texels:
         rows.append(("there so far", found.there, share(found.there, found.texels)))
     for flag, count in found.counts.items():
-        if count or flag in ("fitted", "converged"):
+        if count or flag == "fitted" or (flag == "converged" and found.fitted):
             whole = found.texels if flag in ("fitted", "masked", "too_few_readings", "failed") else found.fitted
             of = "" if whole == found.texels else " of the fitted"
             rows.append((WORDS[flag], count, f"{share(count, whole)}{of}"))
@@ -52,20 +52,20 @@ def count_table(found: Summary) -> Table:
 
 def quartile_table(found: Summary, map: FittedMap) -> Table:
     """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
-    rows = []
+    rows, notes = [], []
     for name in map.names:
-        unit, missing = map.units[name], found.no_error[name]
-        note = f"{share(missing, found.fitted)} without error" if missing else ""
-        rows.append((name, *_words(found.values[name]), *_words(found.errors[name]), unit, note))
+        rows.append((name, *_words(found.values[name]), *_words(found.errors[name]), map.units[name]))
+        if missing := found.no_error[name]:
+            notes.append(f"{name} has no error in {share(missing, found.fitted)} of them.")
     none = ("", "", "")
-    rows.append(("chi-square per degree of freedom", *_words(found.reduced_chi_square), *none, "1", ""))
-    rows.append(("readings", *_words(found.readings), *none, "1", ""))
+    rows.append(("chi2/dof", *_words(found.reduced_chi_square), *none, "1"))
+    rows.append(("readings", *_words(found.readings), *none, "1"))
     if found.numerical_error is not None:
-        *quartiles, most = found.numerical_error
-        words = _words((quartiles[0], quartiles[1], quartiles[2]))
-        rows.append(("numerical error", *words, *none, "sigma", f"95 % below {most:.2g}"))
-    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit", "")
-    return Table("Quartiles over the fitted texels", columns, tuple(rows))
+        low, middle, high, most = found.numerical_error
+        rows.append(("numerical error", *_words((low, middle, high)), *none, "sigma"))
+        notes.append(f"The numerical error is below {most:.2g} sigma in 95 % of them.")
+    columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
+    return Table("Quartiles over the fitted texels", columns, tuple(rows), " ".join(notes))
 
 
 def worst_table(map: FittedMap) -> Table:
@@ -165,9 +165,9 @@ def share(part: float, whole: float) -> str:
     if not whole:
         return "none"
     percent = 100.0 * part / whole
-    if part not in (0, whole) and f"{percent:.3g}" in ("0", "100"):
-        return "> 99.9 %" if percent > 50.0 else "< 0.1 %"
-    return "< 0.1 %" if 0.0 < percent < 0.1 else f"{percent:.3g} %"
+    if part not in (0, whole) and not 0.01 <= percent <= 99.99:
+        return "> 99.99 %" if percent > 50.0 else "< 0.01 %"
+    return f"{percent:.4g} %" if percent > 99.9 else f"{percent:.3g} %" if percent >= 1.0 else f"{percent:.2g} %"
 
 
 def _words(quartiles: Quartiles) -> tuple[str, str, str]:
