@@ -1,9 +1,17 @@
-"""A fit for every texel of a map, chunk by chunk, into a store."""
+"""A fit for every texel of a map, chunk by chunk, into a store.
+
+A sample of the texels is fitted first, from many starts: it says at which resolution an exact transport has to be
+solved, what numbers are that all texels share (a joint fit of the sample, see `fits.maps.sharing`), and where all
+other fits begin. Every texel then begins where the likeliest of the sample ended, and is begun again, from others of
+these ends, from its neighbours within the chunk and from points all over the box, only where its chi-square says that
+it ended poorly: a second minimum that fits as well is not looked for.
+"""
 
 import math
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +42,40 @@ if TYPE_CHECKING:
 MOST_PARAMETERS = 32
 
 
+@dataclass(frozen=True)
+class Settings:
+    """How a map is fitted.
+
+    Args:
+        starts, seed: of each of the first few fits of the sample.
+        sample: texels of it.
+        chunk: texels that are fitted and written together.
+        tabulate: whether an exact transport is replaced by a table over the box of the parameters, made once; None: for
+            maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
+        posterior: texels whose posteriors are sampled as well, see `FittedMap.posterior`: they tell how far standard
+            errors hold.
+
+    Raises:
+        ValueError: a number below what it must be.
+    """
+
+    starts: int = 8
+    seed: int = 0
+    sample: int = 64
+    chunk: int = 1024
+    tabulate: bool | None = None
+    posterior: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in {"starts": 1, "seed": 0, "sample": 1, "chunk": 1, "posterior": 0}.items():
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+
+    def told(self) -> dict[str, Any]:
+        """What the fits of the texels depend on."""
+        return {name: getattr(self, name) for name in ("starts", "seed", "sample", "chunk", "tabulate")}
+
+
 def fit_map(
     stack: Any,
     geometry: "Geometry | Any",
@@ -60,73 +102,71 @@ def fit_map(
 ) -> FittedMap:
     """Fit a stack to the readings of every texel of a map, into a zarr store that grows chunk by chunk.
 
-    A sample of the texels is fitted first, from many starts: it says at which resolution an exact transport has to be
-    solved, what numbers are that all texels share (`Free(..., shared=True)`, a joint fit of the sample, held from then
-    on: errors of the others are conditional on them), and where all other fits begin. Every texel then begins where the
-    likeliest of the sample ended, and is begun again, from others of these ends, from its neighbours within the chunk
-    and from points all over the box, only where its chi-square says that it ended poorly: a second minimum that fits as
-    well is not looked for. What is in the store is not done again, and the result does not depend on who did the work.
+    What is in the store is not done again, and what comes to be in it does not depend on who did the work.
 
     Args:
-        stack: holds `Free` where each texel has a number of its own, or all share one.
+        stack: holds `Free` where each texel has a number of its own, or with `shared=True` all have one in common,
+            which is held from then on: errors of the others are conditional on it.
         geometry, values, sigma, mask: see `fits.maps.inputs.readings`: arrays or files, values (..., N, C) in 1/sr.
         out: directory of the store, made here, or begun by an earlier call with the same arguments.
         noise: as in `fits.fit`, but independent; a floor that it leaves out is one for the whole map.
         client: a `distributed.Client`, or the address of a scheduler, whose workers see `out` under the same path.
-        transport, scale, objective, instrument: as in `fits.fit`. There can be no instrument where texels have
-            directions of their own.
-        starts, seed: of each of the first few fits of the sample.
-        sample: texels of it.
-        chunk: texels that are fitted and written together.
+        transport, scale, objective, instrument: as in `fits.fit`; no instrument where texels have own directions.
+        starts, seed, sample, chunk, tabulate, posterior: see `Settings`.
         processes: 1: threads of this process, one a core; of more each has a core of its own.
-        tabulate: whether an exact transport is replaced by a table over the box of the parameters, made once; None:
-            for maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
-        posterior: texels whose posteriors are sampled as well, see `FittedMap.posterior`: they tell how far standard
-            errors hold.
         force: throw away a store of other arguments, and begin anew.
         progress: called with ("sample" or "map", done, all, note).
-
-    Returns:
-        The store, opened: values and standard errors by name, reduced chi-square and flags of each texel.
 
     Raises:
         ValueError: arguments that do not fit together, a store of others, one that another process writes, or chunks
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    _check({"starts": starts, "sample": sample, "chunk": chunk}, {"posterior": posterior}, objective)
-    path, found = Path(out), readings(values, geometry, sigma=sigma, mask=mask)
-    if instrument is not None and found.geometry is None:
-        raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
+    settings = Settings(starts, seed, sample, chunk, tabulate, posterior)
     rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
-    settings = {"starts": starts, "seed": seed, "sample": sample, "chunk": chunk, "tabulate": tabulate}
+    found = readings(values, geometry, sigma=sigma, mask=mask)
+    _require_fitting(settings, found, rest)
+    with locked(Path(f"{Path(out)}.lock"), str(out)):
+        return _fitted(Path(out), found, stack, noise, rest, settings, client, processes, force, progress)
+
+
+def _fitted(
+    path: Path,
+    found: Readings,
+    stack: Any,
+    noise: Noise | None,
+    rest: Mapping[str, Any],
+    settings: Settings,
+    client: Any,
+    processes: int,
+    force: bool,
+    progress: Progress | None,
+) -> FittedMap:
     identity = {name: digest(one) for name, one in {"stack": stack, "noise": noise, **rest}.items()}
-    identity |= {"settings": digest(sorted(settings.items(), key=str)), "readings": found.digest()}
+    identity |= {"settings": digest(settings.told()), "readings": found.digest()}
     identity["precision"] = str(np.dtype(jnp.result_type(float)))
-    with locked(path.with_name(f"{path.name}.lock"), str(path)):
-        root = _begun(path, identity, force)
-        prepared = _prepared(root, found, stack, noise, rest, settings, progress)
-        if root is None:
-            root = _created(path, prepared, found, identity, settings, stack)
-        if GROUP not in root:
-            save(prepared, root)
-        prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
-        failures = _run(path, root, prepared, found, settings, client, processes, progress)
-        if posterior and not failures:
-            sample_texels(root, prepared, found, posterior, seed, progress)
+    root = _begun(path, identity, force)
+    prepared = _prepared(root, found, stack, noise, rest, settings, progress)
+    if root is None:
+        root = _created(path, prepared, found, identity, settings, stack)
+    if GROUP not in root:
+        save(prepared, root)
+    prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
+    failures = _run(path, root, prepared, found, settings, client, processes, progress)
     if failures:
         more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
         raise ValueError(f"{path}: {failures[0]}{more}; all other chunks are done, and another run does these")
+    if settings.posterior:
+        sample_texels(root, prepared, found, settings.posterior, settings.seed, progress)
     return open_map(path)
 
 
-def _check(counts: Mapping[str, int], extra: Mapping[str, int], objective: str) -> None:
-    for least, numbers in ((1, counts), (0, extra)):
-        for name, number in numbers.items():
-            if number < least:
-                raise ValueError(f"{name} is {number}; it must be at least {least}")
-    if extra["posterior"] and objective != "likelihood":
-        raise ValueError(f"posterior is {extra['posterior']}; it must be 0 with objective {objective!r}, no likelihood")
+def _require_fitting(settings: Settings, found: Readings, rest: Mapping[str, Any]) -> None:
+    """Refuse arguments that mean nothing together."""
+    if rest["instrument"] is not None and found.geometry is None:
+        raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
+    if settings.posterior and rest["objective"] != "likelihood":
+        raise ValueError(f"posterior is {settings.posterior}; it must be 0 with objective {rest['objective']!r}")
 
 
 def _begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | None:
@@ -153,12 +193,12 @@ def _prepared(
     stack: Any,
     noise: Noise | None,
     rest: Mapping[str, Any],
-    settings: Mapping[str, Any],
+    settings: Settings,
     progress: Progress | None,
 ) -> Prepared:
     if root is not None and GROUP in root:
         return load(root, found, stack, noise, **rest)
-    some, places = sampled(found, settings["sample"], 1)
+    some, places = sampled(found, settings.sample, 1)
     problem = prototype(some, found, stack, noise, **rest)
     if len(problem.names) > MOST_PARAMETERS:
         raise ValueError(f"stack: {len(problem.names)} parameters are free; of a map at most {MOST_PARAMETERS} can be")
@@ -170,10 +210,10 @@ def _prepared(
         found,
         some.rows(enough),
         places[enough],
-        starts=settings["starts"],
-        seed=settings["seed"],
-        size=settings["chunk"],
-        table=settings["tabulate"],
+        starts=settings.starts,
+        seed=settings.seed,
+        size=settings.chunk,
+        table=settings.tabulate,
         progress=progress,
     )
 
@@ -183,7 +223,7 @@ def _created(
     prepared: Prepared,
     found: Readings,
     identity: Mapping[str, str],
-    settings: Mapping[str, Any],
+    settings: Settings,
     stack: Any,
 ) -> zarr.Group:
     problem, reduced = prepared.problem, prepared.reduced[np.isfinite(prepared.reduced)]
@@ -199,7 +239,7 @@ def _created(
         "stack": repr(stack),
         "transport": repr(problem.transport),
         "noise": repr(problem.noise),
-        "settings": dict(settings),
+        "settings": settings.told(),
         "pilot": {
             "texels": len(prepared.texels),
             "reduced_chi_square": float(np.median(reduced)) if reduced.size else math.nan,
@@ -213,7 +253,7 @@ def _created(
         names=problem.names,
         units=problem.units,
         shape=found.shape,
-        chunk=tile(found.shape, settings["chunk"]),
+        chunk=tile(found.shape, settings.chunk),
         attributes=about,
         numerical=prepared.numerical_error is not None,
     )
@@ -236,14 +276,14 @@ def _run(
     root: zarr.Group,
     prepared: Prepared,
     found: Readings,
-    settings: Mapping[str, Any],
+    settings: Settings,
     client: Any,
     processes: int,
     progress: Progress | None,
 ) -> list[str]:
     """Fit the chunks that are left; what became of those that could not be."""
     blocks = left(root)
-    every = len(list(grid(found.shape, tile(found.shape, settings["chunk"]))))
+    every = len(list(grid(found.shape, tile(found.shape, settings.chunk))))
     here = client is None and processes == 1
     source = found if here else found.portable
     job = Job(
@@ -251,7 +291,7 @@ def _run(
         prepared.problem,
         prepared.starts,
         prepared.least,
-        settings["chunk"],
+        settings.chunk,
         prepared.numerical_error,
         source,
     )

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from fits._lazy import shown_by
 from fits.maps import chunk_files
+from fits.maps.sampled import Sampled, sampled_in
 from fits.maps.store import FLAGS, FORMAT, KEY, KIND, arrays_of
 
 if TYPE_CHECKING:
     import zarr
-
-    from fits.maps.posterior import Sampled
 
 Floats = NDArray[np.float64]
 
@@ -107,11 +106,9 @@ class FittedMap:
         return (self.flags & FLAGS[meaning]) != 0
 
     @property
-    def posterior(self) -> "Sampled | None":
+    def posterior(self) -> Sampled | None:
         """Posteriors of a few texels beside their standard errors; None where `fit_map` was not asked for any."""
-        from fits.maps.posterior import sampled_of
-
-        return sampled_of(self)
+        return sampled_in(self._group, self.names, self.values, self.errors)
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":
         if path not in self._types:

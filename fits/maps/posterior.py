@@ -1,9 +1,8 @@
 """Posteriors of a few texels of a fitted map: how far the standard errors of all of them hold."""
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
@@ -12,48 +11,18 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.inference.optimise import refit
 from fits.inference.sampling import sample
-from fits.maps.fitted_map import open_map
+from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.inputs import Readings
 from fits.maps.job import Part, completed, part_of
 from fits.maps.prepared import GOLDEN, Prepared
+from fits.maps.sampled import GROUP, QUANTILES
 from fits.maps.tabulated import Tabulated
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
-if TYPE_CHECKING:
-    from fits.maps.fitted_map import FittedMap
-
 Floats = NDArray[np.float64]
 
-GROUP = "posterior"
-"""Of the store."""
-
-QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 MOST_STEPS = 20_000
-
-
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """Posteriors of T texels with P parameters.
-
-    Attributes:
-        names: of the parameters.
-        places: of the texels in the map, (T, rank).
-        mean, sd: (T, P).
-        quantiles: at `QUANTILES`, (T, P, 5).
-        shift: from the fitted value to the mean, in standard errors, (T, P).
-        ratio: standard deviation over standard error, (T, P): 1 where the error holds.
-        converged: whether the chain was long enough, (T,).
-    """
-
-    names: tuple[str, ...]
-    places: NDArray[np.int64]
-    mean: Floats
-    sd: Floats
-    quantiles: Floats
-    shift: Floats
-    ratio: Floats
-    converged: NDArray[np.bool_]
 
 
 def sample_texels(
@@ -83,30 +52,12 @@ def sample_texels(
     group.attrs.update({"names": list(fitted.names), "quantiles": list(QUANTILES), "seed": seed, "texels": len(places)})
 
 
-def chosen(fitted: "FittedMap", count: int) -> NDArray[np.int64]:
+def chosen(fitted: FittedMap, count: int) -> NDArray[np.int64]:
     """Places of texels that converged, evenly from all over the map, (T, rank)."""
     candidates = np.argwhere(fitted.has("converged"))
     turns = (np.arange(min(4 * count, len(candidates))) + 0.5) * GOLDEN % 1.0
     picked = list(dict.fromkeys((turns * len(candidates)).astype(int).tolist()))[:count]
     return candidates[sorted(picked)]
-
-
-def sampled_of(fitted: "FittedMap") -> Sampled | None:
-    """What a store holds of posteriors; None if there are none."""
-    root = zarr.open_group(fitted.path, mode="r")
-    if GROUP not in root or "texels" not in root[GROUP].attrs:  # written last
-        return None
-    group: Any = root[GROUP]
-    places, mean, sd, quantiles, converged = (
-        np.asarray(group[name][...]) for name in ("places", "mean", "sd", "quantiles", "converged")
-    )
-    at = tuple(places.T)
-    values, errors = (
-        np.stack([of[name][at] for name in fitted.names], axis=1) for of in (fitted.values, fitted.errors)
-    )
-    with np.errstate(all="ignore"):
-        shift, ratio = (mean - values) / errors, sd / errors
-    return Sampled(fitted.names, places, mean, sd, quantiles, shift, ratio, converged)
 
 
 def _sampled(

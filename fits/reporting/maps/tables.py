@@ -125,7 +125,7 @@ def posterior_table(map: FittedMap) -> Table | None:
         rows.append((name, f"{np.median(ratios):.3g}", range_, f"{np.median(shifts):.2g}", largest))
     columns = ("parameter", "sd / error", "from ... to", "mean - value, errors", "at most")
     note = (
-        f"{len(sampled.places)} texels from all over the map; {int(sampled.converged.sum())} of their chains converged. "
+        f"{len(sampled.places)} texels from all over the map; {sampled.converged.sum()} of their chains converged. "
         "Where sd / error is 1 and the means are the values, a standard error says all; where it is not, the posterior "
         "is skewed, curved or cut off by a bound."
     )
