@@ -29,6 +29,8 @@ from fits.progress import Progress
 
 LOCK = "fit-many.lock"
 NOT_YET = "not done yet"
+NAMED = 3
+"""Reasons that are given where no file can be fitted."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def fit_files(
     if not job.names():
         raise ValueError("no stack is given, nor a search asked for; there must be one of them")
     with _held(out):
-        plan = _Plan.of(job, out, found)
+        plan = _Plan.of(job, out, found, here=client is None)
         plan.require_readable()
         plan.write(left_out, pictures=False)
         try:
@@ -144,17 +146,20 @@ class _Plan:
 
     job: Job
     out: Path
+    here: bool
     rows: dict[tuple[str, str], Row] = field(default_factory=dict)
     tasks: list[Task] = field(default_factory=list)
 
     @classmethod
-    def of(cls, job: Job, out: Path, files: dict[str, Path]) -> "_Plan":
+    def of(cls, job: Job, out: Path, files: dict[str, Path], here: bool) -> "_Plan":
         """Files are read, and results that are there looked at.
+
+        here: whether workers share this working directory.
 
         Raises:
             ValueError: a result of something else is there.
         """
-        plan = cls(job, out)
+        plan = cls(job, out, here)
         for name, path in files.items():
             plan._add(name, path)
         order = job.names()
@@ -169,7 +174,7 @@ class _Plan:
             self._fail(name, job.names(), one_line(error))
             return
         for stack in job.names():
-            task = Task(path.absolute(), fingerprint_of, stack)
+            task = Task(path if self.here else path.absolute(), fingerprint_of, stack)
             self.rows[name, stack] = Row(name, stack, failure=NOT_YET)
             try:
                 row = done_before(task.directory(self.out), job.origin(fingerprint_of, stack))
@@ -206,10 +211,11 @@ class _Plan:
 
     def require_readable(self) -> None:
         """ValueError that says why, where nothing is done nor left to be done."""
-        broken = [row.failure for row in self.rows.values() if not row.fitted]
-        if not self.tasks and len(broken) == len(self.rows):
-            more = len({row.file for row in self.rows.values()}) - 1
-            raise ValueError(broken[0] + (f" (and {more} more, of which none can be fitted)" if more else ""))
+        if self.tasks or any(row.fitted for row in self.rows.values()):
+            return
+        reasons = list(dict.fromkeys(row.failure for row in self.rows.values()))
+        more = f"; and {len(reasons) - NAMED} more" if len(reasons) > NAMED else ""
+        raise ValueError(f"no file can be fitted: {'; '.join(reasons[:NAMED])}{more}")
 
     def write(self, left_out: Sequence[str], pictures: bool) -> None:
         """Table and page of what is done by now."""

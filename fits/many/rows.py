@@ -130,7 +130,7 @@ def standings(rows: Sequence[Row]) -> dict[tuple[str, str], str]:
         for row in own:
             behind = (row.loss - best.loss) / (1.0 if math.isnan(excess) else excess)
             alike = behind < LEANING and row.measure in ("AIC", "score") and row.converged
-            words[row.file, row.stack] = BEST if row is best else AS_GOOD if alike else f"+{behind:.1f}"
+            words[row.file, row.stack] = BEST if row is best else AS_GOOD if alike else f"{behind:+.1f}"
     return words
 
 

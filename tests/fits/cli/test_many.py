@@ -1,0 +1,95 @@
+"""`layerjax fit-many`: what it prints, how it ends, and that its results are those of `layerjax fit`."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from fits.cli.parser import main
+from fits.reporting.results import load_fit
+from tests.helpers.coats import make_folder
+from tests.helpers.commands import refused
+
+MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    make_folder(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "scans" / "coated.csv").unlink()
+    assert main([*MANY, "--mask-grazing", "80"]) == 1  # one file is broken
+    output = capsys.readouterr()
+    for words in ("broken.csv", "FAILED", "paint.csv", "1 of 2 fits are there", "out/table.csv", "out/report.html"):
+        assert words in output.out
+    assert "layerjax: fits 2/2" in output.err
+    fit = ["fit", "scans/paint.csv", "--stack", "bare.toml", "--out", "alone", "--starts", "2", "--mask-grazing", "80"]
+    assert main(fit) == 0
+    own = {path.name for path in (folder / "out" / "paint.csv" / "bare").iterdir()}
+    assert own == {path.name for path in (folder / "alone").iterdir()} | {"origin.json"}
+    for name in ("fitted.toml", "problem.toml", "data.csv"):
+        same = (folder / "out" / "paint.csv" / "bare" / name).read_text() == (folder / "alone" / name).read_text()
+        assert same, name
+    assert main(["compare", "out/paint.csv/bare", "alone", "--no-refit"]) == 0
+    assert main(["predict", "out/paint.csv/bare", "--incidence", "20", "--out", "predicted.csv"]) == 0
+
+    (folder / "scans" / "broken.csv").unlink()
+    capsys.readouterr()
+    assert main([*MANY, "--mask-grazing", "80"]) == 0  # nothing is left to do
+    assert "1 of 1 fits are there, 1 of them converged" in capsys.readouterr().out
+    with open("out/table.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["base.albedo"]) == pytest.approx(load_fit("alone").values["base.albedo"])
+    assert "starts 2, not 3" in refused([*MANY, "--mask-grazing", "80", "--starts", "3"], capsys, folder)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nowhere", "--stacks", "bare.toml"], "nowhere: no such file or folder"),
+        (["scans", "--stacks", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["scans"], "no stack is given, nor a search asked for"),
+        (["scans/broken.csv", "--stacks", "bare.toml"], "'twenty'"),
+        (["scans", "scans", "--stacks", "bare.toml"], "results go by the file's name"),
+        (["scans", "--stacks", "bare.toml", "--only", "everything"], "'everything' is no selection"),
+        (["scans", "--stacks", "bare.toml", "--strata", "flux"], "--strata is given without --bins"),
+        (["scans", "--stacks", "bare.toml", "--noise", "0.1"], "--noise is given without --search"),
+        (["scans", "--stacks", "bare.toml", "--objective", "cube_root", "--hold-out", "incidence=50"], "--hold-out"),
+    ],
+)
+def test_bad_input_is_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    assert message in refused(["fit-many", *words, "--out", "out"], capsys, folder)
+    assert not (folder / "out").exists()
+
+
+def test_no_processes_are_bad_usage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*MANY[:-1], "0"])
+    assert stop.value.code == 2
+    assert "must be a whole number >= 1" in capsys.readouterr().err
+
+
+def test_a_cluster_that_is_not_there_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dask = pytest.importorskip("dask")
+    pytest.importorskip("distributed")
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        assert main([*MANY, "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_an_interrupt_says_how_to_go_on(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fits.many.files.fit_one", interrupted)
+    assert main(MANY) == 130
+    assert "out keeps what was fitted; the same command again goes on with it" in capsys.readouterr().err
+    assert (folder / "out" / "table.csv").is_file()

@@ -1,0 +1,40 @@
+"""A folder of simulated readings of two materials, and the stack files that made them."""
+
+from pathlib import Path
+
+import layerjax as lj
+from fits.data.formats.csv import write_csv
+from fits.data.geometry import slices
+from fits.problem.simulate import simulate
+
+BASE = """
+[base]
+kind = "Lambertian"
+albedo = { start = 0.5, low = 0.0, high = 1.0 }
+
+[noise]
+correlated = false
+"""
+COAT = """
+[[layers]]
+kind = "Medium"
+thickness = { start = 1.0, low = 0.05, high = 5.0 }
+albedo = 0.8
+"""
+STACKS = {"coat": f'transport = "SingleScattering"\n{COAT}{BASE}', "bare": f'transport = "SingleScattering"\n{BASE}'}
+THICKNESS, COATED, BARE = 0.6, 0.4, 0.7
+TRUE = {"coated.csv": {"layers[0].thickness": THICKNESS, "base.albedo": COATED}, "paint.csv": {"base.albedo": BARE}}
+
+
+def make_folder(folder: Path) -> None:
+    """coat.toml and bare.toml, and in scans/: coated.csv, paint.csv, one that is broken, and one that is no data."""
+    scans = folder / "scans"
+    scans.mkdir()
+    view = slices(incidence=(10, 50), azimuth=(0, 60))
+    coated = lj.Stack([lj.Medium(thickness=THICKNESS, albedo=0.8)], base=lj.Lambertian(COATED))
+    for name, stack in (("coated", coated), ("paint", lj.Stack([], base=lj.Lambertian(BARE)))):
+        write_csv(simulate(stack, view, transport=lj.SingleScattering(), noise=0.03, seed=1), scans / f"{name}.csv")
+    (scans / "broken.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n10,180,twenty,0,0.1\n")
+    (scans / "README.md").write_text("Readings of two samples.\n")
+    for name, text in STACKS.items():
+        (folder / f"{name}.toml").write_text(text)
