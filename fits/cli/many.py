@@ -41,6 +41,7 @@ def fit_many(arguments: Namespace) -> int:
             starts=arguments.starts,
             seed=arguments.seed,
             solver=arguments.solver,
+            reports=not arguments.no_reports,
             force=arguments.force,
             progress=progress,
         )

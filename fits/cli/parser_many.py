@@ -34,6 +34,9 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
         metavar="ADDRESS",
         help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",
     )
+    parser.add_argument(
+        "--no-reports", action="store_true", help="leave out the report of each fit, `layerjax report DIR` writes it"
+    )
     add_fitting(parser)
     add_reading(parser)
     add_only(parser, "fit")

@@ -26,6 +26,7 @@ from fits.many.table import KIND, table_csv, table_json
 from fits.many.work import Job, Task, fit_one
 from fits.problem.likelihood import Objective
 from fits.progress import Progress
+from fits.reporting.results import REPORT
 
 LOCK = "fit-many.lock"
 NOT_YET = "not done yet"
@@ -78,6 +79,7 @@ def fit_files(
     starts: int = 32,
     seed: int = 0,
     solver: Solver = "least_squares",
+    reports: bool = True,
     force: bool = False,
     progress: Progress | None = None,
 ) -> FittedFiles:
@@ -90,12 +92,12 @@ def fit_files(
         files: a folder, of which files that hold no measurements are left out, or files and folders.
         stacks: stack files; may be none where a search is asked for.
         out: directory to write, or to go on with.
-        processes, client: who does it, see `fits.engines.run`. Workers of a cluster see files and `out` by these paths.
+        processes, client: see `fits.engines.run`. Workers of a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a `Searching` says how.
         format, quantity, bins, strata: see `fits.read`, of all files.
         mask_retro, mask_grazing, only, hold_out: see `fits.data.reading.Reading`.
-        objective: in place of that of the stack files.
-        starts, seed, solver: of each fit, see `fits.fit`.
+        objective, starts, seed, solver: of each fit, see `fits.fit`; objective: in place of that of the stack files.
+        reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
         progress: called with ("fits", done, all, file and stack).
 
@@ -110,21 +112,27 @@ def fit_files(
         require_posterior(objective or problem.objective, "--hold-out" if hold_out else None)
     searching = Searching(seed=seed) if search is True else search or None
     out = Path(out)
-    job = Job(out.absolute(), given, searching, reading, objective, starts, seed, solver, force)
+    job = Job(out.absolute(), given, searching, reading, objective, starts, seed, solver, force, reports)
     if not job.names():
         raise ValueError("no stack is given, nor a search asked for; there must be one of them")
     with _held(out):
-        plan = _Plan.of(job, out, found, here=client is None)
-        plan.require_readable()
-        plan.write(left_out, pictures=False)
-        try:
-            _fit_all(job, plan, processes, client, progress)
-        except BaseException:
-            with suppress(OSError):
-                plan.write(left_out, pictures=False)
-            raise
-        plan.write(left_out, pictures=True)
-    return FittedFiles(out, plan.ordered, left_out)
+        return _carried_out(job, _Plan.of(job, out, found, here=client is None), left_out, processes, client, progress)
+
+
+def _carried_out(
+    job: Job, plan: "_Plan", left_out: tuple[str, ...], processes: int, client: Any, progress: Progress | None
+) -> FittedFiles:
+    """What is left of a plan is done, and all of it is told."""
+    plan.require_readable()
+    plan.write(left_out, pictures=False)
+    try:
+        _fit_all(job, plan, processes, client, progress)
+    except BaseException:
+        with suppress(OSError):
+            plan.write(left_out, pictures=False)
+        raise
+    plan.write(left_out, pictures=True)
+    return FittedFiles(plan.out, plan.ordered, left_out)
 
 
 def _fit_all(job: Job, plan: "_Plan", processes: int, client: Any, progress: Progress | None) -> None:
@@ -223,9 +231,10 @@ class _Plan:
         settings: dict[str, Any] = {"starts": job.starts, "seed": job.seed, "solver": job.solver}
         settings |= {"objective": job.objective, "searching": None if job.searching is None else repr(job.searching)}
         settings |= vars(job.reading)
+        drawn = {row.directory for row in rows if row.fitted and (self.out / row.directory / REPORT).is_file()}
         write_json(self.out / TABLE_JSON, table_json(rows, left_out, settings), force=True)
         write_text(self.out / TABLE, table_csv(rows), force=True)
-        write_text(self.out / PAGE, page(rows, left_out, pictures), force=True)
+        write_text(self.out / PAGE, page(rows, left_out, pictures, drawn), force=True)
 
 
 @contextmanager

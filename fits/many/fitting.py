@@ -16,7 +16,7 @@ from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress
 from fits.reporting import results
 from fits.reporting.directories import replacing, reserved
-from fits.reporting.html import Foretold
+from fits.reporting.html import Foretold, foretell
 from fits.reporting.report_files import write_report
 from fits.reporting.stored import HELD_OUT
 
@@ -45,6 +45,7 @@ def fit_into(
     seed: int = 0,
     solver: Solver = "least_squares",
     force: bool = False,
+    report: bool = True,
     progress: Progress | None = None,
     beside: Beside | None = None,
 ) -> Fitted:
@@ -57,6 +58,7 @@ def fit_into(
         objective: in place of that of the stack file.
         starts, seed, solver, progress: see `fit`; starts are kept beside the directory until it is there.
         force: replace an earlier result.
+        report: with it and its pictures, which take longer than a fit of a transport in closed form.
         beside: files that the directory holds as well.
 
     Raises:
@@ -81,7 +83,7 @@ def fit_into(
             checkpoint=done,
         )
         text = given.text if objective == given.objective else None
-        fitted = _written(directory, found, unseen, text, force, progress, beside)
+        fitted = _written(directory, found, unseen, text, force, report, progress, beside)
         for kept in (done, again(done)):
             kept.unlink(missing_ok=True)
     return fitted
@@ -92,12 +94,12 @@ def write_into(
     found: Fit,
     *,
     force: bool = False,
-    progress: Progress | None = None,
+    report: bool = True,
     beside: Beside | None = None,
 ) -> Fitted:
     """Write the result directory of a fit with its report; arguments as of `fit_into`."""
     with reserved(directory, force):
-        return _written(Path(directory), found, None, None, force, progress, beside)
+        return _written(Path(directory), found, None, None, force, report, None, beside)
 
 
 def require_posterior(objective: Objective, option: str | None) -> Objective:
@@ -114,6 +116,7 @@ def _written(
     unseen: Measurements | None,
     text: str | None,
     force: bool,
+    report: bool,
     progress: Progress | None,
     beside: Beside | None,
 ) -> Fitted:
@@ -123,7 +126,11 @@ def _written(
         results.write_fit(found, folder, text)
         if unseen is not None:
             write_csv(unseen, folder / HELD_OUT)
-        fitted = Fitted(found, write_report(folder, directory.resolve().name, found))
+        if report:
+            foretold = write_report(folder, directory.resolve().name, found)
+        else:
+            foretold = None if unseen is None else foretell(found, None, unseen)
+        fitted = Fitted(found, foretold)
         for name, content in (beside(fitted) if beside is not None else {}).items():
             write_json(folder / name, content)
     if progress is not None:

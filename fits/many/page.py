@@ -1,7 +1,8 @@
 """What became of many files, as tables, a picture for each stack, and one HTML page."""
 
 import html
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -32,20 +33,25 @@ def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
     words = standings(rows)
     several = len({row.stack for row in rows}) > 1
     scored = any(row.scored for row in rows)
-    heads = ["file", "stack", "converged", "chi2/dof", *(["log score"] if scored else [])]
+    shared = any(math.isfinite(row.alone) for row in rows)
+    heads = ["file", "stack", "converged", "chi2/dof", *(["without shared"] if shared else [])]
+    heads += ["log score"] if scored else []
     heads += [*(["standing"] if several else []), "readings", "seconds", "status"]
     cells = []
     for row in rows:
         fitted = ["yes" if row.converged else "NO", f"{row.reduced_chi_square:.3g}"]
+        fitted += [f"{row.alone:.3g}" if math.isfinite(row.alone) else ""] if shared else []
         fitted += [f"{row.score:.2f}" if row.scored else ""] if scored else []
         fitted += [words[row.file, row.stack]] if several else []
         fitted += [f"{row.readings:,}", f"{row.seconds:.1f}"]
-        found = f"{row.structure}; {row.status}" if row.structure else row.status
+        short = "; ".join(row.status.split("; ")[:2])  # all of it is in the table and in the report of the fit
+        found = f"{row.structure}; {short}" if row.structure else short
         middle = ["FAILED", *[""] * (len(fitted) - 1)] if row.failure else fitted
         cells.append((row.file, row.stack, *middle, row.failure or found))
     shown = cells if most is None else list(tables.shortened(cells, most))
-    note = "" if not several else _measured(rows)
-    return tables.Table("Fits", tuple(heads), tuple(shown), note, keys=2)
+    notes = [_measured(rows)] if several else []
+    notes += [_SHARED] if shared else []
+    return tables.Table("Fits", tuple(heads), tuple(shown), " ".join(notes), keys=2)
 
 
 def _measured(rows: Sequence[Row]) -> str:
@@ -90,10 +96,11 @@ def told(rows: Sequence[Row], left_out: Sequence[str]) -> list[str]:
     return words
 
 
-def page(rows: Sequence[Row], left_out: Sequence[str], pictures: bool = True) -> str:
-    """All of it as one HTML file, which stands beside the results that it links to."""
+def page(rows: Sequence[Row], left_out: Sequence[str], pictures: bool, drawn: Collection[str]) -> str:
+    """All of it as one HTML file, which stands beside the results; drawn: directories of those that have a report."""
     title = f"Fits of {_count(len({row.file for row in rows}), 'file')}"
-    links = {f"{row.file}\n{row.stack}": quote(f"{row.directory}/report.html") for row in rows if row.fitted}
+    told_of = [row for row in rows if row.directory in drawn]
+    links = {f"{row.file}\n{row.stack}": quote(f"{row.directory}/report.html") for row in told_of}
     fine = all(row.fitted and row.converged for row in rows)
     verdict = f'<p class="verdict{" fine" if fine else ""}">{html.escape(told(rows, left_out)[0])}</p>'
     body = [f"<h1>{html.escape(title)}</h1>", verdict, sentences(told(rows, left_out)[1:])]
@@ -151,6 +158,11 @@ def parameters_picture(rows: Sequence[Row]) -> "Figure":
             axes.set_axis_off()
     return figure
 
+
+_SHARED = (
+    "Without shared: chi2/dof of the same stack without errors that readings share, where they are counted: how far "
+    "the stack alone misses the data."
+)
 
 _CAPTION = "Every fitted parameter by file, with its standard error; orange: at a bound."
 

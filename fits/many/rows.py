@@ -35,6 +35,8 @@ class Row:
         structure: of a search, the stack that it found best, from the top.
         converged, status, objective, chi_square, reduced_chi_square: see `Fit`.
         readings: that were fitted.
+        alone: reduced chi-square of the stack without errors that readings share, which say how far it misses the data;
+            NaN where none are counted.
         aic: Akaike's information criterion; NaN for a named objective.
         score, scored: mean log-density of readings that were held out, and how many values they have.
         seconds: that it took, with compilation and pictures.
@@ -52,6 +54,7 @@ class Row:
     readings: int = 0
     chi_square: float = math.nan
     reduced_chi_square: float = math.nan
+    alone: float = math.nan
     aic: float = math.nan
     score: float = math.nan
     scored: int = 0
@@ -82,7 +85,8 @@ class Row:
 
 def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure: str, seconds: float) -> Row:
     """The row of a fit."""
-    fit, seen = fitted.fit, None if fitted.foretold is None else fitted.foretold.prediction.scores
+    fit, alone = fitted.fit, fitted.fit.alone
+    seen = None if fitted.foretold is None else fitted.foretold.prediction.scores
     return Row(
         file=file,
         stack=stack,
@@ -94,6 +98,7 @@ def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure
         readings=int(fit.problem.data.mask.sum()),
         chi_square=fit.chi_square,
         reduced_chi_square=fit.reduced_chi_square,
+        alone=math.nan if alone is None else alone.chi_square / max(alone.degrees_of_freedom, 1),
         aic=2.0 * len(fit.vector) - 2.0 * fit.log_likelihood,
         score=math.nan if seen is None else seen.log_score,
         scored=0 if seen is None else seen.count,
@@ -107,7 +112,7 @@ def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure
 
 def stored_row(content: Mapping[str, Any]) -> Row:
     """A row as `Row.plain` and a JSON file keep it: numbers that are not finite are words there."""
-    numbers = ("chi_square", "reduced_chi_square", "aic", "score", "seconds")
+    numbers = ("chi_square", "reduced_chi_square", "alone", "aic", "score", "seconds")
     parameters = tuple(
         Parameter(**(dict(one) | {key: float(one[key]) for key in ("value", "error")})) for one in content["parameters"]
     )

@@ -9,7 +9,15 @@ from fits.many.rows import Row, best_of, standings
 
 KIND = "layerjax_table"
 
-COLUMNS = ("file", "stack", "structure", "result", "converged", "standing", "reduced_chi_square", "aic", "score")
+COLUMNS = ("file", "stack", "structure", "result", "converged", "standing")
+NUMBERS = {
+    "reduced_chi_square": "reduced_chi_square",
+    "without shared errors": "alone",
+    "aic": "aic",
+    "score": "score",
+}
+"""Columns, and what of a row stands in them."""
+
 MORE = ("readings", "seconds", "at_bound", "status")
 
 
@@ -19,10 +27,10 @@ def table_csv(rows: Sequence[Row]) -> str:
     names = list(dict.fromkeys(one.name for row in rows for one in row.parameters))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([*COLUMNS, *(head for name in names for head in (name, f"{name} error")), *MORE])
+    writer.writerow([*COLUMNS, *NUMBERS, *(head for name in names for head in (name, f"{name} error")), *MORE])
     for row in rows:
         own = {one.name: one for one in row.parameters}
-        numbers = [_word(number) for number in (row.reduced_chi_square, row.aic, row.score)]
+        numbers = [_word(getattr(row, of)) for of in NUMBERS.values()]
         cells = [row.file, row.stack, row.structure, "failed" if row.failure else "fitted"]
         cells += ["" if row.failure else "yes" if row.converged else "no", words[row.file, row.stack], *numbers]
         for name in names:

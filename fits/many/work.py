@@ -38,6 +38,7 @@ class Job:
     seed: int
     solver: Any
     force: bool
+    reports: bool
 
     def names(self) -> list[str]:
         """Of stacks, and of the search."""
@@ -114,7 +115,7 @@ def _fitted(job: Job, task: Task) -> Row:
             shutil.rmtree(stacks)
         best = search_into(stacks, data, job.searching).best
         structure = best.name
-        write_into(directory, best.fit, force=job.force, beside=beside)
+        write_into(directory, best.fit, force=job.force, report=job.reports, beside=beside)
     else:
         fit_into(
             directory,
@@ -126,6 +127,7 @@ def _fitted(job: Job, task: Task) -> Row:
             seed=job.seed,
             solver=job.solver,
             force=job.force,
+            report=job.reports,
             beside=beside,
         )
     return rows[-1]

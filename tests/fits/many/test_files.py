@@ -210,6 +210,12 @@ def test_processes_give_what_threads_give(folder: Path) -> None:
     assert "data:image/png" in Path("out/paint.csv/bare/report.html").read_text()
 
 
+def test_reports_may_be_left_out(folder: Path) -> None:
+    assert fits.fit_files("scans/paint.csv", STACKS, "out", reports=False, **FEW).complete
+    assert not list((folder / "out").glob("*/*/report.html"))
+    assert "href=" not in Path("out/report.html").read_text()
+
+
 def test_one_run_at_a_time_writes_there(folder: Path) -> None:
     os.mkdir("out")
     with locked(Path("out") / LOCK, "it"), pytest.raises(ValueError, match="out is in use by another process"):

@@ -73,7 +73,8 @@ def test_a_row_comes_back_from_a_file() -> None:
 
 
 def test_the_page_escapes_names_and_links_to_reports() -> None:
-    text = page([*ROWS, row("coat", file="b.csv", failure="line 2: <x> is no number")], ["scans/README.md"])
+    rows = [*ROWS, row("coat", file="b.csv", directory="", failure="line 2: <x> is no number")]
+    text = page(rows, ["scans/README.md"], True, {one.directory for one in ROWS})
     assert "%3C0%3E%20%23.csv/coat/report.html" in text
     assert "&lt;0&gt; #.csv" in text
     assert "<0>" not in text
