@@ -47,6 +47,12 @@ def slow(shared: str, task: int) -> int:
     return task * task
 
 
+def endless(shared: str, task: int) -> None:
+    """Tells its process in a file, and takes longer than any test waits."""
+    Path(shared, f"{os.getpid()}").touch()
+    time.sleep(100.0)
+
+
 def unpicklable(shared: Any, task: Any) -> Any:
     return lambda: task
 
