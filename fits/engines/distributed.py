@@ -114,7 +114,7 @@ class _Run:
             with self._reached():
                 return [self._submit(index) for index in islice(left, self._room() - len(self.running))]
 
-        completed = as_completed(begin())
+        completed = as_completed(begin(), loop=self.client.loop)
         for future in completed:
             index = self.running.pop(future)
             outcome = self._outcome(future, index, alone)

@@ -35,7 +35,10 @@ def client() -> Iterator[Any]:
     before = {name: os.environ.get(name) for name in ("PYTHONPATH", *QUIET)}
     os.environ.update(QUIET | {"PYTHONPATH": str(ROOT)})
     try:
-        with distributed.LocalCluster(silence_logs=50, **options) as cluster, distributed.Client(cluster) as client:
+        with (
+            distributed.LocalCluster(silence_logs=50, **options) as cluster,
+            distributed.Client(cluster, set_as_default=False) as client,  # what is given must be enough
+        ):
             yield client
     finally:
         for name, value in before.items():
