@@ -148,13 +148,12 @@ def test_a_worker_is_set_as_its_parent_is(monkeypatch: pytest.MonkeyPatch, tmp_p
         assert seen["double"]
         assert seen["cache"] == jax.config.values["jax_compilation_cache_dir"]
         assert seen["least"] == 0.2
-        assert "--xla_cpu_multi_thread_eigen=false" in seen["flags"].split()
+        assert seen["flags"] == os.environ.get("XLA_FLAGS", "")  # with others, results differ in their last digits
         assert seen["interrupts"]
         np.testing.assert_array_equal(seen["shared"], large)
     allowed = os.sched_getaffinity(0)
     assert {core for seen in found for core in seen["cores"]} <= allowed
     assert all(len(seen["cores"]) == 1 for seen in found)
-    assert "--xla_cpu_multi_thread_eigen=false" not in os.environ.get("XLA_FLAGS", "")
 
 
 SCRIPT = """

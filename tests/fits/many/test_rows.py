@@ -67,9 +67,9 @@ ROWS = [
 def test_a_row_comes_back_from_a_file() -> None:
     import json
 
-    from fits._files import _plain
+    from fits._files import plain
 
-    assert repr(stored_row(json.loads(json.dumps(_plain(ROWS[0].plain()))))) == repr(ROWS[0])
+    assert repr(stored_row(json.loads(json.dumps(plain(ROWS[0].plain()))))) == repr(ROWS[0])
 
 
 def test_the_page_escapes_names_and_links_to_reports() -> None:
