@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +34,7 @@ from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
+from fits.problem.problem import with_floor
 from fits.progress import Progress
 
 if TYPE_CHECKING:
@@ -145,6 +146,9 @@ def _fitted(
     identity = {name: digest(one) for name, one in {"stack": stack, "noise": noise, **rest}.items()}
     identity |= {"settings": digest(settings.told()), "readings": found.digest()}
     identity["precision"] = str(np.dtype(jnp.result_type(float)))
+    if rest["instrument"] is not None:  # the floor of a map's noise stands in one place
+        noise = with_floor(noise or Noise(), rest["instrument"])
+        rest = {**rest, "instrument": replace(rest["instrument"], floor=None)}
     root = _begun(path, identity, force)
     prepared = _prepared(root, found, stack, noise, rest, settings, progress)
     if root is None:

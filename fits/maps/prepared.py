@@ -165,6 +165,9 @@ def prepare(
     """
     own, sample = readings.geometry is None, with_floor(sample, least_floor(problem))
     names, words = shared_names(problem), {}
+    for name in names:
+        if name.startswith("instrument."):
+            raise ValueError(f"{name} is shared; of an instrument nothing can be, hold it at a number")
     if len(names) == len(problem.names):
         raise ValueError("stack: all free parameters are shared; a map needs one that each texel has of its own")
     problem, known = resolved(problem, starts, seed, progress)

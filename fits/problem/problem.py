@@ -145,7 +145,7 @@ def _assemble(problem: Problem) -> Assembled:
     used = problem.data.used()
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
-    levels = noise_levels(_with_floor(problem.noise, problem.instrument), used)
+    levels = noise_levels(with_floor(problem.noise, problem.instrument), used)
     process = make_process(used.wi, used.wo) if problem.noise.correlated else None
     if process is not None:
         process = replace(process, gram=levels.gram(process, used.values))
@@ -275,7 +275,7 @@ def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
     }
 
 
-def _with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
+def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
     """The noise with an instrument's floor."""
     if instrument is None or instrument.floor is None:
         return noise

@@ -291,3 +291,19 @@ def test_what_cannot_be_is_refused(tmp_path, geometry, values):
 )
 def test_chunks_are_as_square_as_the_map_allows(shape, texels, expected):
     assert tile(shape, texels) == expected
+
+
+def test_an_instrument_stands_between_map_and_readings(tmp_path, geometry, values):
+    instrument = fits.Instrument(detector=2.0, floor=1e-4, gain_per_incidence=0.01)
+    noise = fits.Noise(relative=0.02)
+    found = fitted(tmp_path / "seen.zarr", geometry, values[3:4], noise=noise, instrument=instrument)
+    data = problem_of(values[3, 2], geometry, np.ones((16, 1), bool)).data
+    alone = replace(noise, correlated=False)
+    one = fits.fit(FREE, data, transport=TRANSPORT, noise=alone, instrument=instrument, starts=2)
+    assert found.names == one.problem.names
+    for name in found.names:
+        assert abs(found.values[name][0, 2] - one.values[name]) < 2e-3 * one.standard_errors[name]
+        assert found.errors[name][0, 2] == pytest.approx(one.standard_errors[name], rel=1e-3)
+    shared = fits.Instrument(offset=fits.Free(0.0, -1.0, 1.0, shared=True))
+    with pytest.raises(ValueError, match="instrument.offset is shared"):
+        fitted(tmp_path / "none.zarr", geometry, values, instrument=shared)
