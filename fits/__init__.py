@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
+    from fits.maps.smoothing import Smoothness as Smoothness
     from fits.problem.correlated import Correlated as Correlated
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
@@ -81,6 +82,7 @@ _HOMES = {
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
+    "Smoothness": "maps.smoothing",
     "Foresight": "inference.foresight",
     "read": "data.formats",
     "write_csv": "data.formats.csv",

@@ -21,6 +21,9 @@ Floats = NDArray[np.float64]
 
 ROOT = "zarr.json"
 
+SMOOTHED = "smoothed"
+"""The group of the map smoothed, see `fits.maps.alternating`."""
+
 
 class FittedMap:
     """Parameters of every texel of a map, with errors and flags; arrays are read when they are asked for.
@@ -58,6 +61,23 @@ class FittedMap:
     def errors(self) -> Mapping[str, Floats]:
         """Standard errors by name; NaN at a bound, infinite where nothing holds a parameter."""
         return _Arrays(self, "errors")
+
+    @property
+    def smoothed(self) -> Mapping[str, Floats] | None:
+        """Values of the map with neighbours held together, by name; None if it was not smoothed."""
+        return None if self.smoothing is None else _Arrays(self, f"{SMOOTHED}/values")
+
+    @property
+    def smoothed_errors(self) -> Mapping[str, Floats] | None:
+        """Their standard errors by name, with the neighbours of a texel held where they are; None as `smoothed`."""
+        return None if self.smoothing is None else _Arrays(self, f"{SMOOTHED}/errors")
+
+    @property
+    def smoothing(self) -> dict[str, Any] | None:
+        """How the map was smoothed: what was asked for, rounds, largest moves, objective; None if it was not."""
+        if not is_store(self.path / SMOOTHED):
+            return None
+        return _attributes(self.path / SMOOTHED)
 
     @property
     def reduced_chi_square(self) -> Floats:
@@ -111,8 +131,8 @@ class FittedMap:
         return sampled_in(self._group, self.names, self.values, self.errors)
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":
-        if path not in self._types:
-            raise KeyError(f"{path!r} is not one of {', '.join(self._types)}")
+        if path not in self._every:
+            raise KeyError(f"{path!r} is not one of {', '.join(self._every)}")
         return self._group[path]  # type: ignore[return-value]
 
     def __repr__(self) -> str:
@@ -126,6 +146,14 @@ class FittedMap:
     def _types(self) -> dict[str, tuple[np.dtype, Any]]:
         return arrays_of(self.names, self.attributes["numerical_error"])
 
+    @property
+    def _every(self) -> dict[str, tuple[np.dtype, Any]]:
+        """With the arrays of the map smoothed, where there are any."""
+        if not is_store(self.path / SMOOTHED):
+            return self._types
+        plain = {name: one for name, one in self._types.items() if name.partition("/")[0] in ("values", "errors")}
+        return self._types | {f"{SMOOTHED}/{name}": one for name, one in plain.items()}
+
     @cached_property
     def _group(self) -> "zarr.Group":
         import zarr
@@ -134,7 +162,7 @@ class FittedMap:
 
     def _read(self, name: str) -> Any:
         """A whole array. A damaged chunk is a ValueError that names it; zarr would tell of it in many words."""
-        array, (dtype, _) = self[name], self._types[name]
+        array, (dtype, _) = self[name], self._every[name]
         if not _is_plain(array):  # somebody wrote it anew, compressed
             return np.asarray(array[...])
         whole = np.full(self.shape, array.fill_value, dtype)

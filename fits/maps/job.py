@@ -105,14 +105,13 @@ def work(job: Job, task: Task) -> dict[str, int]:
 def fit_chunk(job: Job, part: Part) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
     shape = part.values.shape[:-2]
-    flat = _flat(part, len(shape))
-    rows = texels(flat.values, flat.sigma, job.least, flat.wi, flat.wo)
+    rows, mask = rows_of(job, part), part.mask.reshape(-1)
     enough = rows.readings >= len(job.problem.names)
-    fitted = np.flatnonzero(flat.mask & enough)
+    fitted = np.flatnonzero(mask & enough)
     results = _empty(job, rows.number)
     results["readings"][:] = rows.readings
-    results["flags"][~flat.mask] |= FLAGS["masked"]
-    results["flags"][flat.mask & ~enough] |= FLAGS["too_few_readings"]
+    results["flags"][~mask] |= FLAGS["masked"]
+    results["flags"][mask & ~enough] |= FLAGS["too_few_readings"]
     if len(fitted):
         beside = _among(neighbours(shape), fitted)
         ends = search(job.problem, job.starts, rows.rows(fitted), job.size, beside)
@@ -120,13 +119,14 @@ def fit_chunk(job: Job, part: Part) -> dict[str, NDArray[Any]]:
     return {name: array.reshape(shape) for name, array in results.items()}
 
 
-def _flat(part: Part, rank: int) -> Part:
-    """The same with one axis of texels."""
+def rows_of(job: Job, part: Part) -> Texels:
+    """The texels of a part, one after the other."""
+    rank = part.mask.ndim
 
     def flat(array: Any) -> Any:
         return None if array is None else array.reshape(-1, *array.shape[rank:])
 
-    return Part(*map(flat, part))
+    return texels(flat(part.values), flat(part.sigma), job.least, flat(part.wi), flat(part.wo))
 
 
 def _among(beside: NDArray[np.int64], fitted: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -101,7 +101,7 @@ def create(
                     dtype=dtype,
                     fill_value=fill,
                     compressors=None,
-                    dimension_names=_dimensions(len(chunk)),
+                    dimension_names=dimensions(len(chunk)),
                     attributes=_described(name, units),
                 )
             os.chmod(new, permissions(0o777))  # mkdtemp makes what only its owner can read
@@ -128,7 +128,7 @@ def _checked(path: Path, names: Sequence[str], shape: Sequence[int], chunk: Sequ
     return tuple(min(side, size) for side, size in zip(chunk, shape, strict=True))
 
 
-def _dimensions(rank: int) -> list[str]:
+def dimensions(rank: int) -> list[str]:
     """Names of axes, by which xarray knows that arrays belong together."""
     return {1: ["texel"], 2: ["row", "column"]}.get(rank, [f"axis_{axis}" for axis in range(rank)])
 
@@ -201,7 +201,9 @@ def left(group: "zarr.Group") -> list[Block]:
 
 def clean(path: str | Path) -> None:
     """Remove what writers that were killed left of files they had begun; none may be writing."""
-    for folder, _, files in os.walk(path):
+    for folder, folders, files in os.walk(path):
+        for name in [one for one in folders if one.endswith(PARTIAL)]:
+            shutil.rmtree(os.path.join(folder, name), ignore_errors=True)
         for name in files:
             if name.endswith(PARTIAL):
                 with suppress(FileNotFoundError):

@@ -11,6 +11,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.problem.model import Model
+from fits.problem.parameters import Box
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -24,7 +25,8 @@ class Texels(NamedTuple):
 
     values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is left out,
     and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
-    of the problem.
+    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the coordinate of
+    `Box.centre`; None where there are none.
     """
 
     values: Any
@@ -33,6 +35,8 @@ class Texels(NamedTuple):
     used: Any
     wi: Any = None
     wo: Any = None
+    centre: Any = None
+    inverse_sd: Any = None
 
     @property
     def number(self) -> int:
@@ -86,7 +90,17 @@ def model_of(model: Model, row: Texels) -> Model:
     """The model with the readings of one texel, (N, C)."""
     own = (row.values, row.variance, row.lowest)
     model = eqx.tree_at(lambda m: (m.values, m.variance, m.lowest), model, own)
+    if row.centre is not None:
+        model = eqx.tree_at(lambda m: m.box, model, _with_prior(model.box, row.centre, row.inverse_sd))
     return model if row.wi is None else eqx.tree_at(lambda m: (m.wi, m.wo), model, (row.wi, row.wo))
+
+
+def _with_prior(box: Box, centre: Array, inverse_sd: Array) -> Box:
+    """The box with Gaussian priors (P,) beside its own, one product of the two, up to a constant."""
+    own, other = jnp.square(box.inverse_sd), jnp.square(inverse_sd)
+    both = own + other
+    mean = (own * box.centre + other * centre) / jnp.where(both > 0.0, both, 1.0)
+    return replace(box, centre=mean, inverse_sd=jnp.sqrt(both))
 
 
 def with_own_directions(problem: Problem) -> Problem:
