@@ -22,6 +22,7 @@ import zarr
 import layerjax
 from fits._files import locked
 from fits.engines import Failure, run
+from fits.maps.alternating import require_smoothable, smooth_map
 from fits.maps.chunk_files import Block, grid
 from fits.maps.fitted_map import FittedMap, is_store, open_map
 from fits.maps.identity import digest, require_same
@@ -29,6 +30,7 @@ from fits.maps.inputs import Readings, readings
 from fits.maps.job import Job, Task, part_of, work
 from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
+from fits.maps.smoothing import Smoothness
 from fits.maps.store import KEY, clean, create, left
 from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise, Objective
@@ -55,6 +57,8 @@ class Settings:
             maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
         posterior: texels whose posteriors are sampled as well, see `FittedMap.posterior`: they tell how far standard
             errors hold.
+        smooth: holds neighbouring texels together, beside the plain fit and after it, see `FittedMap.smoothed`; another
+            one smooths anew, and fits nothing again.
 
     Raises:
         ValueError: a number below what it must be.
@@ -66,11 +70,14 @@ class Settings:
     chunk: int = 1024
     tabulate: bool | None = None
     posterior: int = 0
+    smooth: Smoothness | None = None
 
     def __post_init__(self) -> None:
         for name, least in {"starts": 1, "seed": 0, "sample": 1, "chunk": 1, "posterior": 0}.items():
             if not getattr(self, name) >= least:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        if not isinstance(self.smooth, Smoothness | None):
+            raise ValueError(f"smooth is {self.smooth!r}; it must be a fits.Smoothness, or None")
 
     def told(self) -> dict[str, Any]:
         """What the fits of the texels depend on."""
@@ -98,6 +105,7 @@ def fit_map(
     processes: int = 1,
     tabulate: bool | None = None,
     posterior: int = 0,
+    smooth: Smoothness | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> FittedMap:
@@ -113,17 +121,17 @@ def fit_map(
         noise: as in `fits.fit`, but independent; a floor that it leaves out is one for the whole map.
         client: a `distributed.Client`, or the address of a scheduler, whose workers see `out` under the same path.
         transport, scale, objective, instrument: as in `fits.fit`; no instrument where texels have own directions.
-        starts, seed, sample, chunk, tabulate, posterior: see `Settings`.
+        starts, seed, sample, chunk, tabulate, posterior, smooth: see `Settings`.
         processes: 1: threads of this process, one a core; of more each has a core of its own.
         force: throw away a store of other arguments, and begin anew.
-        progress: called with ("sample" or "map", done, all, note).
+        progress: called with (stage, done, all, note): "sample", "map" and so on.
 
     Raises:
         ValueError: arguments that do not fit together, a store of others, one that another process writes, or chunks
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    settings = Settings(starts, seed, sample, chunk, tabulate, posterior)
+    settings = Settings(starts, seed, sample, chunk, tabulate, posterior, smooth)
     rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
     found = readings(values, geometry, sigma=sigma, mask=mask)
     _require_fitting(settings, found, rest)
@@ -156,10 +164,15 @@ def _fitted(
     if GROUP not in root:
         save(prepared, root)
     prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
-    failures = _run(path, root, prepared, found, settings, client, processes, progress)
+    require_smoothable(prepared.problem, settings.smooth)
+    job = _job(path, prepared, found, settings, client is None and processes == 1)
+    failures = _run(root, job, found, client, processes, progress)
     if failures:
         more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
         raise ValueError(f"{path}: {failures[0]}{more}; all other chunks are done, and another run does these")
+    if settings.smooth is not None:
+        here = replace(job, source=found) if client is None else job
+        smooth_map(open_map(path), here, found, settings.smooth, client, progress)
     if settings.posterior:
         sample_texels(root, prepared, found, settings.posterior, settings.seed, progress)
     return open_map(path)
@@ -206,6 +219,7 @@ def _prepared(
     problem = prototype(some, found, stack, noise, **rest)
     if len(problem.names) > MOST_PARAMETERS:
         raise ValueError(f"stack: {len(problem.names)} parameters are free; of a map at most {MOST_PARAMETERS} can be")
+    require_smoothable(problem, settings.smooth)
     enough = some.readings >= len(problem.names)
     if not enough.any():
         raise ValueError(f"values: no texel has as many readings as there are free parameters, {len(problem.names)}")
@@ -275,32 +289,27 @@ def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
     return tuple(sides)
 
 
-def _run(
-    path: Path,
-    root: zarr.Group,
-    prepared: Prepared,
-    found: Readings,
-    settings: Settings,
-    client: Any,
-    processes: int,
-    progress: Progress | None,
-) -> list[str]:
-    """Fit the chunks that are left; what became of those that could not be."""
-    blocks = left(root)
-    every = len(list(grid(found.shape, tile(found.shape, settings.chunk))))
-    here = client is None and processes == 1
-    source = found if here else found.portable
-    job = Job(
+def _job(path: Path, prepared: Prepared, found: Readings, settings: Settings, here: bool) -> Job:
+    """What all chunks have in common; here: threads of this process do them."""
+    return Job(
         str(path.resolve()),
         prepared.problem,
         prepared.starts,
         prepared.least,
         settings.chunk,
         prepared.numerical_error,
-        source,
+        found if here else found.portable,
     )
+
+
+def _run(
+    root: zarr.Group, job: Job, found: Readings, client: Any, processes: int, progress: Progress | None
+) -> list[str]:
+    """Fit the chunks that are left; what became of those that could not be."""
+    blocks = left(root)
+    every = len(list(grid(found.shape, tile(found.shape, job.size))))
     failures = []
-    tasks, unreadable = _tasks(blocks, found, source is None)
+    tasks, unreadable = _tasks(blocks, found, job.source is None)
     failures += unreadable
     done = every - len(blocks)
     _tell(progress, done, every, "")

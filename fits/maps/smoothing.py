@@ -54,9 +54,8 @@ class Smoothness:
         given = self.scale if isinstance(self.scale, Mapping) else {"": self.scale}
         if not given:
             raise ValueError("Smoothness.scale is empty; it must name a parameter, or be a number")
-        plain = {
-            str(name): _checked(f"Smoothness.scale{f'[{name!r}]' if name else ''}", v) for name, v in given.items()
-        }
+        where = {name: f"Smoothness.scale[{name!r}]" if name else "Smoothness.scale" for name in given}
+        plain = {str(name): _checked(where[name], one) for name, one in given.items()}
         object.__setattr__(self, "scale", plain if isinstance(self.scale, Mapping) else plain[""])
         whole = isinstance(self.rounds, int | np.integer) and not isinstance(self.rounds, bool)
         if not whole or self.rounds < 1:
