@@ -1,0 +1,389 @@
+"""Neighbouring texels held together: against joint minimisations by scipy, and what becomes of work that is stopped."""
+
+import errno
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares, minimize
+
+import fits
+import layerjax as lj
+from fits.data.geometry import Geometry
+from fits.maps import alternating, chunk_files
+from fits.maps.smoothing import Edges
+
+TRANSPORT = lj.SingleScattering()
+SHAPE, CHUNK = (4, 4), 8
+THICKNESS, ALBEDO = NAMES = ("layers[0].thickness", "base.albedo")
+LOW, HIGH = np.array([np.log(0.05), 0.0]), np.array([np.log(3.0), 1.0])
+MEAN, SD = 0.5, 0.2
+"""Of the prior of the albedo."""
+
+HUBER = 0.1
+"""Of a scale: below, a total variation is quadratic."""
+
+
+def coat(thickness, albedo):
+    return lj.Stack([lj.Medium(thickness, 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(albedo))
+
+
+FREE = coat(fits.Free(0.5, 0.05, 3.0, prior=fits.LogUniform()), fits.Free(0.4, 0.0, 1.0, prior=fits.Normal(MEAN, SD)))
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    every = fits.slices(incidence=[10.0, 60.0])
+    places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
+    return Geometry(every.wi[places], every.wo[places])
+
+
+@pytest.fixture(scope="module")
+def predict(geometry):
+    """Values (12,) of a texel from its numbers (2,) in the unit box."""
+
+    def one(unit):
+        natural = LOW + unit * (HIGH - LOW)
+        stack = coat(jnp.exp(natural[0]), natural[1])
+        return lj.evaluate(stack, jnp.asarray(geometry.wi), jnp.asarray(geometry.wo), transport=TRANSPORT)[:, 0]
+
+    return jax.jit(one)
+
+
+@pytest.fixture(scope="module")
+def mask():
+    mask = np.ones(SHAPE, bool)
+    mask[1, 2] = False
+    return mask
+
+
+@pytest.fixture(scope="module")
+def readings(predict):
+    """Of a map whose albedo has an edge in the middle, with their standard deviations."""
+    rows, columns = np.indices(SHAPE)
+    truth = np.stack([np.log(0.3 + 0.1 * rows), np.where(columns < 2, 0.3, 0.6)], axis=-1)
+    exact = np.stack([predict(one) for one in ((truth - LOW) / (HIGH - LOW)).reshape(-1, 2)]).reshape(*SHAPE, -1, 1)
+    sigma = 0.03 * exact
+    return exact + sigma * np.random.default_rng(4).standard_normal(exact.shape), sigma
+
+
+@pytest.fixture(scope="module")
+def fitted(geometry, readings, mask):
+    """Fits the map, with these options."""
+
+    def fit(out, **options):
+        options = {"chunk": CHUNK, "sample": 4, "starts": 2} | options
+        noise = fits.Noise(relative=0.0, floor=0.0)
+        values, sigma = readings
+        return fits.fit_map(FREE, geometry, values, out, noise, transport=TRANSPORT, sigma=sigma, mask=mask, **options)
+
+    return fit
+
+
+@pytest.fixture(scope="module")
+def own(predict, readings, mask):
+    """Residuals of all readings and priors at units (15, 2) of the texels that are fitted, written down anew."""
+    values, sigma = (jnp.asarray(one[mask][..., 0]) for one in readings)
+
+    def residuals(units):
+        data = (jax.vmap(predict)(units) - values) / sigma
+        return jnp.concatenate([data.reshape(-1), (units[:, 1] - MEAN) / SD])
+
+    return residuals
+
+
+@pytest.fixture(scope="module")
+def pairs(mask):
+    """Places, among the texels that are fitted, of those that lie beside each other."""
+    place = np.full(SHAPE, -1)
+    place[mask] = np.arange(mask.sum())
+    found = []
+    for row, column in np.argwhere(mask):
+        for other in ((row + 1, column), (row, column + 1)):
+            if max(other) < 4 and mask[other]:
+                found.append((place[row, column], place[other]))
+    return np.array(found)
+
+
+def units_of(values, mask):
+    """Numbers of the texels that are fitted, (15, 2), in the unit box."""
+    natural = np.stack([np.log(values[THICKNESS][mask]), values[ALBEDO][mask]], axis=-1)
+    return (natural - LOW) / (HIGH - LOW)
+
+
+def unit_errors(map, mask, errors):
+    slope = (HIGH - LOW) * np.stack([map.smoothed[THICKNESS][mask], np.ones(mask.sum())], axis=-1)
+    return np.stack([errors[name][mask] for name in NAMES], axis=-1) / slope
+
+
+SCALES = np.array([0.03, 0.02])
+WIDER = 3.0 * SCALES
+"""Of a total variation, whose neighbours hold on to each other ten times as much: few rounds are enough."""
+
+GAUSSIAN = fits.Smoothness("gaussian", dict(zip(NAMES, SCALES, strict=True)), rounds=40)
+VARIATION = fits.Smoothness("total_variation", dict(zip(NAMES, WIDER, strict=True)), rounds=100)
+
+
+@pytest.fixture(scope="module")
+def gaussian(tmp_path_factory, fitted):
+    return fitted(tmp_path_factory.mktemp("map") / "gaussian.zarr", smooth=GAUSSIAN)
+
+
+@pytest.fixture(scope="module")
+def variation(tmp_path_factory, fitted):
+    return fitted(tmp_path_factory.mktemp("map") / "variation.zarr", smooth=VARIATION)
+
+
+def left_to_go(map):
+    """How far the end of a geometric series of moves is at most, in standard errors, by its last two."""
+    *_, before, last = map.smoothing["largest_moves"]
+    return last / (1.0 - last / before)
+
+
+def test_gaussian_smoothness_ends_where_a_joint_minimisation_does(gaussian, own, pairs, mask):
+    assert gaussian.smoothing["settled"]
+    first, second = pairs.T
+
+    def residuals(flat):
+        units = flat.reshape(-1, 2)
+        return jnp.concatenate([own(units), ((units[second] - units[first]) / SCALES).reshape(-1)])
+
+    residuals, slopes = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
+    plain = units_of(gaussian.values, mask)
+    best = least_squares(
+        lambda x: np.asarray(residuals(x)), plain.ravel(), lambda x: np.asarray(slopes(x)), bounds=(0.0, 1.0),
+        xtol=1e-14, ftol=1e-14, gtol=1e-12,
+    )  # fmt: skip
+    joint, found = best.x.reshape(-1, 2), units_of(gaussian.smoothed, mask)
+    information = best.jac.T @ best.jac
+    errors = np.array([np.sqrt(np.diag(np.linalg.inv(information[k : k + 2, k : k + 2]))) for k in range(0, 30, 2)])
+    assert np.max(np.abs(joint - plain) / errors) > 3.0  # what is compared is no small change
+    assert np.max(np.abs(joint - found) / errors) < left_to_go(gaussian) + 2e-3  # a fit ends within 1e-4 errors
+    assert left_to_go(gaussian) < 0.1
+    # of Gauss-Newton at the optimum, to which the map has come this close
+    np.testing.assert_allclose(unit_errors(gaussian, mask, gaussian.smoothed_errors), errors, rtol=0.01)
+    start, *_, end = gaussian.smoothing["objective"]
+    costs = [0.5 * float(jnp.sum(residuals(units.ravel()) ** 2)) for units in (plain, found)]
+    assert start - end == pytest.approx(costs[0] - costs[1], rel=1e-9)
+
+
+def test_total_variation_ends_where_a_joint_minimisation_does(variation, own, pairs, mask):
+    assert variation.smoothing["settled"]
+    first, second = pairs.T
+
+    def cost(flat):
+        units = flat.reshape(-1, 2)
+        share = jnp.abs(units[second] - units[first]) / WIDER
+        size = jnp.where(share < HUBER, 0.5 * share**2 / HUBER + 0.5 * HUBER, share)
+        return 0.5 * jnp.sum(own(units) ** 2) + jnp.sum(size)
+
+    both = jax.jit(jax.value_and_grad(cost))
+    plain, found = units_of(variation.values, mask), units_of(variation.smoothed, mask)
+    best = minimize(
+        lambda x: [np.asarray(one, float) for one in both(x)], plain.ravel(), jac=True, method="BFGS",
+        options={"gtol": 1e-4, "maxiter": 2000},
+    )  # fmt: skip
+    assert np.max(np.abs(best.jac)) < 1e-2  # slopes over a box: of next to nothing within an error
+    joint, errors = best.x.reshape(-1, 2), unit_errors(variation, mask, variation.smoothed_errors)
+    assert np.max(np.abs(joint - plain) / errors) > 3.0
+    assert left_to_go(variation) < 0.5
+    assert np.max(np.abs(joint - found) / errors) < left_to_go(variation) + 2e-2
+    start, *_, end = variation.smoothing["objective"]
+    assert start - end == pytest.approx(float(cost(plain.ravel()) - cost(found.ravel())), rel=1e-9)
+    assert variation.smoothing["eps"] == "0.1 of the scale"
+
+
+def test_total_variation_keeps_edges_better_than_a_gaussian(gaussian, variation):
+    jumps, scatter = [], []
+    for map in (gaussian, variation):
+        albedo = map.smoothed[ALBEDO]
+        left, right = albedo[:, :2], albedo[:, 2:]
+        jumps.append(np.nanmean(right[:, 0]) - np.nanmean(left[:, 1]))
+        scatter.append(np.nanstd(left) + np.nanstd(right))
+    assert abs(jumps[1] - 0.3) < 0.5 * abs(jumps[0] - 0.3)
+    assert scatter[1] < scatter[0]
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "variation"])
+def test_no_round_raises_the_objective(kind, request):
+    said = request.getfixturevalue(kind).smoothing
+    objective = np.array(said["objective"])
+    assert len(objective) == said["rounds"] + 1 == len(said["largest_moves"]) + 1
+    assert np.all(np.diff(objective) <= 1e-12 * np.abs(objective[:-1]))
+
+
+def test_the_plain_fit_stays_and_texels_left_out_stay_out(tmp_path, gaussian, fitted, mask):
+    plain = fitted(tmp_path / "plain.zarr")
+    assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
+    assert plain.attributes == gaussian.attributes
+    for name in plain._types:
+        np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
+    for name in NAMES:
+        for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
+            np.testing.assert_array_equal(np.isfinite(numbers), mask)
+        np.testing.assert_array_equal(gaussian[f"smoothed/values/{name}"][:], gaussian.smoothed[name])
+    assert "neighbours" in gaussian[f"smoothed/errors/{ALBEDO}"].attrs["long_name"]
+    assert "neighbours" in gaussian.smoothing["method"]
+
+
+def test_what_is_not_named_is_not_smoothed(tmp_path, fitted, mask):
+    map = fitted(tmp_path / "one.zarr", smooth=fits.Smoothness("gaussian", {ALBEDO: 0.001}, rounds=2))
+    assert map.smoothing["smoothness"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 2}
+    assert not map.smoothing["settled"]
+    rough = {name: np.nanstd(map.smoothed[name]) / np.nanstd(map.values[name]) for name in NAMES}
+    assert rough[ALBEDO] < 0.5
+    assert rough[THICKNESS] > 0.5
+
+
+def assert_same(found, expected):
+    assert found.smoothing == expected.smoothing
+    for name in expected._every:
+        np.testing.assert_array_equal(found[name][:], expected[name][:], err_msg=name)
+
+
+def test_a_run_that_was_stopped_between_rounds_goes_on_to_the_bit(tmp_path, fitted, gaussian):
+    def stop(stage, done, total=None, info=""):
+        if stage == "smoothing" and done == 2:
+            raise KeyboardInterrupt
+
+    out, told = tmp_path / "stopped.zarr", []
+    with pytest.raises(KeyboardInterrupt):
+        fitted(out, smooth=GAUSSIAN, progress=stop)
+    assert fits.open_map(out).done == 1.0
+    assert fits.open_map(out).smoothed is None
+    found = fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    rounds = [done for stage, done in told if stage == "smoothing"]
+    assert rounds[0] == 2  # not begun anew
+    assert_same(found, gaussian)
+    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+
+
+def test_a_run_that_was_killed_in_its_last_moments_goes_on_to_the_bit(tmp_path, fitted, gaussian):
+    out = tmp_path / "killed.zarr"
+    found, rounds = fitted(out, smooth=GAUSSIAN), gaussian.smoothing["rounds"]
+    os.rename(out / "smoothed", out / f"smoothing_{rounds}")
+    (out / "smoothed.old.partial" / "values").mkdir(parents=True)  # of what was there before
+    (out / f"smoothing_{rounds + 1}.partial").mkdir()
+    assert fits.open_map(out).smoothed is None
+    found = fitted(out, smooth=GAUSSIAN)
+    assert_same(found, gaussian)
+    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+
+
+def test_a_full_disk_costs_a_round(tmp_path, monkeypatch, fitted, gaussian):
+    out, write, calls = tmp_path / "full.zarr", chunk_files.write, []
+    fitted(out)
+
+    def full(*arguments):
+        calls.append(arguments)
+        if len(calls) == 12:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(*arguments)
+
+    monkeypatch.setattr(chunk_files, "write", full)
+    with pytest.raises(OSError, match="No space left"):
+        fitted(out, smooth=GAUSSIAN)
+    monkeypatch.undo()
+    assert not list(out.glob("*.partial"))
+    assert fits.open_map(out).smoothed is None
+    assert_same(fitted(out, smooth=GAUSSIAN), gaussian)
+
+
+def test_readings_that_cannot_be_read_again_are_named(tmp_path, monkeypatch, fitted):
+    out = tmp_path / "gone.zarr"
+    fitted(out)
+
+    def gone(*arguments):
+        raise ValueError("values: damaged")
+
+    monkeypatch.setattr(alternating, "part_of", gone)
+    with pytest.raises(ValueError, match=r"smoothing of chunk \[0:4, 0:2\]: values: damaged; the map is fitted"):
+        fitted(out, smooth=GAUSSIAN)
+
+
+def test_other_smoothness_smooths_anew_and_fits_nothing_again(tmp_path, fitted, gaussian, variation):
+    out, told = tmp_path / "again.zarr", []
+    fitted(out, smooth=VARIATION)
+    before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
+    found = fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    assert_same(found, gaussian)
+    assert "sample" not in {stage for stage, _ in told}
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    told.clear()
+    fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    assert "smoothing" not in {stage for stage, _ in told}  # it is there
+    assert fitted(out).smoothed is not None  # and stays
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "total_variation"])
+def test_edges_are_those_of_a_loop_over_all_pairs(kind):
+    rng = np.random.default_rng(0)
+    shape, scales = (3, 4, 2), np.array([0.2, np.inf, 0.05])
+    units, there = rng.random((*shape, 3)), rng.random(shape) < 0.8
+    units[~there] = np.nan
+    edges, block = Edges(kind, scales), (slice(1, 3), slice(0, 3), slice(0, 2))
+    centre, precision = edges.pull(units, there, block)
+    total = 0.0
+    for place in np.ndindex(shape):
+        pulls = []
+        for other in np.ndindex(shape):
+            if np.abs(np.subtract(place, other)).sum() != 1 or not (there[place] and there[other]):
+                continue
+            for k in (0, 2):
+                distance = abs(units[place][k] - units[other][k])
+                width = max(distance, HUBER * scales[k])
+                pulls.append((k, other, 1.0 / scales[k] ** 2 if kind == "gaussian" else 1.0 / (scales[k] * width)))
+                flat = distance**2 / (2.0 * HUBER * scales[k] ** 2) + 0.5 * HUBER
+                size = distance / scales[k] if distance > HUBER * scales[k] else flat
+                total += 0.5 * (0.5 * (distance / scales[k]) ** 2 if kind == "gaussian" else size)
+        inside = tuple(np.subtract(place, (1, 0, 0)))
+        if min(inside) < 0 or inside[1] == 3 or not there[place]:
+            continue
+        for k in range(3):
+            mine = [(units[other][k], weight) for at, other, weight in pulls if at == k]
+            weights = np.array([weight for _, weight in mine])
+            assert precision[inside][k] == pytest.approx(weights.sum())
+            if mine:
+                assert centre[inside][k] == pytest.approx(np.average([unit for unit, _ in mine], weights=weights))
+    assert edges.cost(units, there) == pytest.approx(total)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "laplace"}, "Smoothness.kind is 'laplace'; it must be one of gaussian, total_variation"),
+        ({"scale": 0.0}, "Smoothness.scale is 0.0; it must be a number from 1e-06 to 1e"),
+        ({"scale": np.nan}, "Smoothness.scale is nan"),
+        ({"scale": "wide"}, "Smoothness.scale is 'wide'"),
+        ({"scale": {"base.albedo": -1.0}}, r"Smoothness.scale\['base.albedo'\] is -1.0"),
+        ({"scale": {}}, "Smoothness.scale is empty"),
+        ({"rounds": 0}, "Smoothness.rounds is 0; it must be a whole number of at least 1"),
+        ({"rounds": 1.5}, "Smoothness.rounds is 1.5"),
+    ],
+)
+def test_smoothness_that_cannot_be_is_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        fits.Smoothness(**({"kind": "gaussian", "scale": 0.1} | options))
+
+
+def test_smoothness_of_what_texels_do_not_have_is_refused(tmp_path, geometry, readings, fitted):
+    out = tmp_path / "none.zarr"
+    with pytest.raises(ValueError, match=r"names 'albedo'; it must be one of layers\[0\].thickness, base.albedo"):
+        fitted(out, smooth=fits.Smoothness("gaussian", {"albedo": 0.1}))
+    with pytest.raises(ValueError, match=r"smooth is 0\.1; it must be a fits\.Smoothness"):
+        fitted(out, smooth=0.1)
+    free = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0))
+    with pytest.raises(ValueError, match="objective 'cosine_l2' has no noise"):
+        fits.fit_map(
+            free, geometry, readings[0], out, transport=TRANSPORT, objective="cosine_l2", smooth=GAUSSIAN, sample=4
+        )
+    assert not out.exists()
+
+
+def test_channels_have_a_scale_together_or_their_own():
+    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]
+    both = fits.Smoothness("gaussian", {"base.albedo[1]": 0.3, "base.albedo": 0.1})
+    assert both.scales(names) == {"base.albedo[0]": 0.1, "base.albedo[1]": 0.3}
+    assert fits.Smoothness("gaussian", 0.2).scales(names) == dict.fromkeys(names, 0.2)
