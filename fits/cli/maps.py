@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from fits.cli.interrupts import hint
 from fits.cli.setting import use_jax
 from fits.maps.inputs import readings
+from fits.maps.smoothing import Smoothness
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ def fit_map(arguments: Namespace) -> int:
     _require_store(arguments.out)
     # before anything slow is imported: what is wrong with the files is told
     readings(arguments.data, arguments.geometry, sigma=arguments.sigma, mask=arguments.mask)
+    smooth = _smoothness(arguments)
     use_jax()
     from fits.problem.stack_file import read_problem
 
@@ -39,6 +41,7 @@ def fit_map(arguments: Namespace) -> int:
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
     local = arguments.scheduler is None
     more: dict[str, Any] = {"posterior": arguments.posterior} if arguments.posterior else {}
+    more |= {} if smooth is None else {"smooth": smooth}
     kept = f"what was fitted is in {arguments.out}; the same command again goes on with it"
     with show_progress() as progress, hint(kept):
         found = run_map(
@@ -68,8 +71,26 @@ def fit_map(arguments: Namespace) -> int:
     shared = replace(tables.shared_table(found), title="The same for all texels")
     for table in (tables.count_table(told), tables.quartile_table(told, found), *([shared] if shared.rows else [])):
         print_table(table, sys.stdout)
+    if smooth is not None:
+        print(tables.smoothing_words(found))
     print(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     return DONE if _reliable(told) else DOUBTFUL
+
+
+def _smoothness(arguments: Namespace) -> Smoothness | None:
+    """What is asked for of neighbouring texels."""
+    if arguments.smooth is None:
+        for name in ("smooth_scale", "smooth_rounds"):
+            if getattr(arguments, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} is given without --smooth")
+        return None
+    if not arguments.smooth_scale:
+        raise ValueError(f"--smooth {arguments.smooth} needs --smooth-scale, such as 0.05 of the bounds")
+    scales = dict(arguments.smooth_scale)
+    if len(scales) < len(arguments.smooth_scale) or ("" in scales and len(scales) > 1):
+        raise ValueError("--smooth-scale: must be one number for all parameters, or one for each name")
+    rounds = {} if arguments.smooth_rounds is None else {"rounds": arguments.smooth_rounds}
+    return Smoothness(arguments.smooth, scales.get("", scales), **rounds)
 
 
 def _reliable(found: "Summary") -> bool:

@@ -33,6 +33,12 @@ def level(word: str) -> float:
     return _number(word, float, 0.0, None)
 
 
+def scale(word: str) -> tuple[str, float]:
+    """A number, at least 0, and the name before it, as in base.albedo=0.1; "" where there is none."""
+    name, _, number = word.rpartition("=")
+    return name, _number(number, float, 0.0, None)
+
+
 def length(word: str) -> float:
     """A wavelength, in nanometres."""
     return _number(word, float, 1.0, None)

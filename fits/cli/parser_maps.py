@@ -3,10 +3,11 @@
 import argparse
 from typing import Any
 
-from fits.cli.numbers import count, level, seed, whole
+from fits.cli.numbers import count, level, scale, seed, whole
 from fits.cli.options import add_force, command
 
 TABULATE = ("auto", "always", "never")
+SMOOTH = ("gaussian", "total_variation")
 
 
 def add_fit_map(commands: "argparse._SubParsersAction[Any]") -> None:
@@ -35,6 +36,7 @@ def add_fit_map(commands: "argparse._SubParsersAction[Any]") -> None:
     group.add_argument("--mask", metavar="FILE", help="which texels are fitted, (...): 1, or 0 for those left out")
     group.add_argument("--noise", type=level, metavar="REL", help="relative noise (default: what the stack file says)")
     _add_solving(parser)
+    _add_smoothing(parser)
     _add_engine(parser)
     add_force(parser, "replace STORE, whatever was fitted there")
 
@@ -60,6 +62,23 @@ def _add_solving(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="sample the posterior of N texels: how far errors hold (default: 0)",
     )
+
+
+def _add_smoothing(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("neighbouring texels held together, beside the plain fit")
+    group.add_argument(
+        "--smooth",
+        choices=SMOOTH,
+        help="gaussian: changes are gradual; total_variation: areas are even, edges stay (default: not at all)",
+    )
+    group.add_argument(
+        "--smooth-scale",
+        type=scale,
+        nargs="+",
+        metavar="[NAME=]X",
+        help="of the difference between neighbours, as a share of the bounds, of all parameters or of NAME",
+    )
+    group.add_argument("--smooth-rounds", type=count, metavar="N", help="at most (default: 10)")
 
 
 def _add_engine(parser: argparse.ArgumentParser) -> None:

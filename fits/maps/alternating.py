@@ -8,6 +8,7 @@ round than its neighbours allow: where smoothness weighs much more than the read
 """
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -166,8 +167,15 @@ class _Smoothing:
     def about(self, state: _State) -> dict[str, Any]:
         """What a group says of itself."""
         said = {"kind": "smoothed map", "smoothness": self.asked, "method": METHOD, "rounds": len(state.moves)}
-        said |= {"settled": state.moves[-1] <= SETTLED, "largest_moves": state.moves, "objective": state.objective}
+        said |= {"settled": state.moves[-1] <= SETTLED, "largest_moves": state.moves, "left": _left(state.moves)}
+        said |= {"objective": state.objective}
         return said | ({"eps": f"{FLAT:g} of the scale"} if self.smooth.kind == "total_variation" else {})
+
+
+def _left(moves: list[float]) -> float:
+    """What is left to go, in standard errors, if moves go on to shrink as the last two did."""
+    before, last = moves[-2:] if len(moves) > 1 else (0.0, moves[-1])
+    return last * last / (before - last) if last < before else (math.inf if last > 0.0 else 0.0)
 
 
 def _natural(vectors: Floats, logarithmic: Truths) -> Floats:

@@ -2,6 +2,7 @@
 
 import html
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -56,6 +57,7 @@ def draw(map: FittedMap, progress: Progress | None = None) -> dict[str, bytes]:
         values = map.values[name]
         samples[name] = values.ravel()[sampled]
         images |= _parameter(map, name, values, fitted, shown)
+        images |= _smoothed(map, name, values, fitted, shown)
     if progress is not None:
         progress("pictures", len(samples), len(samples))
     varying, correlation = _correlation(samples)
@@ -81,6 +83,22 @@ def _parameter(
         images[f"{what} {name}"] = _png(pictures.value_picture(numbers, fitted, shown, title, label, colours))
         images[f"histogram of {what} {name}"] = _png(pictures.histogram_picture(numbers[fitted], title, label))
     return images
+
+
+def _smoothed(
+    map: FittedMap, name: str, values: np.ndarray, fitted: np.ndarray, shown: pictures.Face
+) -> dict[str, bytes]:
+    """Of a map that was smoothed, in the colours of the plain one."""
+    smoothed, errors = map.smoothed, map.smoothed_errors
+    if smoothed is None or errors is None:
+        return {}
+    unit = "unitless" if map.units[name] == "1" else map.units[name]
+    of: dict[str, tuple[Any, ...]] = {
+        "value": (smoothed[name], f"{name}, smoothed", unit, "viridis", values),
+        "error": (errors[name], f"error of {name}, smoothed", unit, "plasma"),
+    }
+    drawn = {what: pictures.value_picture(one[0], fitted, shown, *one[1:]) for what, one in of.items()}
+    return {f"smoothed {what} {name}": _png(figure) for what, figure in drawn.items()}
 
 
 def _evenly(places: np.ndarray) -> np.ndarray:
@@ -150,18 +168,21 @@ def _values(map: FittedMap, images: Pictures, part: str) -> str:
     parts = []
     for name in drawn(map):
         parts.append(f"<h3>{html.escape(name)}</h3>")
+        rows = []
         for prefix, words in (
             ("", f"over the map.{part}"),
+            ("smoothed ", f"with neighbouring texels held together.{part}"),
             ("histogram of ", "how often it occurs; line: the median."),
         ):
-            parts.append(
-                _pair(
-                    image(images, f"{prefix}value {name}", f"{name}, {words}"),
-                    image(images, f"{prefix}error {name}", f"Standard error of {name}, {words}"),
-                )
-            )
+            value = image(images, f"{prefix}value {name}", f"{name}, {words}")
+            rows.append((value, image(images, f"{prefix}error {name}", f"Standard error of {name}, {words}")))
+        plain, smoothed, histograms = rows
+        if any(smoothed):  # beside the plain one, value by value
+            plain, smoothed = (plain[0], smoothed[0]), (plain[1], smoothed[1])
+        parts += [_pair(*row) for row in (plain, smoothed, histograms) if any(row)]
     note = "Colours run over the middle 98 % of the values; what lies beyond has the colour of the end."
-    return section("Values and errors", f'<p class="note">{note}</p>', *parts)
+    told = f"<p>{html.escape(tables.smoothing_words(map))}</p>" if map.smoothing is not None else ""
+    return section("Values and errors", f'<p class="note">{note}</p>', told, *parts)
 
 
 def _explained(images: Pictures, part: str) -> str:

@@ -93,7 +93,15 @@ def face(shape: Sequence[int]) -> Face:
     return Face((*leading, *trailing), tuple(steps.values()), ", ".join(words))
 
 
-def value_picture(values: Floats, fitted: np.ndarray, shown: Face, title: str, label: str, colours: str) -> Figure:
+def value_picture(
+    values: Floats,
+    fitted: np.ndarray,
+    shown: Face,
+    title: str,
+    label: str,
+    colours: str,
+    beside: Floats | None = None,
+) -> Figure:
     """One number of every texel, such as a parameter or its error.
 
     Args:
@@ -102,8 +110,9 @@ def value_picture(values: Floats, fitted: np.ndarray, shown: Face, title: str, l
         shown: what is drawn of it.
         title, label: what stands above, and what the numbers are, with their unit.
         colours: name of a colour map of matplotlib.
+        beside: of the picture that this one stands beside, whose colours it has.
     """
-    scale = scale_of(values[fitted])
+    scale = scale_of((values if beside is None else beside)[fitted])
     return _picture(shown.of(np.where(fitted, values, np.nan)), shown.of(fitted), shown, scale, title, label, colours)
 
 

@@ -132,6 +132,25 @@ def posterior_table(map: FittedMap) -> Table | None:
     return Table("", columns, tuple(rows), note)
 
 
+def smoothing_words(map: FittedMap) -> str:
+    """How a map was smoothed, and how far that has come, in a few sentences; nothing if it was not."""
+    said = map.smoothing
+    if said is None:
+        return ""
+    asked, (start, *_, end) = said["smoothness"], said["objective"]
+    scales = {f"{one:g}" for one in asked["scale"].values()}
+    each = ", ".join(f"{name} {one:g}" for name, one in asked["scale"].items()) if len(scales) > 1 else scales.pop()
+    kind = asked["kind"].replace("_", " ")
+    words = f"Smoothed beside the plain fit by block alternation ({kind}, of the bounds: {each}): {said['rounds']} "
+    words += f"rounds took {start - end:.4g} off minus the log-posterior. In the last one texels moved by at most "
+    words += f"{said['largest_moves'][-1]:.2g} standard errors"
+    if said["settled"]:
+        return f"{words}. Errors of the smoothed map hold with the neighbours where they are."
+    left = float(said["left"])
+    far = f", by the last two about {left:.2g} more are left to go" if math.isfinite(left) else ""
+    return f"{words}{far}: it has not settled. Errors of the smoothed map hold with the neighbours where they are."
+
+
 _ELSEWHERE = {"kind", "format", "names", "units", "shape", "chunk", "numerical_error", "shared", "stack"}
 
 
