@@ -13,6 +13,7 @@ import layerjax as lj
 from fits.cli.parser import main
 from fits.data.geometry import slices
 from fits.maps.fitted_map import FittedMap, open_map
+from fits.maps.smoothing import Smoothness
 from fits.maps.store import FLAGS
 from fits.problem.compiled import cores
 from fits.problem.likelihood import Noise
@@ -88,6 +89,11 @@ def test_defaults_and_options_arrive(place: Path, monkeypatch: pytest.MonkeyPatc
     assert main([*WORDS, "--scheduler", "tcp://10.0.0.1:8786", "--tabulate", "always"]) == 0
     assert (called.given["client"], called.given["processes"]) == ("tcp://10.0.0.1:8786", 1)
     assert called.given["tabulate"] is True
+    assert main([*WORDS, "--smooth", "gaussian", "--smooth-scale", "0.1"]) == 0
+    assert called.given["smooth"] == Smoothness("gaussian", 0.1)
+    some = ["--smooth-scale", "base.albedo=0.1", "scale=1", "--smooth-rounds", "3"]
+    assert main([*WORDS, "--smooth", "total_variation", *some]) == 0
+    assert called.given["smooth"] == Smoothness("total_variation", {"base.albedo": 0.1, "scale": 1.0}, 3)
 
 
 def test_a_map_is_fitted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,8 +196,26 @@ def test_bad_input_is_named(
 
 
 @pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("--smooth gaussian", "--smooth gaussian needs --smooth-scale"),
+        ("--smooth-scale 0.1", "--smooth-scale is given without --smooth"),
+        ("--smooth-rounds 3", "--smooth-rounds is given without --smooth"),
+        ("--smooth gaussian --smooth-scale 0.1 scale=0.1", "one number for all parameters, or one for each name"),
+        ("--smooth gaussian --smooth-scale scale=0", "Smoothness.scale['scale'] is 0.0; it must be a number from"),
+    ],
+)
+def test_smoothness_that_cannot_be_is_named(
+    place: Path, capsys: pytest.CaptureFixture[str], more: str, message: str
+) -> None:
+    assert message in refused([*WORDS, *more.split()], capsys, place)
+
+
+@pytest.mark.parametrize(
     "more",
     [
+        ["--smooth", "wide"],
+        ["--smooth", "gaussian", "--smooth-scale", "scale=x"],
         ["--starts", "0"],
         ["--sample", "0"],
         ["--chunk", "-1"],

@@ -12,6 +12,7 @@ import zarr
 import fits
 from fits.cli.parser import main
 from fits.maps.fitted_map import FittedMap
+from fits.maps.smoothed import write
 from tests.helpers.commands import refused
 from tests.helpers.painted_maps import NAMES, bounded, numbers, stored, without
 
@@ -103,6 +104,28 @@ def test_maps_of_other_ranks_are_reported(shape: tuple[int, ...], words: str, tm
     text = (tmp_path / "a.html").read_text()
     assert words in text
     assert len(pictured(text)) == FULL - 1 - (shape == (1, 1))  # no numerical error; one texel has no correlation
+
+
+@pytest.mark.parametrize(("settled", "left"), [(True, 0.01), (False, 0.5), (False, "inf")])
+def test_a_smoothed_map_is_shown_beside_the_plain_one(settled: bool, left: float | str, tmp_path: Path) -> None:
+    map = painted(tmp_path / "a.zarr")
+    arrays = {f"{group}/{name}": map[f"{group}/{name}"][:] for group in ("values", "errors") for name in NAMES}
+    asked = {"kind": "total_variation", "scale": {NAMES[0]: 0.1, NAMES[2]: 0.2}, "rounds": 3}
+    about = {"smoothness": asked, "rounds": 3, "settled": settled, "left": left, "objective": [50.0, 12.0, 9.0, 8.0]}
+    write(map, "smoothed", arrays, about | {"largest_moves": [3.0, 1.0, 0.5]})
+    fits.report(map, path=tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text()
+    told = pictured(text)
+    assert len(told) == FULL + 2 * len(NAMES)
+    for name in NAMES:  # each after the plain one that it stands beside
+        for words in (name, f"Standard error of {name}"):
+            place = next(k for k, one in enumerate(told) if one.startswith(f"{words}, over the map"))
+            assert told[place + 1].startswith(f"{words}, with neighbouring texels held together")
+    said = f"(total variation, of the bounds: {NAMES[0]} 0.1, {NAMES[2]} 0.2): 3 rounds took 42 off"
+    assert said in text
+    assert "by at most 0.5 standard errors" in text
+    assert ("it has not settled" in text) is not settled
+    assert ("about 0.5 more are left to go" in text) is (left == 0.5)
 
 
 def test_only_a_map_by_itself_is_reported(tmp_path: Path) -> None:
