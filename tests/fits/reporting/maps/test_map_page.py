@@ -13,6 +13,7 @@ import fits
 from fits.cli.parser import main
 from fits.maps.fitted_map import FittedMap
 from fits.maps.smoothed import write
+from fits.reporting.maps.tables import smoothing_words
 from tests.helpers.commands import refused
 from tests.helpers.painted_maps import NAMES, bounded, numbers, stored, without
 
@@ -106,13 +107,17 @@ def test_maps_of_other_ranks_are_reported(shape: tuple[int, ...], words: str, tm
     assert len(pictured(text)) == FULL - 1 - (shape == (1, 1))  # no numerical error; one texel has no correlation
 
 
-@pytest.mark.parametrize(("settled", "left"), [(True, 0.01), (False, 0.5), (False, "inf")])
-def test_a_smoothed_map_is_shown_beside_the_plain_one(settled: bool, left: float | str, tmp_path: Path) -> None:
-    map = painted(tmp_path / "a.zarr")
+def smoothed(path: Path, **said: object) -> FittedMap:
+    map = painted(path)
     arrays = {f"{group}/{name}": map[f"{group}/{name}"][:] for group in ("values", "errors") for name in NAMES}
     asked = {"kind": "total_variation", "scale": {NAMES[0]: 0.1, NAMES[2]: 0.2}, "rounds": 3}
-    about = {"smoothness": asked, "rounds": 3, "settled": settled, "left": left, "objective": [50.0, 12.0, 9.0, 8.0]}
-    write(map, "smoothed", arrays, about | {"largest_moves": [3.0, 1.0, 0.5]})
+    about = {"smoothness": asked, "rounds": 3, "largest_moves": [3.0, 1.0, 0.5], "objective": [50.0, 12.0, 9.0, 8.0]}
+    write(map, "smoothed", arrays, about | said)
+    return map
+
+
+def test_a_smoothed_map_is_shown_beside_the_plain_one(tmp_path: Path) -> None:
+    map = smoothed(tmp_path / "a.zarr", settled=False, left=0.25)
     fits.report(map, path=tmp_path / "a.html")
     text = (tmp_path / "a.html").read_text()
     told = pictured(text)
@@ -121,11 +126,16 @@ def test_a_smoothed_map_is_shown_beside_the_plain_one(settled: bool, left: float
         for words in (name, f"Standard error of {name}"):
             place = next(k for k, one in enumerate(told) if one.startswith(f"{words}, over the map"))
             assert told[place + 1].startswith(f"{words}, with neighbouring texels held together")
-    said = f"(total variation, of the bounds: {NAMES[0]} 0.1, {NAMES[2]} 0.2): 3 rounds took 42 off"
-    assert said in text
-    assert "by at most 0.5 standard errors" in text
-    assert ("it has not settled" in text) is not settled
-    assert ("about 0.5 more are left to go" in text) is (left == 0.5)
+    assert smoothing_words(map) in text
+
+
+@pytest.mark.parametrize(("settled", "left"), [(True, 0.01), (False, 0.25), (False, "inf")])
+def test_it_is_said_how_far_smoothing_has_come(settled: bool, left: float | str, tmp_path: Path) -> None:
+    words = smoothing_words(smoothed(tmp_path / "a.zarr", settled=settled, left=left))
+    assert f"(total variation, of the bounds: {NAMES[0]} 0.1, {NAMES[2]} 0.2): 3 rounds took 42 off" in words
+    assert "by at most 0.5 standard errors" in words
+    assert ("it has not settled" in words) is not settled
+    assert ("about 0.25 more are left to go" in words) is (left == 0.25)
 
 
 def test_only_a_map_by_itself_is_reported(tmp_path: Path) -> None:
