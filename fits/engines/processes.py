@@ -20,6 +20,9 @@ from fits.engines.worker import READY, Raised, environment, serve
 AGAIN = 78
 """Exit code of a worker that runs its parent's script to the point where that started workers."""
 
+MOST_FALSE_STARTS = 10
+"""Worker processes that die one after the other before they are ready: no task is to blame, and something is wrong."""
+
 SHORT = 1 << 14
 """Bytes that fit into the pipe by which a process is started; of more there is a file."""
 
@@ -33,11 +36,19 @@ def run_processes(
     work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], processes: int
 ) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`."""
-    if getattr(current_process(), "_inheriting", False):  # a script without `if __name__ == "__main__":`
-        sys.exit(AGAIN)
+    end_if_again()
     payload = _pickled((work, shared), "what tasks share")
     packed = [_pickled(task, "a task") for task in tasks]
     return _results(payload, packed, min(processes, len(tasks)))
+
+
+def end_if_again() -> None:
+    """End a worker process that runs its parent's script, one without a guard, to where that asks for workers.
+
+    To be called before anything is done that must not be done twice.
+    """
+    if getattr(current_process(), "_inheriting", False):
+        sys.exit(AGAIN)
 
 
 def _pickled(what: Any, called: str) -> bytes:
@@ -89,6 +100,7 @@ class _Pool:
         self.payload, self.tasks = payload, tasks
         self.left = iter(range(len(tasks)))
         self.deaths: Counter[int] = Counter()
+        self.false_starts = 0
         self.workers: list[_Worker] = []
         self.finished: list[_Worker] = []
 
@@ -101,7 +113,7 @@ class _Pool:
         if message is None:
             return self._replace(worker)
         if message == READY:
-            worker.ready = True
+            worker.ready, self.false_starts = True, 0
             worker.send(self.tasks[index])
             return None
         outcome = pickle.loads(message)
@@ -122,8 +134,12 @@ class _Pool:
         self.workers.remove(worker)
         worker.pipe.close()
         code, index = worker.process.exitcode or 0, worker.index
-        if not worker.ready and code > 0:
-            raise ValueError(_cannot_start(code))
+        if not worker.ready:
+            self.false_starts += 1
+            if code > 0 or self.false_starts == MOST_FALSE_STARTS:
+                raise ValueError(_cannot_start(code, self.false_starts))
+            self.start(worker.core, index)
+            return None
         self.deaths[index] += 1
         lost = self.deaths[index] >= MOST_DEATHS
         following = next(self.left, None) if lost else index
@@ -178,7 +194,9 @@ def _as_workers_start() -> Iterator[None]:
                 signal.pthread_sigmask(signal.SIG_SETMASK, heard)
 
 
-def _cannot_start(code: int) -> str:
+def _cannot_start(code: int, tried: int) -> str:
+    if code <= 0:
+        return f"{tried} worker processes in a row died as they started ({_death(code)})"
     guard = 'what the script does must stand under `if __name__ == "__main__":`'
     if code == AGAIN:
         return f"each worker process runs the script that asks for it: {guard}, or processes must be 1"

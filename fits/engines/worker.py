@@ -8,6 +8,7 @@ import hashlib
 import os
 import pickle
 import platform
+import shutil
 import signal
 import socket
 import sys
@@ -106,7 +107,7 @@ def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None)
     payload: `work` and what tasks share, pickled, or the file that holds it.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(payload,), daemon=True).start()
     if core is not None:
         _stay_on(core)
     quieten()
@@ -150,8 +151,11 @@ def _stay_on(core: int) -> None:
             os.sched_setaffinity(thread, {core})
 
 
-def _end_with_parent() -> None:
+def _end_with_parent(payload: bytes | str) -> None:
+    """Wait for it, take away the file that it cannot take away any more, and end."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
+        if isinstance(payload, str):
+            shutil.rmtree(Path(payload).parent, ignore_errors=True)
         os._exit(1)
