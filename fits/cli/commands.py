@@ -141,7 +141,7 @@ def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
 
 def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, if asked for beside others; or that of a fitted map."""
-    if is_store(arguments.directory):
+    if is_store(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
     from fits.reporting import results

@@ -100,10 +100,10 @@ def _reliable(found: "Summary") -> bool:
 
 def _require_store(out: str) -> None:
     """Before any work: the store may stand there. What it holds is for `fits.fit_map` to judge."""
-    place = Path(out).resolve()
-    if place.suffix != ".zarr":
+    place = Path(out)
+    if (place if place.name else place.resolve()).suffix != ".zarr":
         raise ValueError(f"{out}: a fitted map can be written as .zarr only")
     if place.exists() and not place.is_dir():
         raise ValueError(f"{out}: is a file, must be a store or nothing")
-    if not place.parent.is_dir():
-        raise ValueError(f"{out}: there is no directory {Path(out).parent}")
+    if not place.resolve().parent.is_dir():
+        raise ValueError(f"{out}: there is no directory {place.parent}")

@@ -38,7 +38,7 @@ def add_fit_map(commands: "argparse._SubParsersAction[Any]") -> None:
     _add_solving(parser)
     _add_smoothing(parser)
     _add_engine(parser)
-    add_force(parser, "replace STORE, whatever was fitted there")
+    add_force(parser, "replace STORE if it holds the map of another fit, or is damaged")
 
 
 def _add_solving(parser: argparse.ArgumentParser) -> None:

@@ -8,8 +8,6 @@ it ended poorly: a second minimum that fits as well is not looked for.
 """
 
 import math
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,18 +18,20 @@ import numpy as np
 import zarr
 
 import layerjax
-from fits._files import locked
+from fits._files import locked, named
 from fits.engines import Failure, run
+from fits.engines.processes import end_if_again
 from fits.maps.alternating import require_smoothable, smooth_map
 from fits.maps.chunk_files import Block, grid
-from fits.maps.fitted_map import FittedMap, is_store, open_map
-from fits.maps.identity import digest, require_same
+from fits.maps.fitted_map import FittedMap, open_map
+from fits.maps.identity import digest
 from fits.maps.inputs import Readings, readings
 from fits.maps.job import Job, Task, part_of, work
 from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
+from fits.maps.resuming import begun, require_folder
 from fits.maps.smoothing import Smoothness
-from fits.maps.store import KEY, clean, create, left
+from fits.maps.store import clean, create, left
 from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise, Objective
 from fits.problem.model import Transport
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry
 
 MOST_PARAMETERS = 32
+
+USUAL_CHUNK = 1024
+"""Texels of a chunk; programs of smaller maps are for so many as well, and thus the same."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class Settings:
     starts: int = 8
     seed: int = 0
     sample: int = 64
-    chunk: int = 1024
+    chunk: int = USUAL_CHUNK
     tabulate: bool | None = None
     posterior: int = 0
     smooth: Smoothness | None = None
@@ -131,12 +134,17 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
+    if processes > 1 and client is None:
+        end_if_again()
     settings = Settings(starts, seed, sample, chunk, tabulate, posterior, smooth)
     rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
     found = readings(values, geometry, sigma=sigma, mask=mask)
     _require_fitting(settings, found, rest)
-    with locked(Path(f"{Path(out)}.lock"), str(out)):
-        return _fitted(Path(out), found, stack, noise, rest, settings, client, processes, force, progress)
+    settings = replace(settings, chunk=min(chunk, max(USUAL_CHUNK, math.prod(found.shape))))
+    path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
+    require_folder(path)
+    with locked(Path(f"{path}.lock"), str(path)):
+        return _fitted(path, found, stack, noise, rest, settings, client, processes, force, progress)
 
 
 def _fitted(
@@ -152,17 +160,18 @@ def _fitted(
     progress: Progress | None,
 ) -> FittedMap:
     identity = {name: digest(one) for name, one in {"stack": stack, "noise": noise, **rest}.items()}
-    identity |= {"settings": digest(settings.told()), "readings": found.digest()}
-    identity["precision"] = str(np.dtype(jnp.result_type(float)))
+    identity |= {name: digest(one) for name, one in settings.told().items()}
+    identity |= {"readings": found.digest(), "precision": str(np.dtype(jnp.result_type(float)))}
     if rest["instrument"] is not None:  # the floor of a map's noise stands in one place
         noise = with_floor(noise or Noise(), rest["instrument"])
         rest = {**rest, "instrument": replace(rest["instrument"], floor=None)}
-    root = _begun(path, identity, force)
+    root = begun(path, identity, force)
     prepared = _prepared(root, found, stack, noise, rest, settings, progress)
     if root is None:
         root = _created(path, prepared, found, identity, settings, stack)
     if GROUP not in root:
-        save(prepared, root)
+        with named(path):
+            save(prepared, root)
     prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
     require_smoothable(prepared.problem, settings.smooth)
     job = _job(path, prepared, found, settings, client is None and processes == 1)
@@ -184,24 +193,6 @@ def _require_fitting(settings: Settings, found: Readings, rest: Mapping[str, Any
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
     if settings.posterior and rest["objective"] != "likelihood":
         raise ValueError(f"posterior is {settings.posterior}; it must be 0 with objective {rest['objective']!r}")
-
-
-def _begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | None:
-    """The store that is there, if it is of the same fit."""
-    if not os.path.lexists(path):
-        return None
-    if not is_store(path):
-        raise ValueError(f"{path}: is there, and is no fitted map; it must be the store of one, or not be there")
-    root = zarr.open_group(path, mode="r+")
-    about: Any = root.metadata.attributes[KEY]
-    if force and about["digests"] != dict(identity):
-        shutil.rmtree(path)
-        return None
-    require_same(path, about["digests"], identity)
-    clean(path)
-    if GROUP in root and "expected" not in root[GROUP].attrs:  # it was killed while it wrote this
-        shutil.rmtree(path / GROUP)
-    return root
 
 
 def _prepared(
@@ -322,6 +313,10 @@ def _run(
         done += 1
         share = f"{100.0 * poor / fitted:.1f} % poor" if fitted else ""
         _tell(progress, done, every, share)
+    if client is None:  # of a cluster, some may still write what others have done
+        clean(job.path)
+    if not failures:
+        failures += [f"{_words(block)}: was written, and is not there" for block in left(root)]
     return failures
 
 

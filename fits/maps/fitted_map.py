@@ -213,6 +213,14 @@ def is_store(path: str | Path) -> bool:
     return (Path(path) / ROOT).is_file()
 
 
+def is_ours(path: str | Path) -> bool:
+    """Whether this is the store of a fitted map, be it damaged or of another version."""
+    try:
+        return _attributes(Path(path)).get("kind") == KIND
+    except ValueError:
+        return False
+
+
 def open_map(path: str | Path) -> FittedMap:
     """Open the store of a fitted map, finished or not.
 

@@ -34,7 +34,7 @@ def require_same(path: Any, stored: Mapping[str, str], given: Mapping[str, str])
     changed = [name for name in {**stored, **given} if not alike(stored.get(name, ""), given.get(name, ""))]
     if changed:
         raise ValueError(
-            f"{path}: holds a map fitted with another {', another '.join(changed)} "
+            f"{path}: holds a map of another fit, different in {', '.join(changed)} "
             "(--force, or force=True, throws it away and begins anew)"
         )
 

@@ -14,7 +14,7 @@ from fits.maps.chunk_files import Block
 from fits.maps.inputs import Portable, Readings
 from fits.maps.searching import Ends, Starts, neighbours, reduced_chi_square, search
 from fits.maps.solving import Found
-from fits.maps.store import FLAGS, arrays_of, write_chunk
+from fits.maps.store import FLAGS, arrays_of, flags_of, write_chunk
 from fits.maps.tabulated import Table, Tabulated, coarser, with_table
 from fits.maps.texels import Texels, texels, with_own_directions
 from fits.problem.model import Model
@@ -95,11 +95,14 @@ class Task(NamedTuple):
 
 
 def work(job: Job, task: Task) -> dict[str, int]:
-    """Fit a chunk and write it; returns how many texels have which flag."""
-    part = part_of(job.readings, task.block) if task.part is None else task.part
-    results = fit_chunk(job, part)
-    write_chunk(zarr.open_group(job.path, mode="r+"), task.block, results)
-    return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
+    """Fit a chunk and write it, if a worker that was killed has not; returns how many texels have which flag."""
+    root = zarr.open_group(job.path, mode="r+")
+    flags = flags_of(root, task.block)
+    if flags is None:
+        results = fit_chunk(job, part_of(job.readings, task.block) if task.part is None else task.part)
+        write_chunk(root, task.block, results)
+        flags = results["flags"]
+    return {meaning: int(np.sum(flags & bit > 0)) for meaning, bit in FLAGS.items()}
 
 
 def fit_chunk(job: Job, part: Part) -> dict[str, NDArray[Any]]:

@@ -42,6 +42,9 @@ GROUP = "pilot"
 
 GOLDEN = 0.6180339887498949
 
+FEW, MOST_TRIED = 8, 4096
+"""Texels that a sample is to have, or be that of all that there are, and how many are tried for it."""
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -85,15 +88,21 @@ def sampled(readings: Readings, count: int, least: int) -> tuple[Texels, NDArray
     """
     mask = readings.read_mask(tuple(slice(0, size) for size in readings.shape))
     wanted = np.flatnonzero(mask)
-    parts, places = [], []
-    for turn in range(min(4 * count, len(wanted))):
-        where = wanted[int(((turn + 0.5) * GOLDEN % 1.0) * len(wanted))]
+    if not len(wanted):
+        raise ValueError("mask: no texel takes part, it is 0 everywhere")
+    failure: ValueError | None = None
+    parts: list[Texels] = []
+    places: list[tuple[int, ...]] = []
+    for turn, where in enumerate(wanted[_spread(len(wanted), 4 * count)]):
         place = tuple(int(at) for at in np.unravel_index(where, readings.shape))
         if place in places:
             continue
+        if turn >= 4 * count and len(places) >= FEW:
+            break
         try:
             part = part_of(readings, tuple(slice(at, at + 1) for at in place))
-        except ValueError:  # what cannot be read is told of with its chunk
+        except ValueError as error:  # what cannot be read is told of with its chunk
+            failure = failure or error
             continue
         own = [None if one is None else one.reshape(1, *one.shape[len(place) :]) for one in part]
         row = texels(own[0], own[1], 0.0, own[3], own[4])  # type: ignore[arg-type]
@@ -103,10 +112,17 @@ def sampled(readings: Readings, count: int, least: int) -> tuple[Texels, NDArray
         if len(places) == count:
             break
     if not parts:
-        raise ValueError(f"values: no texel takes part that can be read and has {least} readings or more")
+        raise failure or ValueError("values: no reading of a texel that takes part is a finite number")
     order = sorted(range(len(places)), key=lambda k: places[k])
     stacked = [None if one[0] is None else np.concatenate([one[k] for k in order]) for one in zip(*parts, strict=True)]
     return Texels(*stacked), np.array([places[k] for k in order])
+
+
+def _spread(count: int, first: int) -> NDArray[np.int64]:
+    """Places among so many: the first ones from all over them, then others, in case those are of no use."""
+    turns = np.arange(min(first, count))
+    rest = np.linspace(0, count - 1, min(count, MOST_TRIED))
+    return np.concatenate([((turns + 0.5) * GOLDEN % 1.0) * count, rest]).astype(int)
 
 
 def prototype(sample: Texels, readings: Readings, stack: Any, noise: Noise | None, **rest: Any) -> Problem:
@@ -216,8 +232,9 @@ def save(prepared: Prepared, root: "zarr.Group") -> None:
     for name, array in arrays.items():
         group.create_array(name, data=np.ascontiguousarray(array), compressors=None)
     shared = prepared.shared
-    group.attrs.update(
+    group.attrs.update(  # last: with them it is whole
         {
+            "arrays": list(arrays),
             "noise": [_plain(problem.noise.relative), _plain(problem.noise.floor)],
             "transport": _transport(problem.transport),
             "expected": starts.expected,
@@ -229,10 +246,22 @@ def save(prepared: Prepared, root: "zarr.Group") -> None:
     )
 
 
+def is_whole(root: "zarr.Group") -> bool:
+    """Whether a store has it, undamaged: it may have been killed while it wrote this."""
+    try:
+        group: Any = root[GROUP]
+        for name in group.attrs["arrays"]:
+            group[name][...]
+    except (LookupError, ValueError, OSError, TypeError):
+        return False
+    return True
+
+
 def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None, **rest: Any) -> Prepared:
     """What `save` kept, for the same arguments as those of `prototype`."""
     group: Any = root[GROUP]
-    about, array = dict(group.attrs), {name: np.asarray(group[name][...]) for name in _stored(group)}
+    about = dict(group.attrs)
+    array = {name: np.asarray(group[name][...]) for name in about["arrays"]}
     given = Noise() if noise is None else noise
     levels = {
         name: getattr(given, name) if is_free(getattr(given, name)) and value is None else value
@@ -257,10 +286,6 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     return Prepared(
         problem, starts, shared, about["numerical_error"], about["words"], array["reduced"], array["texels"]
     )
-
-
-def _stored(group: "zarr.Group") -> list[str]:
-    return [name for name, member in group.members(max_depth=1) if hasattr(member, "chunks")]
 
 
 def _arrays_of_table() -> list[str]:

@@ -23,6 +23,9 @@ Block = tuple[slice, ...]
 
 HDF5, ZARR = (".h5", ".hdf5"), (".zarr",)
 KINDS = ".npy, .h5, .hdf5 or .zarr"
+NPY = b"\x93NUMPY"
+"""How a .npy file begins."""
+
 _INSIDE = re.compile(r"(?P<path>.+\.(?:h5|hdf5|zarr)):(?P<name>/.*)", re.IGNORECASE)
 _ZARR_FILES = ("zarr.json", ".zarray", ".zgroup")
 
@@ -228,10 +231,7 @@ def _in_file(given: str) -> Source | Named:
             f"{path}: ends in {suffix!r}, a map is read from {KINDS}; readings of one material are for layerjax fit"
         )
     try:
-        if suffix == ".npy":
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-            return _numeric(array, path, Place(os.path.abspath(path), ""))
-        found = _in_hdf5(path) if suffix in HDF5 else _in_zarr(path)
+        found = _in_npy(path) if suffix == ".npy" else _in_hdf5(path) if suffix in HDF5 else _in_zarr(path)
         found = found[name] if name else found
     except MemoryError:
         raise
@@ -240,6 +240,13 @@ def _in_file(given: str) -> Source | Named:
     except Exception as error:
         raise ValueError(f"{path}: cannot be read: {_reason(error)}") from None
     return opened(found, given)
+
+
+def _in_npy(path: str) -> Any:
+    with open(path, "rb") as file:
+        if file.read(len(NPY)) != NPY:
+            raise ValueError("it is no .npy file")  # numpy takes it for a pickle, and tells how to load it unsafely
+    return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
 def _in_hdf5(path: str) -> Any:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fits._files import named, permissions, plain
 from fits.maps import chunk_files
@@ -186,17 +187,22 @@ def write_chunk(group: "zarr.Group", block: Block, results: Mapping[str, np.ndar
 
 
 def left(group: "zarr.Group") -> list[Block]:
-    """The chunks that are not there whole, in their order: a flag is 0, or a file of an array lacks or is too short."""
-    root, arrays, shape, chunk = _layout(group)
-    found = []
-    for place in grid(shape, chunk):
-        block = block_at(place, shape, chunk)
-        if all(chunk_files.is_whole(root / name, place, dtype, chunk) for name, (dtype, _) in arrays.items()):
-            flags = chunk_files.read(root / "flags", place, arrays["flags"][0], chunk)
-            if flags is not None and flags[tuple(slice(one.stop - one.start) for one in block)].all():
-                continue
-        found.append(block)
-    return found
+    """The chunks that are not there, in their order, see `flags_of`."""
+    *_, shape, chunk = _layout(group)
+    return [block for place in grid(shape, chunk) if flags_of(group, block := block_at(place, shape, chunk)) is None]
+
+
+def flags_of(group: "zarr.Group", block: Block) -> NDArray[np.uint16] | None:
+    """The flags of a chunk; None if it is not there whole: a flag is 0, or a file of an array lacks or is too short."""
+    root, arrays, _, chunk = _layout(group)
+    place = tuple(one.start // side for one, side in zip(block, chunk, strict=True))
+    if not all(chunk_files.is_whole(root / name, place, dtype, chunk) for name, (dtype, _) in arrays.items()):
+        return None
+    flags = chunk_files.read(root / "flags", place, arrays["flags"][0], chunk)
+    if flags is None:
+        return None
+    flags = flags[tuple(slice(one.stop - one.start) for one in block)]
+    return flags if flags.all() else None
 
 
 def clean(path: str | Path) -> None:

@@ -60,25 +60,34 @@ def texels(
     wi: Floats | None = None,
     wo: Floats | None = None,
 ) -> Texels:
-    """Readings (M, N, C), with their standard deviations of that shape; what is not finite is left out.
+    """Readings (M, N, C), with their standard deviations of that shape; what is not finite is left out, in single
+    precision too what is so only in double.
 
     least: of the noise's floor.
 
     Raises:
         ValueError: a standard deviation is negative, or 0 where the reading counts.
     """
-    used = np.isfinite(values)
+    largest_number = float(jnp.finfo(jnp.result_type(float)).max)
+    used = np.abs(values) <= largest_number
     variance = np.zeros(values.shape)
     if sigma is not None:
         used &= np.isfinite(sigma)
         wrong = used & (sigma <= 0.0)
         if wrong.any():
             raise ValueError(f"sigma is {sigma[wrong][0]:g} in a reading that counts; it must be above 0")
-        variance = np.where(used, np.square(np.where(used, sigma, 0.0)), 0.0)
+        variance = _squared(np.where(used, sigma, 0.0), largest_number)
     largest = np.max(np.abs(values), initial=0.0, where=used, axis=(1, 2), keepdims=True)
-    silent = np.square(UNHEARD * np.where(largest > 0.0, largest, 1.0))
+    largest = np.minimum(np.where(largest > 0.0, largest, 1.0), largest_number / UNHEARD)
+    silent = _squared(UNHEARD * largest, largest_number)
     variance = np.where(used, variance, silent)
     return with_floor(Texels(np.where(used, values, 0.0), variance, variance, used, wi, wo), least)
+
+
+def _squared(numbers: Floats, largest: float) -> Floats:
+    """Squares that can still be added to others."""
+    with np.errstate(over="ignore"):
+        return np.minimum(np.square(numbers), 0.25 * largest)
 
 
 def with_floor(texels: Texels, least: float) -> Texels:

@@ -11,13 +11,14 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fits.engines import Failure, run
+from fits.engines import Failure, run, worker
 from fits.engines.processes import _death
 from tests.helpers import tasks
 from tests.helpers.places import ROOT
@@ -113,6 +114,52 @@ def test_workers_may_be_killed_at_any_moment(tmp_path: Path) -> None:
     assert {index: results[index] for index in results if index not in failed} == {
         index: index * index for index in range(30) if index not in failed
     }
+
+
+def starting(kills: int) -> tuple[threading.Thread, threading.Event]:
+    """A thread that kills so many workers, each as soon as it is there."""
+    over, killed = threading.Event(), set[int]()
+
+    def killer() -> None:
+        while len(killed) < kills and not over.wait(0.001):
+            for child in multiprocessing.active_children():
+                if child.pid is not None and child.pid not in killed and len(killed) < kills:
+                    with suppress(ProcessLookupError):  # it has ended by itself
+                        os.kill(child.pid, signal.SIGKILL)
+                    killed.add(child.pid)
+
+    thread = threading.Thread(target=killer)
+    thread.start()
+    return thread, over
+
+
+@pytest.mark.parametrize("kills", [6, 1000])
+def test_no_task_is_blamed_for_workers_that_are_killed_as_they_start(tmp_path: Path, kills: int) -> None:
+    thread, over = starting(kills)
+    try:
+        if kills == 6:  # three and more of each task
+            assert dict(run(tasks.slow, str(tmp_path), range(2), processes=2)) == {0: 0, 1: 1}
+        else:
+            with pytest.raises(ValueError, match=r"10 worker processes in a row died as they started \(SIGKILL"):
+                list(run(tasks.slow, str(tmp_path), range(2), processes=2))
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_worker_takes_away_what_its_parent_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Parent:
+        sentinel, theirs = multiprocessing.Pipe()
+
+    (tmp_path / "layerjax-abc").mkdir()
+    (tmp_path / "layerjax-abc" / "shared.pickle").write_text("large")
+    ended: list[int] = []
+    monkeypatch.setattr(worker, "parent_process", Parent)
+    monkeypatch.setattr(os, "_exit", ended.append)
+    Parent.theirs.close()  # it has been killed
+    worker._end_with_parent(str(tmp_path / "layerjax-abc" / "shared.pickle"))
+    assert ended == [1]
+    assert not list(tmp_path.iterdir())
 
 
 def test_whoever_leaves_the_loop_ends_the_workers_at_once(tmp_path: Path) -> None:

@@ -1,0 +1,265 @@
+"""Killed workers and parents, schedulers that go away, full disks: nothing is lost or half written, and in the end the
+store is that of an undisturbed run, to the bit."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from fits.cli.parser import main
+from fits.maps.fitted_map import FittedMap, open_map
+from tests.helpers.files import mounted
+from tests.helpers.places import ROOT
+from tests.helpers.quick_maps import assert_same, command, write_files
+
+CLI, PATIENCE = "fits.cli", 120.0
+SLOW_DISK = """import os, time
+replace = os.replace
+def slowly(*paths):
+    time.sleep(0.01)
+    replace(*paths)
+os.replace = slowly
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a map of 16 chunks."""
+    folder = tmp_path_factory.mktemp("map")
+    write_files(folder, (16, 16))
+    (folder / "sitecustomize.py").write_text(SLOW_DISK)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(place: Path) -> FittedMap:
+    """The store of an undisturbed run."""
+    assert main(command(place, place / "whole.zarr", "--processes", "1")) == 0
+    return open_map(place / "whole.zarr")
+
+
+@contextmanager
+def begun(words: list[str], place: Path) -> Iterator[subprocess.Popen[str]]:
+    """A program of Python in a process group of its own, with the slow disk of this place, killed in the end."""
+    paths = os.pathsep.join((str(place), str(ROOT)))
+    environment = os.environ | {"PYTHONPATH": paths, "DASK_LOGGING__DISTRIBUTED": "critical"}
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *words], env=environment, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE,
+            start_new_session=True,
+        )  # fmt: skip
+    finally:
+        signal.signal(signal.SIGINT, ours)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def there(store: Path) -> int:
+    """How many chunks a store has."""
+    return sum(1 for path in store.glob("flags/c/*/*") if path.suffix != ".partial")
+
+
+def children(process: int, what: str) -> list[int]:
+    """Processes below this one whose command line holds a word."""
+    found, unseen = [], [process]
+    while unseen:
+        with suppress(OSError):
+            for thread in Path(f"/proc/{unseen.pop(0)}/task").iterdir():
+                for child in map(int, (thread / "children").read_text().split()):
+                    unseen.append(child)
+                    if what in Path(f"/proc/{child}/cmdline").read_text():
+                        found.append(child)
+    return found
+
+
+def running(process: int) -> bool:
+    with suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def wait_until(when: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    end = time.monotonic() + seconds
+    while not when():
+        assert time.monotonic() < end, "it never came to that"
+        time.sleep(0.001)
+
+
+class Killer:
+    """Kills workers of a run, and one time in `parents` the run itself, after a few chunks each, at any moment."""
+
+    def __init__(self, store: Path, kills: int, chunks: int, parents: int, seed: int):
+        self.store, self.left, self.random = store, kills, random.Random(seed)
+        self.pace, self.parents = 1.6 * chunks / kills, parents
+        self.killed: Counter[str] = Counter()
+
+    def watch(self, process: subprocess.Popen[str]) -> list[int]:
+        """Until the run ends; returns workers that it left behind."""
+        workers: list[int] = []
+        while process.poll() is None and self.left:
+            until = there(self.store) + int(self.pace * self.random.random())
+            late = time.monotonic() + 20.0 * self.random.random()  # as it starts, too
+            while process.poll() is None and there(self.store) < until and time.monotonic() < late:
+                time.sleep(0.002)
+            time.sleep(0.05 * self.random.random())
+            workers = children(process.pid, "spawn_main")
+            self._kill(process, workers)
+        process.wait(PATIENCE)
+        return workers
+
+    def _kill(self, process: subprocess.Popen[str], workers: list[int]) -> None:
+        parent = self.random.randrange(self.parents) == 0
+        if process.poll() is None and (parent or workers):
+            with suppress(ProcessLookupError):
+                os.kill(process.pid if parent else self.random.choice(workers), signal.SIGKILL)
+                self.left -= 1
+                self.killed["parent" if parent else "worker"] += 1
+
+
+def ordeal(place: Path, words: list[str], killer: Killer) -> None:
+    """The same command again and again until it has come to its end."""
+    while True:
+        with begun([CLI, *words], place) as process:
+            lingering = killer.watch(process)
+            error = "" if process.stderr is None else process.stderr.read()
+        wait_until(lambda lingering=lingering: not any(map(running, lingering)), 10.0)
+        if process.returncode == 0:
+            return
+        if process.returncode != -signal.SIGKILL:  # one chunk has cost three workers
+            assert process.returncode == 2
+            assert "all other chunks are done, and another run does these" in error
+
+
+def test_killed_at_random_moments(place: Path, tmp_path: Path, whole: FittedMap) -> None:
+    out = tmp_path / "coat.zarr"
+    killer = Killer(out, kills=2, chunks=16, parents=2, seed=1)
+    ordeal(place, command(place, out, "--processes", "2"), killer)
+    assert killer.killed["worker"] >= 1
+    assert_same(open_map(out), whole)
+    assert os.listdir(tmp_path) == ["coat.zarr"]
+
+
+@pytest.mark.slow
+def test_killed_fifty_times_in_200_chunks(tmp_path: Path) -> None:
+    write_files(tmp_path, (80, 40))
+    (tmp_path / "sitecustomize.py").write_text(SLOW_DISK)
+    assert main(command(tmp_path, tmp_path / "whole.zarr", "--processes", "1")) == 0
+    (tmp_path / "many").mkdir()
+    out = tmp_path / "many" / "coat.zarr"
+    killer = Killer(out, kills=50, chunks=200, parents=5, seed=2)
+    ordeal(tmp_path, command(tmp_path, out, "--processes", "2"), killer)
+    assert killer.left == 0
+    assert killer.killed["parent"] >= 5
+    assert there(out) == 200
+    assert_same(open_map(out), open_map(tmp_path / "whole.zarr"))
+    assert os.listdir(tmp_path / "many") == ["coat.zarr"]
+
+
+def test_one_run_at_a_time_and_the_next_goes_on_where_it_was_killed(
+    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "coat.zarr"
+    words = command(place, out, "--processes", "1")
+    with begun([CLI, *words], place) as process:
+        wait_until(lambda: there(out) >= 3)
+        process.send_signal(signal.SIGSTOP)
+        for more in ([], ["--force"], ["--noise", "0.03", "--force"]):
+            assert main([*words, *more]) == 2
+            assert f"{out} is in use by another process ({process.pid})" in capsys.readouterr().err
+        assert 0.0 < open_map(out).done < 1.0
+        assert main(["report", str(out)]) == 0  # while it runs
+    assert (tmp_path / "coat.zarr.lock").exists()
+    assert "</html>" in (tmp_path / "coat.html").read_text()
+    assert main(words) == 0
+    assert "map 0/16" not in capsys.readouterr().err
+    assert_same(open_map(out), whole)
+    assert sorted(os.listdir(tmp_path)) == ["coat.html", "coat.zarr"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_interrupted_by_the_user(place: Path, tmp_path: Path, whole: FittedMap, processes: str) -> None:
+    """Ctrl-C goes to all processes of a terminal."""
+    out = tmp_path / "coat.zarr"
+    words = command(place, out, "--processes", processes)
+    with begun([CLI, *words], place) as process:
+        wait_until(lambda: there(out) >= 2)
+        workers = children(process.pid, "spawn_main")
+        os.killpg(process.pid, signal.SIGINT)
+        _, error = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert "Traceback" not in error
+    assert error.splitlines()[-1].startswith("layerjax: interrupted: what was fitted is in")
+    assert not any(map(running, workers))
+    assert os.listdir(tmp_path) == ["coat.zarr"]
+    assert main(command(place, out, "--processes", "1")) == 0
+    assert_same(open_map(out), whole)
+
+
+@pytest.mark.parametrize("processes", ["1", pytest.param("2", marks=pytest.mark.slow)])
+def test_a_disk_that_fills_up(
+    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str], processes: str
+) -> None:
+    """As the store is made, as what all chunks share is kept, and among chunks."""
+    (tmp_path / "disk").mkdir()
+    out = tmp_path / "disk" / "coat.zarr"
+    words = command(place, out, "--processes", processes)
+    with mounted(tmp_path / "disk", "-t", "tmpfs", "-o", "size=20k", "tmpfs"):
+        done = []
+        for size in ("20k", "80k", "300k", "400k"):
+            subprocess.run(["mount", "-o", f"remount,size={size}", str(tmp_path / "disk")], check=True)
+            assert main(words) == 2
+            error = capsys.readouterr().err.splitlines()[-1]
+            assert error == f"layerjax: error: {out}: no space left on device"
+            assert not list((tmp_path / "disk").rglob("*.partial"))
+            done.append(there(out))
+        assert done[0] == done[1] == 0 < done[2] < done[3] < 16
+        subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path / "disk")], check=True)
+        assert main(words) == 0
+        assert_same(open_map(out), whole)
+
+
+def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(
+    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("distributed")
+    out, file = tmp_path / "coat.zarr", tmp_path / "scheduler.json"
+    where, killed = ["--no-dashboard", "--scheduler-file", str(file)], []
+    schedule = ["distributed.cli.dask_scheduler", "--port", "0", *where]
+    work = ["distributed.cli.dask_worker", "--nworkers", "2", "--nthreads", "1", *where]
+    with begun(schedule, place) as scheduler, begun(work, place) as nanny:
+
+        def kill() -> None:
+            wait_until(lambda: there(out) >= 1)
+            killed.append(children(nanny.pid, "spawn_main")[0])
+            os.kill(killed[0], signal.SIGKILL)
+            wait_until(lambda: there(out) >= 4)
+            scheduler.kill()
+
+        wait_until(lambda: file.exists() and file.stat().st_size > 0)
+        address = json.loads(file.read_text())["address"]
+        thread = threading.Thread(target=kill)
+        thread.start()
+        assert main(command(place, out, "--scheduler", address)) == 2
+        thread.join()
+        os.killpg(nanny.pid, signal.SIGKILL)
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error == f"layerjax: error: {address}: the scheduler has gone away"
+    assert killed
+    assert 4 <= there(out) < 16
+    assert main(command(place, out, "--processes", "1")) == 0
+    assert_same(open_map(out), whole)

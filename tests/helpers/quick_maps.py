@@ -1,0 +1,90 @@
+"""A small map of a coat over a diffuse base that is fitted in no time, in memory and as the files of a user."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fits
+import layerjax as lj
+from fits.data.geometry import Geometry
+from fits.maps.fitted_map import FittedMap
+
+TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
+NAMES = ("layers[0].thickness", "base.albedo")
+STACK = """transport = "SingleScattering"
+[[layers]]
+kind = "Medium"
+thickness = { start = 0.5, low = 0.05, high = 3.0 }
+albedo = 0.8
+phase = { kind = "HenyeyGreenstein", g = 0.3 }
+[base]
+kind = "Lambertian"
+albedo = { start = 0.4, low = 0.0, high = 1.0 }
+"""
+OPTIONS = {"--noise": "0.02", "--chunk": "16", "--sample": "8", "--starts": "2"}
+
+
+def coat(thickness, albedo):
+    return lj.Stack([lj.Medium(thickness, 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(albedo))
+
+
+FREE = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0))
+
+
+def geometry() -> Geometry:
+    """16 pairs of directions."""
+    every = fits.slices(incidence=[10.0, 60.0])
+    places = np.linspace(0, len(every.wi) - 1, 16).astype(int)
+    return Geometry(every.wi[places], every.wo[places])
+
+
+def truth(shape: tuple[int, ...]) -> np.ndarray:
+    """Thickness and albedo of every texel, (..., 2): one grows and the other falls along the map."""
+    along = np.linspace(0.0, 1.0, int(np.prod(shape))).reshape(shape)
+    return np.stack([0.2 + 0.8 * along, 0.8 - 0.6 * along], axis=-1)
+
+
+def values(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    """Readings with noise, (..., 16, 1)."""
+    view = geometry()
+
+    def one(numbers):
+        return lj.evaluate(coat(*numbers), jnp.asarray(view.wi), jnp.asarray(view.wo), transport=TRANSPORT)
+
+    exact = np.asarray(jax.jit(jax.vmap(one))(truth(shape).reshape(-1, 2))).reshape(*shape, -1, 1)
+    return exact * (1.0 + NOISE.relative * np.random.default_rng(seed).standard_normal(exact.shape))
+
+
+def fitted(out: Path, given: np.ndarray, **options) -> FittedMap:
+    """The map of readings, from a sample of eight in chunks of 16."""
+    usual = {"noise": NOISE, "transport": TRANSPORT, "chunk": 16, "sample": 8, "starts": 2}
+    return fits.fit_map(FREE, geometry(), given, out, **usual | options)
+
+
+def write_files(folder: Path, shape: tuple[int, ...]) -> None:
+    """map.npy, view.csv and coat.toml."""
+    view = geometry()
+    np.save(folder / "map.npy", values(shape))
+    angles = np.column_stack([view.theta_i, view.phi_i, view.theta_o, view.phi_o])
+    np.savetxt(folder / "view.csv", angles, delimiter=",", header="theta_i,phi_i,theta_o,phi_o", comments="")
+    (folder / "coat.toml").write_text(STACK)
+
+
+def command(folder: Path, out: Path, *more: str) -> list[str]:
+    """The words of `layerjax fit-map` for these files."""
+    files = {"--geometry": "view.csv", "--stack": "coat.toml"}
+    words = ["fit-map", str(folder / "map.npy"), "--out", str(out)]
+    words += [word for option, name in files.items() for word in (option, str(folder / name))]
+    return [*words, *(word for pair in OPTIONS.items() for word in pair), *more]
+
+
+def assert_same(found: FittedMap, expected: FittedMap) -> None:
+    """To the bit: every file of the stores."""
+    one, other = _files(found.path), _files(expected.path)
+    assert {name for name in {*one, *other} if one.get(name) != other.get(name)} == set()
+
+
+def _files(store: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(store)): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
