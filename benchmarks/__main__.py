@@ -1,4 +1,5 @@
 """Benchmarks: ``throughput`` (times, beside numpy and peers), ``textured`` (maps of stacks, beside Mitsuba's textures),
+``maps`` (fits of maps, texels a second, beside scipy),
 ``recovery`` (are errors and intervals honest?), ``calibration`` (are posteriors?), ``samplers`` (do they agree?),
 ``error-vs-time`` (every model against the truth, over the suite of stacks), ``references`` (the solver and the walk
 beside PythonicDISORT and Mitsuba), ``statistics`` (directional statistics, lobe by lobe, beside the walk),
@@ -18,8 +19,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-NAMES = ("throughput", "textured", "recovery", "calibration", "samplers", "error-vs-time", "references", "statistics",
-         "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "pulls", "structures",
+NAMES = ("throughput", "textured", "maps", "recovery", "calibration", "samplers", "error-vs-time", "references",
+         "statistics", "spongecake", "endf", "rough-diffuse", "unseen", "wrong-stacks", "pulls", "structures",
          "accelerator", "side-by-side")  # fmt: skip
 
 POSTERIORS = ("haze", "errors", "banana", "degenerate", "bounded")
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, named_peers in (
         ("throughput", "Mitsuba and Dr.Jit"),
         ("textured", "Mitsuba"),
+        ("maps", "scipy"),
         ("references", "Mitsuba and PythonicDISORT"),
     ):
         commands.choices[name].add_argument("--no-peers", action="store_true", help=f"without {named_peers}")
@@ -103,7 +105,7 @@ def _options(given: argparse.Namespace) -> dict[str, Any]:
     options: dict[str, Any] = {"quick": given.quick}
     if given.out is not None:
         options["directory"] = given.out
-    if given.benchmark in ("throughput", "textured", "references"):
+    if given.benchmark in ("throughput", "textured", "maps", "references"):
         options["with_peers"] = not given.no_peers
     if given.benchmark == "spongecake":
         options["work"] = given.work

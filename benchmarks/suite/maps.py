@@ -168,8 +168,9 @@ _ALPHA, _THICKNESS = _logarithmic(0.2, 0.02, 1.0), _logarithmic(1.0, 0.05, 10.0)
 
 NUMBERS: dict[Material, tuple[Number, ...]] = {
     "coat": (
-        Number("layers[0].alpha", *ROUGHNESS, _ALPHA),
-        Number("layers[1].thickness", *THICKNESS, _THICKNESS),
+        # a box for which a table of all orders takes some thousand solutions
+        Number("layers[0].alpha", *ROUGHNESS, _logarithmic(0.2, 0.05, 0.6)),
+        Number("layers[1].thickness", *THICKNESS, _logarithmic(1.0, 0.1, 5.0)),
         Number("layers[0].ior", 1.4, 1.7, fits.Free(1.5, 1.3, 1.8)),
         Number("base.albedo", 0.2, 0.8, fits.Free(0.5, 0.0, 1.0)),
     ),

@@ -1,0 +1,284 @@
+"""Fits a second beside scipy, how good they are, and what the sample takes that is fitted first."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import fits
+import layerjax as lj
+from benchmarks.measuring.writing import figure, table
+from benchmarks.studies.maps.cases import Case, Given, given, job_of
+from benchmarks.studies.maps.work import Texelwise, Timed, costs_at, rows_of, timed
+from fits.engines import Failure
+from fits.engines import run as run_tasks
+from fits.maps.fitted_map import FittedMap
+from fits.maps.job import Job, Task
+from fits.maps.searching import all_predicted
+
+Floats = NDArray[np.float64]
+Report = Callable[[str], None]
+
+PROCESSES = 2
+OTHER = 0.01
+"""By so much a cost is below scipy's where that has ended elsewhere."""
+
+ROUNDING = 1e-6
+"""By so much a cost may be above scipy's: a fit stops where a full step promises less than a hundredth of it."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured.
+
+    side: of the maps, in texels. chunk: texels. scipy: texels that it fits at a time, and times. checked: texels whose
+    table is compared with a finer solution. rounds: of runs with other numbers of workers; repeats: of a map in each.
+    tasks: empty ones.
+    """
+
+    side: int = 256
+    chunk: int = 1024
+    scipy: tuple[int, int] = (8, 24)
+    checked: int = 32
+    rounds: int = 3
+    repeats: int = 2
+    tasks: int = 2000
+
+
+QUICK = Size(64, 256, (4, 6), 4, 1, 1, 200)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One map.
+
+    rate, scipy: fits a second of `PROCESSES` processes that take turns with both; ratio: of the two. pilot: seconds of
+    all that comes before the first chunk; first: of the same and compilation, in a map of one chunk. whole: seconds of
+    the chunks of the map, workers' start in it. above: share of texels whose cost is above scipy's beyond rounding,
+    below: well below it. width: of pulls, the one furthest from 1. table: largest numerical error of a table at the
+    optimum, in standard deviations, beside a finer solver. peak: bytes of a worker.
+    """
+
+    name: str
+    texels: int
+    rate: float
+    scipy: float | None
+    ratio: float | None
+    bar: str
+    verdict: str
+    first: float
+    pilot: float
+    whole: float
+    converged: float
+    poor: float
+    compared: int
+    above: float | None
+    below: float | None
+    width: float
+    chi_square: float
+    table: float | None
+    words: str
+    peak: int
+
+
+def run(cases: Sequence[Case], size: Size, with_peers: bool, report: Report) -> list[Row]:
+    """Fit the maps and compare."""
+    rows = []
+    for case in cases:
+        report(f"{case.name}: painted")
+        with given(case, size.side) as one:
+            rows.append(measure(case, one, size, with_peers, report))
+    return rows
+
+
+def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report) -> Row:
+    """One map: fitted twice, the first time of one chunk, which compiles; then chunks by turns with scipy."""
+    side = min(size.side, int(size.chunk**0.5))
+    first, _, _ = fitted(one, size, np.load(one.values, mmap_mode="r")[:side, :side])
+    pilot, whole, found = fitted(one, size)
+    report(f"{case.name}: {found.values[found.names[0]].size:,} texels, sample {pilot:.0f} s, all others {whole:.0f} s")
+    job, tasks = job_of(one, size.chunk)
+    turns = by_turns(tasks, size if with_peers else replace(size, scipy=(0, size.scipy[1])))
+    done = [*finished(run_tasks(timed, job, turns, processes=PROCESSES))]
+    ours = rate([task for _, task in warm(done) if task.kind == "ours"])
+    scipy = rate([task for _, task in warm(done) if task.kind == "scipy"]) if with_peers else None
+    report(f"{case.name}: {ours:.0f} fits/s, scipy {figure(scipy)}")
+    ratio = None if scipy is None else ours / scipy
+    differences = _differences(job, found, turns, done)
+    return Row(
+        name=case.name,
+        texels=found.flags.size,
+        rate=ours,
+        scipy=scipy,
+        ratio=ratio,
+        bar=_bar_words(case),
+        verdict=_verdict(case, ours, ratio),
+        first=first,
+        pilot=pilot,
+        whole=whole,
+        converged=float(np.mean(found.has("converged"))),
+        poor=float(np.mean(found.has("poor"))),
+        compared=len(differences),
+        above=float(np.mean(differences > ROUNDING)) if len(differences) else None,
+        below=float(np.mean(differences < -OTHER)) if len(differences) else None,
+        width=pull_width(found, one),
+        chi_square=float(np.nanmean(found.reduced_chi_square)),
+        table=table_error(job, found, size.checked),
+        words=str(found.attributes["numerical"].get("table", "")),
+        peak=max(task.peak for _, task in done),
+    )
+
+
+def _bar_words(case: Case) -> str:
+    if case.rate is not None:
+        return f"{case.rate.words()} fits/s"
+    return f"{case.bar.words()} x scipy" if case.bar is not None else ""
+
+
+def _verdict(case: Case, rate: float, ratio: float | None) -> str:
+    if case.rate is not None:
+        return case.rate.verdict(rate)
+    return "no peer" if ratio is None else case.bar.verdict(ratio) if case.bar is not None else ""
+
+
+def fitted(one: Given, size: Size, values: Floats | None = None) -> tuple[float, float, FittedMap]:
+    """Seconds before the first chunk, seconds of the chunks, and the map. values: in the place of those in the file."""
+    began, told = time.perf_counter(), []
+
+    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        if stage == "map" and done == 0:
+            told.append(time.perf_counter())
+
+    found = fits.fit_map(
+        one.stack,
+        one.geometry,
+        one.values if values is None else values,
+        one.store if values is None else one.store.with_name("first.zarr"),
+        one.noise,
+        transport=one.transport,
+        chunk=size.chunk,
+        processes=PROCESSES,
+        progress=progress,
+    )
+    return told[0] - began, time.perf_counter() - told[0], found
+
+
+def by_turns(tasks: list[Task], size: Size) -> list[Task | Texelwise]:
+    """Chunks of the map and texels for scipy, one after the other; of each kind what compiles stands in front."""
+    generator = np.random.default_rng(5)
+    texels, times = size.scipy
+    chosen = np.linspace(0, len(tasks) - 1, times + PROCESSES).astype(int)
+    turns: list[Task | Texelwise] = []
+    for index in chosen:
+        block = tasks[index].block
+        count = int(np.prod([one.stop - one.start for one in block]))
+        places = np.sort(generator.choice(count, min(texels, count), replace=False))
+        turns.append(tasks[index])
+        if len(places):
+            turns.append(Texelwise(tasks[index], tuple(int(place) for place in places)))
+    return turns
+
+
+def finished(results: Any) -> Any:
+    """What tasks said; ValueError for one that failed."""
+    for index, result in results:
+        if isinstance(result, Failure):
+            raise ValueError(f"a task of the benchmark failed: {result.error}")
+        yield index, result
+
+
+def warm(done: Sequence[tuple[int, Timed]]) -> list[tuple[int, Timed]]:
+    """Without the first of its kind in each process, which compiles; all of them if there is nothing else."""
+    seen: set[tuple[int, str]] = set()
+    kept = []
+    for index, task in sorted(done, key=lambda entry: entry[1].began):
+        if (task.process, task.kind) in seen:
+            kept.append((index, task))
+        seen.add((task.process, task.kind))
+    lacking = {task.kind for _, task in done} - {task.kind for _, task in kept}
+    return kept + [entry for entry in done if entry[1].kind in lacking]
+
+
+def rate(tasks: Sequence[Timed]) -> float:
+    """Fits a second of `PROCESSES` processes that are always at work."""
+    return PROCESSES * sum(task.fits for task in tasks) / sum(task.ended - task.began for task in tasks)
+
+
+def _differences(
+    job: Job, found: FittedMap, turns: Sequence[Task | Texelwise], done: Sequence[tuple[int, Timed]]
+) -> Floats:
+    """Our costs less scipy's, of the texels that it fitted."""
+    parts = []
+    for index, told in done:
+        task = turns[index]
+        if isinstance(task, Texelwise):
+            rows, vectors = rows_of(job, task), vectors_of(found, task)
+            parts.append(costs_at(job, rows, vectors) - np.array(told.costs))
+    return np.concatenate([np.empty(0), *parts])
+
+
+def vectors_of(found: FittedMap, task: Texelwise) -> Floats:
+    """The fitted numbers of those texels, (M, P)."""
+    places, block = list(task.places), task.task.block
+    return np.stack([np.asarray(found[f"values/{name}"][block]).ravel()[places] for name in found.names], axis=1)
+
+
+def pull_width(found: FittedMap, one: Given) -> float:
+    """Half of what the middle 68 % of the pulls span, of the parameter that is furthest from 1.
+
+    Of texels whose readings say something of every parameter, within its bounds.
+    """
+    good = found.has("converged") & ~found.has("at_bound") & ~found.has("unresolved")
+    widths = []
+    for name, truth in one.truth.items():
+        pulls = ((found.values[name] - truth) / found.errors[name])[good]
+        low, high = np.quantile(pulls, [0.158655, 0.841345])
+        widths.append(0.5 * (high - low))
+    return float(max(widths, key=lambda width: abs(width - 1.0)))
+
+
+def table_error(job: Job, found: FittedMap, checked: int) -> float | None:
+    """Of the model at the optimum, beside the transport at the next finer resolution, in standard deviations."""
+    transport = job.problem.transport
+    if not isinstance(transport, lj.AddingDoubling):
+        return None
+    at = np.linspace(0, found.flags.size - 1, checked).astype(int)
+    vectors = np.stack([found.values[name].ravel()[at] for name in found.names], axis=1)
+    mine = all_predicted(job.problem, vectors)
+    fine = all_predicted(replace(job.problem, transport=transport.finer()), vectors)
+    noise = job.problem.noise
+    sigma = np.hypot(float(noise.relative or 0.0) * fine, job.least)  # type: ignore[arg-type]
+    return float(np.max(np.abs(mine - fine) / sigma))
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Rates, and under them how good the fits are."""
+    rates = [
+        (r.name, f"{r.texels:,}", figure(r.rate), figure(r.scipy), figure(r.ratio), r.bar, r.verdict) for r in rows
+    ]
+    header = ("map", "texels", "fits/s", "scipy's", "ratio", "bar (aim)", "verdict")
+    good = [
+        (
+            r.name,
+            f"{100 * r.converged:.2f} %",
+            f"{100 * r.poor:.2f} %",
+            f"{r.compared}",
+            "-" if r.above is None else f"{100 * r.above:.1f} %",
+            "-" if r.below is None else f"{100 * r.below:.1f} %",
+            figure(r.width),
+            figure(r.chi_square),
+            figure(r.table),
+        )
+        for r in rows
+    ]
+    words = ("map", "converged", "poor", "compared", "above scipy's", "below", "pulls", "chi-square", "error, sd")
+    tables = "".join(f"- {r.name}: {r.words}.\n" for r in rows if r.words)
+    return f"{table(header, rates)}\n{table(words, good)}\n{tables}"
+
+
+def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The rows as plain data."""
+    return [asdict(row) for row in rows]
