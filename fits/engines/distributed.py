@@ -155,11 +155,20 @@ class _Run:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="Sending large graph")
                 self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.losses.total()}")
+            self._spread()
         name = f"{self.name}-{index}-{self.losses[index]}-{self.suspects.count(index)}"
         given = (self.shared, self.name, self.tasks[index], precision())
         future = self.client.submit(perform, *given, key=name, retries=RETRIES, pure=False)
         self.running[future] = index
         return future
+
+    def _spread(self) -> None:
+        """Give all workers what tasks share: a scheduler gives a task to those alone that have what it needs."""
+        from distributed import wait
+
+        with suppress(Exception):  # of workers that die meanwhile; others come to have it by and by
+            wait([self.shared], timeout=WAITED)
+            self.client.replicate([self.shared])
 
     def _room(self) -> int:
         """Tasks that may be on their way."""
