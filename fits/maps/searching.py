@@ -10,8 +10,7 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
 
-from fits.maps.descending import Known
-from fits.maps.solving import Found, all_known, nearest, solve, solve_near
+from fits.maps.solving import Found, nearest, solve
 from fits.maps.texels import Texels, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -36,21 +35,16 @@ NEIGHBOUR, RANDOM = -1, -2
 class Starts:
     """Where fits begin.
 
-    vectors, units: K, physical and in the unit box, (K, P). known: what the model says there, (K, ...); None where
-    every texel has directions of its own. random: further points of the unit box, (R, P).
+    vectors, units: K, physical and in the unit box, (K, P). predicted: what they predict, (K, N, C); None where every
+    texel has directions of its own. random: further points of the unit box, (R, P).
     expected: a reduced chi-square that is not poor, whatever the noise says.
     """
 
     vectors: Floats
     units: Floats
-    known: Known | None
+    predicted: Floats | None
     random: Floats
     expected: float = 0.0
-
-    @property
-    def predicted(self) -> Floats | None:
-        """What they predict, (K, N, C), in 1/sr."""
-        return None if self.known is None else self.known.values
 
 
 class Ends(NamedTuple):
@@ -67,8 +61,8 @@ def starts_at(problem: Problem, vectors: Floats, random: Floats, own: bool, expe
     if own:
         vectors = vectors[:MOST_PREDICTED]
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(vectors)), float)
-    units = np.clip(units, 0.0, 1.0)
-    return Starts(vectors, units, None if own else all_known(problem, units), random, expected)
+    predicted = None if own else all_predicted(problem, vectors)
+    return Starts(vectors, np.clip(units, 0.0, 1.0), predicted, random, expected)
 
 
 def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: Integers | None = None) -> Ends:
@@ -79,10 +73,7 @@ def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: 
         beside: the neighbours of each, (M, ...), by their places; -1 where there is none.
     """
     order = _likeliest(problem, starts, texels)
-    if starts.known is None:
-        found = solve(problem, starts.units[order[:, 0]], texels, size, fresh=False)
-    else:
-        found = solve_near(problem, starts.units, starts.known, order[:, 0], texels, size)
+    found = solve(problem, starts.units[order[:, 0]], texels, size, fresh=False)
     start = order[:, 0].copy()
     restarted = np.zeros(texels.number, bool)
 
