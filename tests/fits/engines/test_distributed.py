@@ -31,7 +31,7 @@ def distributed_patience(connect: str) -> Any:
 
 @pytest.fixture(scope="module")
 def client() -> Iterator[Any]:
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": ":0"}
     before = {name: os.environ.get(name) for name in ("PYTHONPATH", *QUIET)}
     os.environ.update(QUIET | {"PYTHONPATH": str(ROOT)})
     try:
