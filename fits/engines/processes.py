@@ -158,11 +158,8 @@ class _Pool:
 
 def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    with tempfile.TemporaryDirectory(prefix="layerjax-") as folder:
-        path = Path(folder) / "shared.pickle"
-        if len(payload) > SHORT:
-            path.write_bytes(payload)
-        pool, patience = _Pool(payload if len(payload) <= SHORT else str(path), tasks), 0.0
+    with _handed_over(payload) as given:
+        pool, patience = _Pool(given, tasks), 0.0
         try:
             for number, index in zip(range(count), pool.left, strict=False):
                 pool.start(cores[number % len(cores)], index)
@@ -173,6 +170,18 @@ def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[i
             patience = PATIENCE
         finally:
             pool.end(patience)
+
+
+@contextmanager
+def _handed_over(payload: bytes) -> Iterator[bytes | str]:
+    """It, or where it is long a file that holds it. Of a parent that is killed, workers take the file away."""
+    if len(payload) <= SHORT:
+        yield payload
+        return
+    with tempfile.TemporaryDirectory(prefix="layerjax-") as folder:
+        path = Path(folder) / "shared.pickle"
+        path.write_bytes(payload)
+        yield str(path)
 
 
 @contextmanager
