@@ -5,9 +5,27 @@ is killed, costs itself alone.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from fits.engines.failures import Failure as Failure
+
+
+@contextmanager
+def connected(client: Any) -> Iterator[Any]:
+    """The client for many calls of `run`: where the address of a scheduler is given, one that ends with the block.
+
+    Raises:
+        ValueError: no client and no address, or no `distributed`.
+        OSError: no such scheduler.
+    """
+    if client is None:
+        yield None
+        return
+    from fits.engines.distributed import connected
+
+    with connected(client) as found:
+        yield found
 
 
 def run(

@@ -31,6 +31,9 @@ COUNTED = 5.0
 RETRIES = 3
 """Of a task that ends by an error which is neither its own nor the death of its worker."""
 
+WITH_PORT = ("tcp", "tls", "ws", "wss", "ucx")
+"""Kinds of addresses of a scheduler, beside those of threads of this process."""
+
 AGAIN, LATER = object(), object()
 """In the place of an outcome, where the task is to be done once more."""
 
@@ -39,13 +42,9 @@ def run_distributed(
     work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], client: Any
 ) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`."""
-    try:
-        import cloudpickle
-        from distributed import Client
-    except ImportError:
-        raise ValueError('client= needs distributed: pip install "layerjax[distributed]"') from None
-    if not isinstance(client, str | Client) or getattr(client, "asynchronous", False):
-        raise ValueError(f"client is {client!r}; it must be a distributed.Client, or the address of a scheduler")
+    _require_client(client)
+    import cloudpickle
+
     try:
         payload = cloudpickle.dumps((work, shared))
         packed = [cloudpickle.dumps(task) for task in tasks]
@@ -57,7 +56,7 @@ def run_distributed(
 def _results(payload: bytes, tasks: list[bytes], given: Any) -> Iterator[tuple[int, Any]]:
     if not tasks:
         return
-    with _connected(given) as client:
+    with connected(given) as client:
         run = _Run(client, payload, tasks)
         try:
             yield from run.results()
@@ -66,9 +65,30 @@ def _results(payload: bytes, tasks: list[bytes], given: Any) -> Iterator[tuple[i
                 client.cancel(list(run.running), force=True)
 
 
+def _require_client(given: Any) -> None:
+    """Refuse what is no client, and no address of a scheduler."""
+    try:
+        from distributed import Client
+        from distributed.comm.addressing import parse_address, parse_host_port
+    except ImportError:
+        raise ValueError('client= needs distributed: pip install "layerjax[distributed]"') from None
+    wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
+    if not isinstance(given, str | Client) or getattr(given, "asynchronous", False):
+        raise ValueError(f"client is {given!r}; it must be {wanted}")
+    if isinstance(given, str):
+        try:
+            scheme, place = parse_address(given)
+            host = parse_host_port(place)[0] if scheme in WITH_PORT else place if scheme == "inproc" else ""
+        except ValueError:  # a client that meets this waits a minute for itself
+            host = ""
+        if not host:
+            raise ValueError(f"client is {given!r}; it must be {wanted}")
+
+
 @contextmanager
-def _connected(given: Any) -> Iterator[Any]:
-    """A client; one of our own for an address, and it ends with the block."""
+def connected(given: Any) -> Iterator[Any]:
+    """A client; one of our own for an address, and it ends with the block. Errors as those of `fits.engines.run`."""
+    _require_client(given)
     from distributed import Client
 
     if not isinstance(given, str):

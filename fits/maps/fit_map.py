@@ -19,7 +19,7 @@ import zarr
 
 import layerjax
 from fits._files import locked, named
-from fits.engines import Failure, run
+from fits.engines import Failure, connected, run
 from fits.engines.processes import end_if_again
 from fits.maps.alternating import require_smoothable, smooth_map
 from fits.maps.chunk_files import Block, grid
@@ -143,8 +143,8 @@ def fit_map(
     settings = replace(settings, chunk=min(chunk, max(USUAL_CHUNK, math.prod(found.shape))))
     path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
     require_folder(path)
-    with locked(Path(f"{path}.lock"), str(path)):
-        return _fitted(path, found, stack, noise, rest, settings, client, processes, force, progress)
+    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached:
+        return _fitted(path, found, stack, noise, rest, settings, reached, processes, force, progress)
 
 
 def _fitted(

@@ -116,6 +116,9 @@ def test_leaving_the_loop_takes_back_what_was_sent(client: Any, tmp_path: Path) 
 def test_what_is_no_cluster_is_refused() -> None:
     with pytest.raises(ValueError, match=r"client is 3; it must be a distributed.Client, or the address"):
         run(tasks.nothing, None, [1], client=3)
+    for address in ("", "head", "8786", "tcp://:8786", "http://head:8786"):
+        with pytest.raises(ValueError, match=f"client is '{address}'; it must be a distributed.Client, or the address"):
+            run(tasks.nothing, None, [1], client=address)
     with distributed_patience("1s"), pytest.raises(OSError, match=r"tcp://127\.0\.0\.1:9: there is no scheduler"):
         list(run(tasks.nothing, None, [1], client="tcp://127.0.0.1:9"))
 
