@@ -16,20 +16,22 @@ class Progress(Protocol):
 
 
 class _Pace:
-    """Adds to a note how long its stage takes from here on, at the pace since the first call of the stage."""
+    """Adds to a note how long its stage takes from here on: at its pace so far, less the first step, which compiles."""
 
     def __init__(self) -> None:
-        self.first: dict[str, tuple[float, int]] = {}
+        self.marks: dict[str, list[tuple[float, int]]] = {}
         self.last: dict[str, int] = {}
 
     def noted(self, stage: str, done: int, total: int | None, info: str) -> str:
         now = time.monotonic()
         if done < self.last.get(stage, done + 1):  # it begins, or begins again
-            self.first[stage] = now, done
-        self.last[stage] = done
-        began, first = self.first[stage]
-        if total is None or not first < done < total:
+            self.marks[stage] = [(now, done)]
+        marks, self.last[stage] = self.marks[stage], done
+        if total is None or not marks[0][1] < done < total:
             return info
+        began, first = marks[-1] if done > marks[-1][1] else marks[0]
+        if len(marks) == 1:
+            marks.append((now, done))
         left = f"about {in_words((now - began) / (done - first) * (total - done))} left"
         return f"{left}; {info}" if info else left
 
