@@ -235,6 +235,7 @@ def test_a_disk_that_fills_up(
         assert_same(open_map(out), whole)
 
 
+@pytest.mark.slow
 def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(
     place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str]
 ) -> None:
