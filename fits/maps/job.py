@@ -86,6 +86,11 @@ class Job:
         assert self.source is not None
         return self.source.open() if isinstance(self.source, Portable) else self.source
 
+    @cached_property
+    def store(self) -> zarr.Group:
+        """The store, opened once in each process."""
+        return zarr.open_group(self.path, mode="r+")
+
 
 class Task(NamedTuple):
     """One chunk: its place, and its readings where workers cannot read them themselves."""
@@ -96,11 +101,10 @@ class Task(NamedTuple):
 
 def work(job: Job, task: Task) -> dict[str, int]:
     """Fit a chunk and write it, if a worker that was killed has not; returns how many texels have which flag."""
-    root = zarr.open_group(job.path, mode="r+")
-    flags = flags_of(root, task.block)
+    flags = flags_of(job.store, task.block)
     if flags is None:
         results = fit_chunk(job, part_of(job.readings, task.block) if task.part is None else task.part)
-        write_chunk(root, task.block, results)
+        write_chunk(job.store, task.block, results)
         flags = results["flags"]
     return {meaning: int(np.sum(flags & bit > 0)) for meaning, bit in FLAGS.items()}
 

@@ -1,8 +1,8 @@
 """What processes, clusters and chunks add to the fits: ratios of rates, milliseconds a chunk, bytes a worker."""
 
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 from unittest.mock import patch
@@ -18,12 +18,12 @@ from benchmarks.measuring.timing import once
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.studies.maps.cases import Case, Given, given, job_of, stored
 from benchmarks.studies.maps.fitting import PROCESSES, Report, Row, Size, finished, fitted
-from benchmarks.studies.maps.work import Meeting, Timed, timed, warm_up
+from benchmarks.studies.maps.work import Meeting, Timed, redo, timed, warm_up
 from benchmarks.suite.maps import readings
 from fits.engines import run as run_tasks
 from fits.engines.processes import run_processes
 from fits.maps import searching
-from fits.maps.job import Task, work
+from fits.maps.job import Task
 
 PAIR, CLUSTER = Bar(1.8, 1.95, rate=True), Bar(0.9, 0.97, rate=True)
 OVERHEAD, MEMORY = Bar(50.0, 10.0), Bar(1.5, 0.7)
@@ -161,7 +161,7 @@ def overhead(size: Size) -> list[Figure]:
         job, (task, *_) = job_of(one, size.chunk)
         for _ in range(WARM + 5 * size.rounds):
             with _solving() as spent:
-                whole.append(1e3 * once(lambda: work(job, task)))
+                whole.append(1e3 * once(lambda: redo(job, task)))
             solved.append(1e3 * sum(spent))
     beside = (np.array(whole) - np.array(solved))[WARM:]
     note = f"{figure(float(np.median(whole[WARM:])))} ms with the solution of a model that costs nothing"
@@ -173,14 +173,18 @@ def overhead(size: Size) -> list[Figure]:
 def _solving() -> Iterator[list[float]]:
     """Seconds of each call that solves texels, as they come."""
     spent: list[float] = []
-    solve = searching.solve
 
-    def measured(*given: Any, **options: Any) -> Any:
-        found: list[Any] = []
-        spent.append(once(lambda: found.append(solve(*given, **options))))
-        return found[0]
+    def measured(solve: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **options: Any) -> Any:
+            found: list[Any] = []
+            spent.append(once(lambda: found.append(solve(*given, **options))))
+            return found[0]
 
-    with patch.object(searching, "solve", measured):
+        return call
+
+    with ExitStack() as stack:
+        for name in ("solve",):
+            stack.enter_context(patch.object(searching, name, measured(getattr(searching, name))))
         yield spent
 
 

@@ -42,8 +42,8 @@ class Size:
     side: int = 256
     chunk: int = 1024
     scipy: tuple[int, int] = (8, 24)
-    checked: int = 32
-    rounds: int = 3
+    checked: int = 64
+    rounds: int = 5
     repeats: int = 2
     tasks: int = 2000
 
@@ -144,7 +144,9 @@ def _verdict(case: Case, rate: float, ratio: float | None) -> str:
     return "no peer" if ratio is None else case.bar.verdict(ratio) if case.bar is not None else ""
 
 
-def fitted(one: Given, size: Size, values: Floats | None = None) -> tuple[float, float, FittedMap]:
+def fitted(
+    one: Given, size: Size, values: Floats | None = None, processes: int = PROCESSES
+) -> tuple[float, float, FittedMap]:
     """Seconds before the first chunk, seconds of the chunks, and the map. values: in the place of those in the file."""
     began, told = time.perf_counter(), []
 
@@ -160,7 +162,7 @@ def fitted(one: Given, size: Size, values: Floats | None = None) -> tuple[float,
         one.noise,
         transport=one.transport,
         chunk=size.chunk,
-        processes=PROCESSES,
+        processes=processes,
         progress=progress,
     )
     return told[0] - began, time.perf_counter() - told[0], found

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from fits.engines.worker import take_after
-from fits.maps.job import Job, Task, part_of, work
+from fits.maps.job import Job, Task, fit_chunk, part_of
 from fits.maps.solving import nearest
+from fits.maps.store import FLAGS, write_chunk
 from fits.maps.texels import Texels, model_of, texels
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -68,7 +69,7 @@ def timed(job: Job, task: Task | Texelwise | Meeting) -> Timed:
     """Fit a chunk of a map, or some texels by scipy."""
     began, costs = time.monotonic(), None
     if isinstance(task, Meeting):
-        count = work(job, task.task)["fitted"]
+        count = redo(job, task.task)
         meet(Path(task.folder), task.workers)
         return Timed("ours", count, began, time.monotonic(), os.getpid(), peak())
     if isinstance(task, Texelwise):
@@ -76,14 +77,21 @@ def timed(job: Job, task: Task | Texelwise | Meeting) -> Timed:
         costs = [scipy_fit(job, rows.rows(place), unit) for place, unit in enumerate(first_starts(job, rows))]
         count = len(costs)
     else:
-        kind, count = "ours", work(job, task)["fitted"]
+        kind, count = "ours", redo(job, task)
     return Timed(kind, count, began, time.monotonic(), os.getpid(), peak(), costs)
+
+
+def redo(job: Job, task: Task) -> int:
+    """A chunk as `fits.maps.job.work` does it, also where it is done already; how many texels were fitted."""
+    results = fit_chunk(job, part_of(job.readings, task.block))
+    write_chunk(job.store, task.block, results)
+    return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
 
 def warm_up(job: Job, task: Task, double: bool) -> None:
     """Compile the programs of a map in a worker of a cluster, which gives a task to whom it likes."""
     take_after(double)
-    work(job, task)
+    redo(job, task)
 
 
 def meet(folder: Path, workers: int) -> None:
