@@ -10,7 +10,8 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
 
-from fits.maps.solving import Found, nearest, solve
+from fits.maps.descending import Known
+from fits.maps.solving import Found, all_known, nearest, solve, solve_near
 from fits.maps.texels import Texels, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -35,16 +36,21 @@ NEIGHBOUR, RANDOM = -1, -2
 class Starts:
     """Where fits begin.
 
-    vectors, units: K, physical and in the unit box, (K, P). predicted: what they predict, (K, N, C); None where every
-    texel has directions of its own. random: further points of the unit box, (R, P).
+    vectors, units: K, physical and in the unit box, (K, P). known: what the model says there, (K, ...); None where
+    every texel has directions of its own. random: further points of the unit box, (R, P).
     expected: a reduced chi-square that is not poor, whatever the noise says.
     """
 
     vectors: Floats
     units: Floats
-    predicted: Floats | None
+    known: Known | None
     random: Floats
     expected: float = 0.0
+
+    @property
+    def predicted(self) -> Floats | None:
+        """What they predict, (K, N, C), in 1/sr."""
+        return None if self.known is None else self.known.values
 
 
 class Ends(NamedTuple):
@@ -61,8 +67,8 @@ def starts_at(problem: Problem, vectors: Floats, random: Floats, own: bool, expe
     if own:
         vectors = vectors[:MOST_PREDICTED]
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(vectors)), float)
-    predicted = None if own else all_predicted(problem, vectors)
-    return Starts(vectors, np.clip(units, 0.0, 1.0), predicted, random, expected)
+    units = np.clip(units, 0.0, 1.0)
+    return Starts(vectors, units, None if own else all_known(problem, units), random, expected)
 
 
 def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: Integers | None = None) -> Ends:
@@ -73,9 +79,14 @@ def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: 
         beside: the neighbours of each, (M, ...), by their places; -1 where there is none.
     """
     order = _likeliest(problem, starts, texels)
-    found = solve(problem, starts.units[order[:, 0]], texels, size, fresh=False)
+    if starts.known is None:
+        found = solve(problem, starts.units[order[:, 0]], texels, size, fresh=False)
+    else:
+        found = solve_near(problem, starts.units, starts.known, order[:, 0], texels, size)
     start = order[:, 0].copy()
     restarted = np.zeros(texels.number, bool)
+
+    limit = _limit(problem, starts, texels)
 
     def again(rows: Integers, units: Floats, begun: Integers) -> None:
         if not len(rows):
@@ -87,34 +98,39 @@ def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: 
         start[rows[improved]] = begun[improved]
 
     for place in range(1, min(OTHERS, order.shape[1] - 1) + 1):
-        rows = np.flatnonzero(_poor(problem, starts, texels, found))
+        rows = np.flatnonzero(_poor(found, texels, limit))
         again(rows, starts.units[order[rows, place]], order[rows, place])
     for _ in range(OTHERS if beside is not None else 0):
-        rows, units = _beside(problem, found, _poor(problem, starts, texels, found), beside)
+        rows, units = _beside(problem, found, _poor(found, texels, limit), beside)
         again(rows, units, np.full(len(rows), NEIGHBOUR))
     for point in starts.random:
-        rows = np.flatnonzero(_poor(problem, starts, texels, found))
+        rows = np.flatnonzero(_poor(found, texels, limit))
         again(rows, np.broadcast_to(point, (len(rows), point.size)), np.full(len(rows), RANDOM))
-    return Ends(found, start, _poor(problem, starts, texels, found) & found.converged, restarted)
+    return Ends(found, start, _poor(found, texels, limit) & found.converged, restarted)
 
 
 def reduced_chi_square(found: Found, texels: Texels) -> Floats:
     """Chi-square over degrees of freedom, (M,)."""
-    return np.asarray(found.chi_square) / _freedom(found, texels)
+    return np.asarray(found.chi_square) / _freedom(texels, found.vector.shape[1])
 
 
-def _freedom(found: Found, texels: Texels) -> Floats:
-    return np.maximum(texels.readings - found.vector.shape[1], 1).astype(float)
+def _freedom(texels: Texels, parameters: int) -> Floats:
+    return np.maximum(texels.readings - parameters, 1).astype(float)
 
 
-def _poor(problem: Problem, starts: Starts, texels: Texels, found: Found) -> NDArray[np.bool_]:
-    """Whether a fit is worse than noise and the sample explain, or has not converged."""
+def _limit(problem: Problem, starts: Starts, texels: Texels) -> Floats:
+    """The reduced chi-square that noise and the sample explain, (M,)."""
     limit = np.full(texels.number, starts.expected)
     if problem.objective == "likelihood" and problem.noise.tails == "gaussian":
-        freedom = _freedom(found, texels)
-        limit = np.maximum(limit, stats.chi2.isf(CHANCE, freedom) / freedom)
+        freedom, where = np.unique(_freedom(texels, len(problem.names)), return_inverse=True)
+        limit = np.maximum(limit, (stats.chi2.isf(CHANCE, freedom) / freedom)[where])
     elif not starts.expected:
         limit[:] = np.inf
+    return limit
+
+
+def _poor(found: Found, texels: Texels, limit: Floats) -> NDArray[np.bool_]:
+    """Whether a fit is worse than that, or has not converged."""
     return ~((reduced_chi_square(found, texels) <= limit) & found.converged)
 
 

@@ -1,4 +1,4 @@
-"""Fits of many texels in one compiled program: a start for each, Levenberg-Marquardt, and what the data say there."""
+"""Fits of many texels in one compiled program: a start for each, descents, and what the data say where these end."""
 
 from typing import Any, NamedTuple
 
@@ -8,18 +8,18 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.inference.descent import PROMISE, descend
+from fits.inference.descent import PROMISE
 from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
-from fits.inference.starts import MOST_STEPS
 from fits.inference.uncertainty import LEAST_PULL, ON_BOUND
-from fits.maps.texels import Texels, blocks, chi_square, model_of
+from fits.maps.descending import BESIDE, End, Known, descents, known_at, linear
+from fits.maps.texels import Texels, chi_square, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 
-TOGETHER = 4
-"""Texels that take their steps side by side: more keep each other waiting."""
+TOGETHER = 64
+"""Starts that a program takes, or a multiple of that."""
 
 
 class Found(NamedTuple):
@@ -58,56 +58,109 @@ def solve(problem: Problem, units: Floats, texels: Texels, size: int, fresh: boo
 
     Not `fresh`: the starts lie near minima.
     """
-    parts = [
-        _solved(problem, units[first : first + size], texels.rows(slice(first, first + size)), size, fresh)
-        for first in range(0, len(units), size)
-    ]
-    return Found(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    if texels.wi is not None:  # what is known somewhere is each texel's own
+        return _all_solved(problem, units, None, np.arange(texels.number), texels, size, fresh)
+    distinct, which = np.unique(units, axis=0, return_inverse=True)
+    parts, order = [], []
+    for first in range(0, len(distinct), TOGETHER):
+        some = distinct[first : first + TOGETHER]
+        rows = np.flatnonzero((which >= first) & (which < first + TOGETHER))
+        known = all_known(problem, some)
+        parts.append(solve_near(problem, some, known, which[rows] - first, texels.rows(rows), size, fresh))
+        order.append(rows)
+    back = np.argsort(np.concatenate(order))
+    return Found(*(np.concatenate(part)[back] for part in zip(*parts, strict=True)))
 
 
-def _solved(problem: Problem, units: Floats, texels: Texels, size: int, fresh: bool) -> Found:
-    count = len(units)
-    filled = np.minimum(np.arange(-(-size // TOGETHER) * TOGETHER), count - 1)
-    number = np.asarray(-(-count // TOGETHER))
-    found = problem.call(_in_blocks, units[filled], texels.rows(filled), number, np.asarray(fresh))
-    return Found(*(np.array(part)[:count] for part in found))
+def solve_near(
+    problem: Problem,
+    units: Floats,
+    known: Known,
+    which: NDArray[np.int64],
+    texels: Texels,
+    size: int,
+    fresh: bool = False,
+) -> Found:
+    """Fits of M texels from starts (K, P), of which is known what the model says there, (K, ...).
+
+    which: start of each texel, (M,).
+    """
+    return _all_solved(problem, padded(units), Known(*map(padded, known)), which, texels, size, fresh)
 
 
-def _in_blocks(model: Model, units: Array, texels: Texels, number: Array, fresh: Array) -> Found:
-    """So many blocks of the texels; what comes after them is left as it is."""
-    rows = blocks((units, texels), TOGETHER)
-
-    def block(index: Array) -> Found:
-        units, texels = jax.tree.map(lambda part: part[index], rows)
-        return jax.vmap(lambda unit, texel: _one(model, unit, texel, fresh))(units, texels)
-
-    shapes = jax.eval_shape(block, jnp.asarray(0))
-    empty = jax.tree.map(lambda part: jnp.zeros((len(rows[0]), *part.shape), part.dtype), shapes)
-    found = jax.lax.fori_loop(
-        0, number, lambda i, out: jax.tree.map(lambda whole, part: whole.at[i].set(part), out, block(i)), empty
-    )
-    return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
+def all_known(problem: Problem, units: Floats) -> Known:
+    """What the model says at K points (K, P) of the unit box."""
+    found = problem.call(_all_known, padded(units))
+    return Known(*(np.asarray(part, float)[: len(units)] for part in found))
 
 
-def _one(model: Model, unit: Array, texel: Texels, fresh: Array) -> Found:
-    own = model_of(model, texel)
-    end = descend(own, unit, fresh, jnp.asarray(MOST_STEPS), jnp.asarray(PROMISE))
-    squares = chi_square(own, texel, end.vector, end.predicted)
+def padded(array: Floats) -> Floats:
+    """With its last row repeated, so that there are few numbers of rows, and programs for them."""
+    return np.concatenate([array, np.repeat(array[-1:], -len(array) % TOGETHER, axis=0)])
+
+
+def _all_known(model: Model, units: Array) -> Known:
+    return jax.lax.map(lambda unit: known_at(model, model.box.from_unit(unit)), units)
+
+
+def _all_solved(
+    problem: Problem,
+    units: Floats,
+    known: Known | None,
+    which: NDArray[np.int64],
+    texels: Texels,
+    size: int,
+    fresh: bool,
+) -> Found:
+    parts = []
+    for first in range(0, texels.number, size):
+        count = min(size, texels.number - first)
+        places = first + np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)
+        starts, begun = (units, which[places]) if known is not None else (units[places], np.arange(len(places)))
+        given = (starts, known, begun, texels.rows(places), np.asarray(count), np.asarray(fresh))
+        parts.append([np.array(part)[:count] for part in problem.call(_solved, *given)])
+    return Found(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _solved(
+    model: Model, units: Array, known: Known | None, which: Array, texels: Texels, number: Array, fresh: Array
+) -> Found:
+    """Fits of the first `number` of the texels; of others whatever."""
+    ends = descents(model, texels, number, fresh, units, known, which)
+    return jax.lax.map(lambda row: _found(model, *row), (ends, texels), batch_size=BESIDE)
+
+
+def _found(model: Model, end: End, texel: Texels) -> Found:
+    own, vector, predicted = model_of(model, texel), model.box.from_unit(end.unit), end.known.values
+    near = linear(own, end.known, vector)
+    finite = jnp.isfinite(end.cost)
+    squares = chi_square(own, texel, vector, predicted)
     scatter = jnp.ones_like(end.cost)
     if model.objective != "likelihood":
-        freedom = jnp.maximum(jnp.sum(texel.used) - unit.size, 1)
+        freedom = jnp.maximum(jnp.sum(texel.used) - vector.size, 1)
         scatter = jnp.maximum(2.0 * end.cost / freedom, jnp.finfo(end.cost.dtype).tiny)
-    errors, held, unresolved = _errors(own, end, scatter)
-    return Found(end.vector, errors, end.cost, squares, end.converged, unresolved, held, end.predicted)
+    rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(end.unit)
+    # R of the QR decomposition has its singular values without squaring its condition number
+    root = jnp.linalg.qr(rows, mode="r")
+    errors, held, unresolved = _errors(model, end, root, scatter)
+    return Found(
+        vector=vector,
+        errors=errors,
+        cost=jnp.where(finite, end.cost, jnp.inf),
+        chi_square=squares,
+        converged=(end.converged > 0.5) & finite,
+        unresolved=unresolved,
+        at_bound=held,
+        predicted=jnp.where(finite, predicted, jnp.nan),
+    )
 
 
-def _errors(model: Model, end: Any, scatter: Array) -> tuple[Array, Array, Array]:
+def _errors(model: Model, end: End, root: Array, scatter: Array) -> tuple[Array, Array, Array]:
     """As `fits.inference.uncertainty`, for a compiled program."""
-    box, count = model.box, end.vector.size
-    root, pull = end.root / jnp.sqrt(scatter), LEAST_PULL * scatter
+    box, unit, count = model.box, end.unit, end.unit.size
+    root, pull = root / jnp.sqrt(scatter), LEAST_PULL * scatter
     known = jnp.isfinite(end.cost) & jnp.all(jnp.isfinite(root))
     root = jnp.where(known, root, 0.0)
-    unit = box.to_unit(end.vector)
     idle = jnp.linalg.norm(root, axis=0) * UNKNOWN_BEYOND < 1.0
     held = ((unit <= ON_BOUND) & (end.gradient > pull)) | ((unit >= 1.0 - ON_BOUND) & (end.gradient < -pull))
     held &= ~idle & known
@@ -117,17 +170,21 @@ def _errors(model: Model, end: Any, scatter: Array) -> tuple[Array, Array, Array
     _, sizes, directions = jnp.linalg.svd(rows, full_matrices=False)
     least = jnp.maximum(jnp.finfo(sizes.dtype).eps * count * sizes[0], 1.0 / LARGEST_ERROR)
     spread = jnp.linalg.norm(directions / jnp.maximum(sizes, least)[:, None], axis=0)
-    errors = jnp.where(spread > UNKNOWN_BEYOND, jnp.inf, spread * box.slope(end.vector))
+    errors = jnp.where(spread > UNKNOWN_BEYOND, jnp.inf, spread * box.slope(box.from_unit(unit)))
     errors = jnp.where(known, errors, jnp.inf)
     return jnp.where(held, jnp.nan, errors), held, unresolved
 
 
 def nearest(problem: Problem, vectors: Floats, predicted: Floats, texels: Texels, most: int) -> NDArray[np.int64]:
     """Which of K vectors (K, P), with what they predict (K, N, C), suit each texel best: (M, most), best first."""
-    return np.asarray(problem.call(_nearest, vectors, predicted, texels))[:, :most]
+    misfit = np.asarray(problem.call(_misfit, padded(vectors), padded(predicted), texels))[:, : len(vectors)]
+    most = min(most, len(vectors))
+    best = np.sort(np.argpartition(misfit, most - 1, axis=1)[:, :most], axis=1)
+    order = np.argsort(np.take_along_axis(misfit, best, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(best, order, axis=1)
 
 
-def _nearest(model: Model, vectors: Array, predicted: Array, texels: Texels) -> Array:
+def _misfit(model: Model, vectors: Array, predicted: Array, texels: Texels) -> Array:
     """By the log-likelihood with noise as the problem's own readings have it, as matrix products."""
     sigma = jax.vmap(model.sigma_at)(vectors, predicted)
     weight = 1.0 / sigma**2
@@ -139,4 +196,4 @@ def _nearest(model: Model, vectors: Array, predicted: Array, texels: Texels) -> 
 
     squares = product(values**2, weight) - 2.0 * product(values, weight * predicted)
     squares += product(used, weight * predicted**2 + 2.0 * jnp.log(sigma))
-    return jnp.argsort(jnp.where(jnp.isnan(squares), jnp.inf, squares), axis=1)
+    return jnp.where(jnp.isnan(squares), jnp.inf, squares)

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -120,8 +119,3 @@ def with_own_directions(problem: Problem) -> Problem:
 def chi_square(model: Model, row: Texels, vector: Array, predicted: Array) -> Array:
     """Of the readings that count; for a named objective the sum of its squared residuals."""
     return jnp.sum(jnp.where(row.used, model.standardised_at(vector, predicted), 0.0) ** 2)
-
-
-def blocks(rows: Any, size: int) -> Any:
-    """Arrays (M, ...) as (M / size, size, ...)."""
-    return jax.tree.map(lambda part: part.reshape(-1, size, *part.shape[1:]), rows)

@@ -183,7 +183,7 @@ def _solving() -> Iterator[list[float]]:
         return call
 
     with ExitStack() as stack:
-        for name in ("solve",):
+        for name in ("solve", "solve_near"):
             stack.enter_context(patch.object(searching, name, measured(getattr(searching, name))))
         yield spent
 
