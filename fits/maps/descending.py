@@ -5,6 +5,7 @@ all that follows from them see the model as linear there. Otherwise the program 
 of these, which takes several times as long. Of a known start the model need not be asked at all.
 """
 
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from typing import Any, NamedTuple
@@ -94,7 +95,7 @@ def descents(
         units: starts, (K, P) in the unit box. which: of each texel, (M,).
         known: what the model says at the starts, (K, ...); None: that is to be found.
     """
-    run = _Run(model, texels, fresh, units, known, which)
+    run = _Run(model, texels, number, fresh, units, known, which)
     places = run.begun(jnp.arange(BESIDE))
     row, unravel = ravel_pytree(jax.tree.map(lambda part: part[0], _ends(places, places.texel < 0)))
     out = jnp.zeros((texels.number + 1, row.size), row.dtype)
@@ -118,6 +119,24 @@ def descents(
     return jax.vmap(unravel)(out[:-1])
 
 
+def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array) -> Any:
+    """What becomes of the first `number` of M rows, (M, ...), `BESIDE` at a time; zeros or whatever of the others."""
+    blocks = jax.tree.map(lambda part: part.reshape(-1, BESIDE, *part.shape[1:]), rows)
+
+    def block(index: Array) -> Any:
+        return jax.vmap(one)(jax.tree.map(lambda part: part[index], blocks))
+
+    count = len(jax.tree.leaves(blocks)[0])
+    shapes = jax.eval_shape(block, jnp.asarray(0))
+    empty = jax.tree.map(lambda part: jnp.zeros((count, *part.shape), part.dtype), shapes)
+
+    def filled(index: Array, out: Any) -> Any:
+        return jax.tree.map(lambda whole, part: whole.at[index].set(part), out, block(index))
+
+    found = jax.lax.fori_loop(0, -(-number // BESIDE), filled, empty)
+    return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
+
+
 def _ends(places: _Place, converged: Array) -> End:
     state = places.state
     return End(places.unit, state.cost, state.gradient, converged.astype(places.unit.dtype), state.beside)
@@ -131,7 +150,7 @@ class _Run:
     """What all places have in common; methods are of `BESIDE` places at once."""
 
     def __init__(
-        self, model: Model, texels: Texels, fresh: Array, units: Array, known: Known | None, which: Array
+        self, model: Model, texels: Texels, number: Array, fresh: Array, units: Array, known: Known | None, which: Array
     ) -> None:
         self.model, self.texels, self.fresh, self.units, self.which = model, texels, fresh, units, which
         self.levels = model.objective == "likelihood" and model.varying
@@ -141,7 +160,7 @@ class _Run:
             self.options["promise"] = PROMISE
         if self.levels:
             self.options["logarithmic"] = model.logarithmic
-        self.opened = None if known is None else self._opened()
+        self.opened = None if known is None else self._opened(number)
 
     def begun(self, numbers: Array) -> _Place:
         """Places of texels of these numbers, (B,), at their starts; of known ones after the first step."""
@@ -169,15 +188,15 @@ class _Run:
         at = jnp.minimum(number, self.texels.number - 1)
         return jax.tree.map(lambda part: part[at], self.texels)
 
-    def _opened(self) -> _Place:
-        """All texels after their first step, without what is known beside them."""
+    def _opened(self, number: Array) -> _Place:
+        """The first `number` texels after their first step, without what is known beside them."""
 
         def one(number: Array) -> _Place:
             known = jax.tree.map(lambda part: part[self.which[number]], self.known)
             place, _, _ = self._step(self._start(number, number), known)
             return place._replace(state=with_beside(place.state, None))
 
-        return jax.lax.map(one, jnp.arange(self.texels.number), batch_size=BESIDE)
+        return first_mapped(one, jnp.arange(self.texels.number), number)
 
     def _start(self, number: Array, at: Array) -> _Place:
         unit = self.units[self.which[at]]

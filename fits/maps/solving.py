@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fits.inference.descent import PROMISE
 from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
 from fits.inference.uncertainty import LEAST_PULL, ON_BOUND
-from fits.maps.descending import BESIDE, End, Known, descents, known_at, linear
+from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, known_at, linear
 from fits.maps.texels import Texels, chi_square, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -100,7 +100,7 @@ def padded(array: Floats) -> Floats:
 
 
 def _all_known(model: Model, units: Array) -> Known:
-    return jax.lax.map(lambda unit: known_at(model, model.box.from_unit(unit)), units)
+    return jax.lax.map(lambda unit: known_at(model, model.box.from_unit(unit)), units, batch_size=BESIDE)
 
 
 def _all_solved(
@@ -127,7 +127,7 @@ def _solved(
 ) -> Found:
     """Fits of the first `number` of the texels; of others whatever."""
     ends = descents(model, texels, number, fresh, units, known, which)
-    return jax.lax.map(lambda row: _found(model, *row), (ends, texels), batch_size=BESIDE)
+    return first_mapped(lambda row: _found(model, *row), (ends, texels), number)
 
 
 def _found(model: Model, end: End, texel: Texels) -> Found:
@@ -142,7 +142,7 @@ def _found(model: Model, end: End, texel: Texels) -> Found:
     rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(end.unit)
     # R of the QR decomposition has its singular values without squaring its condition number
     root = jnp.linalg.qr(rows, mode="r")
-    errors, held, unresolved = _errors(model, end, root, scatter)
+    errors, held, unresolved = _errors(own, end, root, scatter)
     return Found(
         vector=vector,
         errors=errors,
