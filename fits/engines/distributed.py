@@ -1,6 +1,7 @@
 """Tasks by the workers of a dask.distributed cluster, wherever they are.
 
-A worker takes one task at a time; those of several threads share a process, which its libraries may not bear.
+A worker takes one task at a time, or a few where they are short; those of several threads share a process, which its
+libraries may not bear.
 """
 
 import asyncio
@@ -9,11 +10,10 @@ import threading
 import time
 import uuid
 import warnings
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
-from itertools import islice
 from typing import Any
 
 from fits.engines.failures import MOST_DEATHS, Failure, attempt, one_line
@@ -27,6 +27,12 @@ WAITED = 60.0
 
 COUNTED = 5.0
 """Seconds after which workers are counted again: some clusters grow."""
+
+ENOUGH = 0.5
+"""Seconds of work that go to a worker at a time, where single tasks are shorter: to hand one out takes milliseconds."""
+
+SHORTEST = 1e-3
+"""Seconds that a task takes at least."""
 
 RETRIES = 3
 """Of a task that ends by an error which is neither its own nor the death of its worker."""
@@ -111,7 +117,8 @@ class _Run:
     def __init__(self, client: Any, payload: bytes, tasks: list[bytes]):
         self.client, self.payload, self.tasks = client, payload, tasks
         self.name = f"layerjax-{uuid.uuid4().hex[:12]}"
-        self.running: dict[Any, int] = {}
+        self.running: dict[Any, list[int]] = {}
+        self.seconds: float | None = None
         self.losses: Counter[int] = Counter()
         self.suspects: list[int] = []
         self.shared: Any = None
@@ -128,40 +135,53 @@ class _Run:
     def _through(self, indices: list[int], alone: bool) -> Iterator[tuple[int, Any]]:
         from distributed import as_completed
 
-        left = iter(indices)
+        left = deque(indices)
 
         def begin() -> list[Any]:
             with self._reached():
-                return [self._submit(index) for index in islice(left, self._room() - len(self.running))]
+                return [self._submit(self._group(left)) for _ in range(self._room() - len(self.running)) if left]
 
         completed = as_completed(begin(), loop=self.client.loop)
         for future in completed:
-            index = self.running.pop(future)
-            outcome = self._outcome(future, index, alone)
+            group = self.running.pop(future)
+            outcomes = self._outcomes(future, group, alone)
             future.release()
-            if outcome is AGAIN:
-                with self._reached():
-                    completed.add(self._submit(index))
+            with self._reached():
+                for index, outcome in zip(group, outcomes, strict=True):
+                    if outcome is AGAIN:
+                        completed.add(self._submit([index]))
             completed.update(begin())
-            if outcome is not AGAIN and outcome is not LATER:
-                yield index, outcome
+            yield from (
+                (index, outcome)
+                for index, outcome in zip(group, outcomes, strict=True)
+                if outcome is not AGAIN and outcome is not LATER
+            )
 
-    def _outcome(self, future: Any, index: int, alone: bool) -> Any:
-        """The result of a task that has ended, its failure, or when it is to be done once more."""
+    def _group(self, left: deque[int]) -> list[int]:
+        """The next tasks that go together: short ones, while there are enough for all workers."""
+        size = 1
+        if self.seconds is not None:
+            size = max(1, min(int(ENOUGH / max(self.seconds, SHORTEST)), len(left) // self._room()))
+        return [left.popleft() for _ in range(size)]
+
+    def _outcomes(self, future: Any, group: list[int], alone: bool) -> list[Any]:
+        """Of each of the tasks that have ended its result, its failure, or when it is to be done once more."""
         from distributed import KilledWorker
 
         try:
-            return future.result()
+            seconds, outcomes = future.result()
+            each = seconds / len(group)
+            self.seconds = each if self.seconds is None else 0.5 * (self.seconds + each)
+            return list(outcomes)
         except KilledWorker as killed:
             if alone:
-                return Failure(f"its worker died {getattr(killed, 'allowed_failures', MOST_DEATHS) + 1} times")
-            self.suspects.append(index)  # the worker may have died of a task beside it
-            return LATER
+                return [Failure(f"its worker died {getattr(killed, 'allowed_failures', MOST_DEATHS) + 1} times")]
+            self.suspects += group  # the worker may have died of a task beside it
+            return [LATER] * len(group)
         except (futures.CancelledError, asyncio.CancelledError):
             self._require_scheduler()
-            self.losses[index] += 1
             self.shared = None  # it may be lost as well
-            return AGAIN if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
+            return [self._lost(index) for index in group]
         except ImportError as error:
             raise ValueError(
                 f"the workers of {self._address()} lack what this process has: {one_line(error)}"
@@ -170,16 +190,21 @@ class _Run:
             self._require_scheduler()
             raise  # of the task: the disk is full
 
-    def _submit(self, index: int) -> Any:
+    def _lost(self, index: int) -> Any:
+        self.losses[index] += 1
+        return AGAIN if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
+
+    def _submit(self, group: list[int]) -> Any:
         if self.shared is None:  # a task, not scattered data: it is done again where the workers that had it are killed
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="Sending large graph")
                 self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.losses.total()}")
             self._spread()
-        name = f"{self.name}-{index}-{self.losses[index]}-{self.suspects.count(index)}"
-        given = (self.shared, self.name, self.tasks[index], precision())
+        first = group[0]
+        name = f"{self.name}-{first}-{self.losses[first]}-{self.suspects.count(first)}"
+        given = (self.shared, self.name, [self.tasks[index] for index in group], precision())
         future = self.client.submit(perform, *given, key=name, retries=RETRIES, pure=False)
-        self.running[future] = index
+        self.running[future] = group
         return future
 
     def _spread(self) -> None:
@@ -221,12 +246,22 @@ _kept: dict[str, Any] = {}
 _keeping = threading.Lock()
 
 
-def perform(payload: bytes, name: str, task: bytes, double: bool | None) -> Any:
-    """A task in a worker; of each run that has this name it is set up, and unpacks what tasks share, once."""
+def perform(payload: bytes, name: str, tasks: list[bytes], double: bool | None) -> tuple[float, list[Any]]:
+    """Tasks in a worker, and their seconds; of each run that has this name it is set up, and unpacks what tasks share,
+    once."""
+    began = time.monotonic()
     with _keeping:
         if name not in _kept:
-            take_after(double)
+            take_after(double, _threads())
             _kept.clear()
             _kept[name] = pickle.loads(payload)
         work, shared = _kept[name]
-    return attempt(work, shared, pickle.loads(task))
+    outcomes = [attempt(work, shared, pickle.loads(task)) for task in tasks]
+    return time.monotonic() - began, outcomes
+
+
+def _threads() -> int:
+    """Those that this worker may use."""
+    from distributed import get_worker
+
+    return int(get_worker().state.nthreads)

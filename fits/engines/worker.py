@@ -4,6 +4,7 @@ Processes get most of it by their environment, which JAX and LAPACK read as they
 has imported JAX, and is told.
 """
 
+import ctypes
 import hashlib
 import os
 import pickle
@@ -26,6 +27,10 @@ from fits.engines.failures import attempt
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LEAST_COMPILE = 1.0
 """Programs that took so many seconds to compile are kept."""
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
+KEPT = 1 << 25
+"""Bytes: the most that glibc comes to by itself for the second of them."""
 
 READY = b""
 """What a worker sends first."""
@@ -82,16 +87,29 @@ def precision() -> bool | None:
     return None if jax is None else bool(jax.config.jax_enable_x64)
 
 
-def take_after(double: bool | None) -> None:
-    """Set the JAX of a worker that has it already to the precision of who asks, with a cache where it has none."""
+def take_after(double: bool | None, threads: int) -> None:
+    """Set the JAX of a worker that has it already to the precision of who asks, with a cache where it has none; and to
+    so many threads, unless it has computed before."""
     import jax
 
     quieten()
+    _keep_memory()
+    os.environ.setdefault("NPROC", str(threads))  # XLA reads it when it starts its threads
     if double is not None:
         jax.config.update("jax_enable_x64", double)
     if not jax.config.values["jax_compilation_cache_dir"] and (directory := compile_cache()):
         jax.config.update("jax_compilation_cache_dir", directory)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILE)
+
+
+def _keep_memory() -> None:
+    """Do not give memory back to the system after every computation, as dask has its workers do: to be given it again
+    costs a third of a short task."""
+    if "MALLOC_TRIM_THRESHOLD_" in os.environ:
+        with suppress(OSError, AttributeError):  # of another C library
+            mallopt = ctypes.CDLL(None).mallopt
+            mallopt(M_TRIM_THRESHOLD, KEPT)
+            mallopt(M_MMAP_THRESHOLD, KEPT)
 
 
 def quieten() -> None:

@@ -16,7 +16,6 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from fits.engines.worker import take_after
 from fits.maps.job import Job, Task, fit_chunk, part_of
 from fits.maps.solving import nearest
 from fits.maps.store import FLAGS, write_chunk
@@ -88,9 +87,8 @@ def redo(job: Job, task: Task) -> int:
     return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
 
-def warm_up(job: Job, task: Task, double: bool) -> None:
+def warm_up(job: Job, task: Task) -> None:
     """Compile the programs of a map in a worker of a cluster, which gives a task to whom it likes."""
-    take_after(double)
     redo(job, task)
 
 

@@ -54,6 +54,18 @@ def test_results_are_those_of_the_other_engines(client: Any) -> None:
     assert list(run(tasks.square, 5, [], client=client)) == []
 
 
+def test_short_tasks_go_together_and_each_has_its_own_result(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    submit, sent = client.submit, []
+    monkeypatch.setattr(client, "submit", lambda *given, **rest: sent.append(given) or submit(*given, **rest))
+    found = list(run(tasks.square, 5, range(600), client=client))
+    assert sorted(found) == [(index, index * index + 5) for index in range(600)]
+    assert len(sent) < 150
+    sent.clear()
+    bad = dict(run(tasks.picky, None, [5] * 200 + [1] + [5] * 200, client=client))
+    assert [index for index, result in bad.items() if isinstance(result, Failure)] == [200]
+    assert len(bad) == 401 > 2 * len(sent)
+
+
 def test_failures_are_those_of_the_other_engines(client: Any) -> None:
     wanted = dict(run(tasks.picky, None, [0, 1, 2, 5]))
     assert dict(run(tasks.picky, None, [0, 1, 2, 5], client=client)) == wanted
