@@ -34,6 +34,7 @@ class _State(eqx.Module):
     gradient: Array
     normal: Array
     predicted: Array
+    promise: Array
     damping: Array
     growth: Array
     beside: Any
@@ -74,6 +75,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient=jnp.zeros_like(y),
             normal=jnp.eye(y.size, dtype=y.dtype),
             predicted=zero,
+            promise=zero + jnp.inf,
             damping=zero + options.get("damping", FIRST_DAMPING),
             growth=zero + FIRST_GROWTH,
             beside=beside,
@@ -119,6 +121,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient=gradient,
             normal=normal,
             predicted=predicted,
+            promise=promise,
             damping=damping,
             growth=growth,
             beside=beside,

@@ -6,7 +6,7 @@ of these, which takes several times as long. Of a known start the model need not
 """
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,6 +25,9 @@ from fits.problem.model import Model
 
 BESIDE = 4
 """Texels that take their steps side by side: more do not make the arithmetic of each cheaper."""
+
+LAST = 0.01
+"""Of what a full step may promise at the end of a descent: so much is left after a last step that is not looked at."""
 
 _SOLVER = BoxLevenbergMarquardt()
 
@@ -221,10 +224,28 @@ class _Run:
 
         unit, state, _ = _SOLVER.step(residuals, place.unit, None, self.options, place.state, frozenset())
         stop, result = _SOLVER.terminate(residuals, unit, None, self.options, state, frozenset())
+        last = ~stop & ~place.rough & self._is_last(place.state, state)
+        unit, state = jax.tree.map(partial(jnp.where, last), self._stepped_last(unit, state), (unit, state))
+        stop |= last
         again = stop & place.rough
         state = jax.tree.map(partial(jnp.where, again), self._state(unit, state.beside), state)
         converged = (result == optx.RESULTS.successful) & jnp.isfinite(state.cost)
         return _Place(place.texel, place.rough & ~stop, place.sigma, unit, state), stop & ~place.rough, converged
+
+    def _is_last(self, before: Any, state: Any) -> Array:
+        """Whether the next step ends a descent: it is a full one, and another will promise too little if promises go on
+        to fall as they did (after Hairer and Wanner 1996, IV.8)."""
+        followed = state.promise**2 <= LAST * PROMISE * before.promise
+        full = state.promise - state.predicted <= LAST * PROMISE
+        return followed & full & jnp.isfinite(before.promise) & (self.model.objective == "likelihood")
+
+    def _stepped_last(self, unit: Array, state: Any) -> tuple[Array, Any]:
+        """After a step so short that all is linear on the way."""
+        step, known = state.trial - unit, state.beside
+        moved = self.model.box.from_unit(state.trial) - self.model.box.from_unit(unit)
+        near = Known(known.values + jnp.tensordot(moved, known.slopes, 1), known.slopes)
+        state = replace(state, cost=state.cost - state.predicted, gradient=state.gradient + state.normal @ step)
+        return state.trial, with_beside(state, near)
 
 
 def with_beside(state: Any, beside: Any) -> Any:
