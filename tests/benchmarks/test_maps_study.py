@@ -55,6 +55,10 @@ def test_a_scheduler_is_full_where_chunks_are_asked_for_as_fast_as_it_hands_them
     # 1,000 chunks: one core after the other; and 256 cores as fast as the scheduler
     assert found.times == pytest.approx((10_007.0, 632.0, 57.0))
     assert paper.on_paper(row(), 1000, None, texels=1_000_000).times[-1] == pytest.approx(7.0 + 1e4 / 256)
+    # chunks of 0.1 s go five at a time
+    short = paper.on_paper(row(rate=20_000.0), 1000, 20.0, texels=1_000_000)
+    assert short.saturated == pytest.approx(10.0)
+    assert short.times == pytest.approx((107.0, 17.0, 17.0))
 
 
 def test_a_process_has_had_as_much_memory_as_it_has() -> None:
