@@ -42,9 +42,10 @@ of the same map (`processes=1` would be threads). Memory is the most that the sy
 ## Scaling on paper
 
 Empty tasks through the engines on this machine, where {processes} workers share its cores with the scheduler: a
-scheduler with a machine of its own is no slower. dask has them one at a time; of chunks shorter than {enough:g} s it has
-as many together as take that long. *scheduler full at*: so many cores ask for chunks as fast as it hands them out. Times of 4 million texels (2048 x 2048, 2.1 GB of readings): the sample, which one machine fits first, and
-chunks by these rates; cores as fast as these, and a disk that keeps up.
+scheduler with a machine of its own is no slower. dask has them one at a time; of chunks shorter than {enough:g} s it
+has as many together as take that long. *scheduler full at*: so many cores ask for chunks as fast as it hands them out.
+Times of 4 million texels (2048 x 2048, 2.1 GB of readings): the sample, which one machine fits first, and chunks by
+these rates; cores as fast as these, and a disk that keeps up.
 
 {paper}"""
 
