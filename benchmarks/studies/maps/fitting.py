@@ -1,10 +1,12 @@
 """Fits a second beside scipy, how good they are, and what the sample takes that is fitted first."""
 
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,7 +61,7 @@ class Row:
     all that comes before the first chunk; first: of the same and compilation, in a map of one chunk. whole: seconds of
     the chunks of the map, workers' start in it. above: share of texels whose cost is above scipy's beyond rounding,
     below: well below it. width: of pulls, the one furthest from 1. table: largest numerical error of a table at the
-    optimum, in standard deviations, beside a finer solver. peak: bytes of a worker.
+    optimum, in standard deviations, beside a finer solver. peak: bytes of a worker that compiles.
     """
 
     name: str
@@ -128,8 +130,21 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
         chi_square=float(np.nanmean(found.reduced_chi_square)),
         table=table_error(job, found, size.checked),
         words=str(found.attributes["numerical"].get("table", "")),
-        peak=max(task.peak for _, task in done),
+        peak=cold_peak(job, tasks),
     )
+
+
+def cold_peak(job: Job, tasks: Sequence[Task]) -> int:
+    """The most memory that a worker has had which compiles all programs and does a chunk, in bytes."""
+    name = "jax_compilation_cache_dir"
+    kept = jax.config.values[name]
+    with tempfile.TemporaryDirectory(prefix="layerjax-cold-") as folder:
+        jax.config.update(name, folder)  # workers use that of who starts them
+        try:
+            done = [*finished(run_tasks(timed, job, list(tasks[:PROCESSES]), processes=PROCESSES))]
+        finally:
+            jax.config.update(name, kept)
+    return max(task.peak for _, task in done)
 
 
 def _bar_words(case: Case) -> str:

@@ -36,7 +36,8 @@ reading, the largest of {checked} texels.
 
 Rates while all workers are at work: they wait for each other after the first chunk, and the last chunk of the first to
 be done ends it; medians of {rounds} rounds in turns. One worker is a spawned process on a core of its own with chunks
-of the same map (`processes=1` would be threads). Memory is the most that the system has seen of a worker. {missing}
+of the same map (`processes=1` would be threads). Memory is the most that the system has seen of a worker that compiles
+all programs. {missing}
 
 {workers}
 ## Scaling on paper
