@@ -1,7 +1,7 @@
 """Many tasks that do not need each other: by threads of this process, by processes of this machine, or by a cluster.
 
-A function, what all tasks share, and the tasks go in; results come out as they end. A task that fails, or whose worker
-is killed, costs itself alone.
+A function, what all tasks share, and the tasks go in; results come out as they end. A task that fails costs
+itself alone, a worker that is killed what it had in hand, which is done again.
 """
 
 from collections.abc import Callable, Iterable, Iterator

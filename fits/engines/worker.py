@@ -104,7 +104,7 @@ def take_after(double: bool | None, threads: int) -> None:
 
 def _keep_memory() -> None:
     """Do not give memory back to the system after every computation, as dask has its workers do: to be given it again
-    costs a third of a short task."""
+    costs more than short tasks otherwise do beside their work."""
     if "MALLOC_TRIM_THRESHOLD_" in os.environ:
         with suppress(OSError, AttributeError):  # of another C library
             mallopt = ctypes.CDLL(None).mallopt
