@@ -8,12 +8,11 @@ def use_jax() -> None:
     """Double precision, all cores, and compiled programs kept in the user's cache folder from one run to the next."""
     import jax
 
-    from fits.engines.worker import compile_cache, quieten
+    from fits.engines.compile_cache import keep_programs
+    from fits.engines.worker import quieten
     from fits.problem.compiled import devices_of_cores
 
     quieten()
     jax.config.update("jax_enable_x64", True)
     devices_of_cores()
-    if jax.config.values["jax_compilation_cache_dir"] is None and (directory := compile_cache()):
-        jax.config.update("jax_compilation_cache_dir", directory)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILE)
+    keep_programs(LEAST_COMPILE)

@@ -5,28 +5,25 @@ has imported JAX, and is told.
 """
 
 import ctypes
-import hashlib
 import os
 import pickle
-import platform
 import shutil
 import signal
-import socket
 import sys
 import threading
 import traceback
 import warnings
 from contextlib import suppress
-from importlib import metadata
 from multiprocessing import connection, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fits.engines.compile_cache import FOLDER, LEAST, LEAST_COMPILE, compile_cache, keep_programs
 from fits.engines.failures import attempt
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-LEAST_COMPILE = 1.0
-"""Programs that took so many seconds to compile are kept."""
+XLA_THREADS = "NPROC"
+"""Which it reads when it starts its threads."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 KEPT = 1 << 25
@@ -44,41 +41,19 @@ class Raised(NamedTuple):
 
 def environment() -> dict[str, str]:
     """Variables of a worker process that are not those of this one."""
-    found = dict.fromkeys(ONE_THREAD, "1")  # XLA has as many as cores that it may run on; its flags change results
+    found = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # of XLA its flags would change results
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
         found["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax = sys.modules.get("jax")
-    directory: str | None = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    directory: str | None = os.environ.get(FOLDER.upper())
     if jax is not None:
         found["JAX_ENABLE_X64"] = str(int(jax.config.jax_enable_x64))
-        directory = jax.config.values["jax_compilation_cache_dir"]
+        directory = jax.config.values[FOLDER]
         if directory:
-            least = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
-            found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(least)
+            found[LEAST.upper()] = str(jax.config.values[LEAST])
     if not directory and (directory := compile_cache()):
-        found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = str(LEAST_COMPILE)
-    return found | ({"JAX_COMPILATION_CACHE_DIR": directory} if directory else {})
-
-
-def compile_cache() -> str | None:
-    """Where programs compiled by this JAX for this processor are kept, on this host alone; None: they cannot be."""
-    try:
-        key = "\n".join((metadata.version("jaxlib"), socket.gethostname(), _processor()))
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = home / "layerjax" / "compiled" / hashlib.sha256(key.encode()).hexdigest()[:16]
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError, metadata.PackageNotFoundError):  # no home, or one that may not be written to
-        return None
-    return str(folder) if os.access(folder, os.W_OK) else None
-
-
-def _processor() -> str:
-    """Its kind and what it can do."""
-    with suppress(OSError), open("/proc/cpuinfo") as file:
-        for line in file:
-            if line.startswith(("flags", "Features")):
-                return line
-    return f"{platform.machine()} {platform.processor()}"
+        found[LEAST.upper()] = str(LEAST_COMPILE)
+    return found | ({FOLDER.upper(): directory} if directory else {})
 
 
 def precision() -> bool | None:
@@ -94,12 +69,10 @@ def take_after(double: bool | None, threads: int) -> None:
 
     quieten()
     _keep_memory()
-    os.environ.setdefault("NPROC", str(threads))  # XLA reads it when it starts its threads
+    os.environ.setdefault(XLA_THREADS, str(threads))
     if double is not None:
         jax.config.update("jax_enable_x64", double)
-    if not jax.config.values["jax_compilation_cache_dir"] and (directory := compile_cache()):
-        jax.config.update("jax_compilation_cache_dir", directory)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILE)
+    keep_programs()
 
 
 def _keep_memory() -> None:
@@ -126,8 +99,6 @@ def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None)
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
     threading.Thread(target=_end_with_parent, args=(payload,), daemon=True).start()
-    if core is not None:
-        _stay_on(core)
     quieten()
     call: tuple[Any, Any] | None = None
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
@@ -137,6 +108,7 @@ def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None)
             try:
                 if call is None:
                     call = pickle.loads(payload if isinstance(payload, bytes) else Path(payload).read_bytes())
+                    _settle(core)
                 work, shared = call
                 outcome = attempt(work, shared, pickle.loads(task))
             except Exception as error:
@@ -157,6 +129,20 @@ def _packed(outcome: Any) -> bytes:
             return pickle.dumps(Raised(RuntimeError(f"{text}\n{''.join(outcome.error.__notes__)}")))
         text = f"the result of a task, a {type(outcome).__name__}, cannot be pickled: {error}"
         return pickle.dumps(Raised(ValueError(text)))
+
+
+def _settle(core: int | None) -> None:
+    """Stay on a core, with threads that compile for each that there is.
+
+    XLA has as many as cores that it may run on when it first compiles. While one of them compiles what the main thread
+    hands to it, half a gigabyte of that piles up.
+    """
+    if "jax" in sys.modules:
+        import jax
+
+        jax.block_until_ready(jax.jit(jax.numpy.sin)(1.0))
+    if core is not None:
+        _stay_on(core)
 
 
 def _stay_on(core: int) -> None:

@@ -9,6 +9,7 @@ it ended poorly: a second minimum that fits as well is not looked for.
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ import zarr
 import layerjax
 from fits._files import locked, named
 from fits.engines import Failure, connected, run
+from fits.engines.compile_cache import programs_kept
 from fits.engines.processes import end_if_again
 from fits.maps.alternating import require_smoothable, smooth_map
 from fits.maps.chunk_files import Block, grid
@@ -134,7 +136,7 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    if processes > 1 and client is None:
+    if several := processes > 1 and client is None:
         end_if_again()
     settings = Settings(starts, seed, sample, chunk, tabulate, posterior, smooth)
     rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
@@ -143,7 +145,8 @@ def fit_map(
     settings = replace(settings, chunk=min(chunk, max(USUAL_CHUNK, math.prod(found.shape))))
     path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
     require_folder(path)
-    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached:
+    kept = programs_kept() if several else nullcontext()  # workers run the program that has fitted the sample
+    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached, kept:
         return _fitted(path, found, stack, noise, rest, settings, reached, processes, force, progress)
 
 
@@ -172,7 +175,7 @@ def _fitted(
     if GROUP not in root:
         with named(path):
             save(prepared, root)
-    prepared = load(root, found, stack, noise, **rest)  # as a run that is taken up again has it
+    prepared = load(root, found, stack, noise, settings.chunk, **rest)  # as a run that is taken up again has it
     require_smoothable(prepared.problem, settings.smooth)
     job = _job(path, prepared, found, settings, client is None and processes == 1)
     failures = _run(root, job, found, client, processes, progress)
@@ -205,7 +208,7 @@ def _prepared(
     progress: Progress | None,
 ) -> Prepared:
     if root is not None and GROUP in root:
-        return load(root, found, stack, noise, **rest)
+        return load(root, found, stack, noise, settings.chunk, **rest)
     some, places = sampled(found, settings.sample, 1)
     problem = prototype(some, found, stack, noise, **rest)
     if len(problem.names) > MOST_PARAMETERS:

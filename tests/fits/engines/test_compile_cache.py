@@ -1,0 +1,62 @@
+"""Programs that are kept for other processes: where, and that a process is left as it was."""
+
+import os
+import stat
+from pathlib import Path
+
+import jax
+import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+from fits.engines.compile_cache import FOLDER, LEAST, compile_cache, keep_programs, programs_kept
+
+
+@pytest.fixture
+def without(monkeypatch, tmp_path):
+    """A process that keeps nothing, of a user whose cache is empty."""
+    before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    jax.config.update(FOLDER, None)
+    reset_cache()
+    yield tmp_path
+    for name, value in before.items():
+        jax.config.update(name, value)
+    reset_cache()
+
+
+def test_programs_are_kept_within_the_block_alone(without, monkeypatch):
+    monkeypatch.setattr("fits.engines.compile_cache.LEAST_COMPILE", 0.0)
+    least = jax.config.values[LEAST]
+    with programs_kept():
+        folder = Path(jax.config.values[FOLDER])
+        assert folder == Path(compile_cache())
+        assert without in folder.parents
+        jax.block_until_ready(jax.jit(lambda x: x * 3.5 + 1.25)(2.0))
+        kept = list(folder.iterdir())
+        assert kept
+    assert jax.config.values[FOLDER] is None
+    assert jax.config.values[LEAST] == least
+    jax.block_until_ready(jax.jit(lambda x: x * 4.5 + 1.25)(2.0))
+    assert list(folder.iterdir()) == kept
+
+
+def test_a_user_who_keeps_programs_keeps_the_same_place(without, tmp_path):
+    jax.config.update(FOLDER, str(tmp_path / "own"))
+    with programs_kept():
+        assert jax.config.values[FOLDER] == str(tmp_path / "own")
+    assert jax.config.values[FOLDER] == str(tmp_path / "own")
+    assert not keep_programs()
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_home_that_may_not_be_written_to_keeps_nothing(without):
+    without.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    with programs_kept():
+        assert jax.config.values[FOLDER] is None
+
+
+def test_a_home_that_is_a_file_keeps_nothing(without, monkeypatch):
+    (without / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(without / "file"))
+    with programs_kept():
+        assert jax.config.values[FOLDER] is None
