@@ -89,36 +89,56 @@ def known_at(model: Model, vector: Array) -> Known:
 
 
 def descents(
-    model: Model, texels: Texels, number: Array, fresh: Array, units: Array, known: Known | None, which: Array
+    model: Model,
+    texels: Texels,
+    number: Array,
+    fresh: Array,
+    look: Array,
+    units: Array,
+    known: Known | None,
+    which: Array,
 ) -> End:
     """Ends of M texels, (M, ...), of which the first `number` count.
 
     Args:
-        fresh: whether starts are far from minima.
+        fresh: whether starts are far from minima. look: whether each ends where it begins, with what is known there.
         units: starts, (K, P) in the unit box. which: of each texel, (M,).
-        known: what the model says at the starts, (K, ...); None: that is to be found.
+        known: what the model says at the starts, (K, ...), or with `look` anything; None: that is to be found.
     """
-    run = _Run(model, texels, number, fresh, units, known, which)
-    places = run.begun(jnp.arange(BESIDE))
+    run = _Run(model, texels, fresh, units, known, which)
+    places, _ = run.begun(jnp.full(BESIDE, texels.number))  # no texel's
     row, unravel = ravel_pytree(jax.tree.map(lambda part: part[0], _ends(places, places.texel < 0)))
     out = jnp.zeros((texels.number + 1, row.size), row.dtype)
 
-    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        following, places, trial, out = carry
-        places, ended, converged = run.stepped(places, trial)
-        rows = jax.vmap(lambda end: ravel_pytree(end)[0])(_ends(places, converged))
+    def stepped(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        """A step of places whose turn it is; of those that end and make room for a known start it is again."""
+        following, places, trial, turn, out = carry
+        after, ended, converged = run.stepped(places, trial)
+        places = jax.tree.map(partial(_choose, turn), after, places)
+        ended = ((ended | look) & turn) | (following == 0)
+        ends = _ends(places, converged)
+        seen = jax.tree.map(partial(jnp.where, look), trial, ends.known)
+        rows = jax.vmap(lambda end: ravel_pytree(end)[0])(ends._replace(known=seen))
         kept = ended & (places.texel < number)
         for place in range(BESIDE):  # of all others into a last row, which is no texel's
             to = jnp.where(kept[place], places.texel[place], texels.number)
             out = jax.lax.dynamic_update_slice(out, rows[place][None], (to, jnp.zeros_like(to)))
-        new = run.begun(following + jnp.cumsum(ended) - 1)
-        places = jax.tree.map(partial(_choose, ended), new, places)
-        return following + jnp.sum(ended), places, run.tried(places), out
+        new, said = run.begun(following + jnp.cumsum(ended) - 1)
+        places, trial = jax.tree.map(partial(_choose, ended), (new, said), (places, trial))
+        turn = ended & (places.texel < number) & (known is not None) & ~look
+        return following + jnp.sum(ended), places, trial, turn, out
+
+    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        following, places, out = carry
+        begin = following, places, run.tried(places), jnp.ones(BESIDE, bool), out
+        following, places, _, _, out = jax.lax.while_loop(lambda carry: jnp.any(carry[3]), stepped, begin)
+        return following, places, out
 
     def left(carry: tuple[Any, ...]) -> Array:
-        return jnp.any(carry[1].texel < number)
+        return (carry[0] == 0) | jnp.any(carry[1].texel < number)
 
-    *_, out = jax.lax.while_loop(left, body, (jnp.asarray(BESIDE), places, run.tried(places), out))
+    # model and step stand in the program once each, as that takes its time and memory to compile
+    *_, out = jax.lax.while_loop(left, body, (jnp.asarray(0), places, out))
     return jax.vmap(unravel)(out[:-1])
 
 
@@ -153,7 +173,7 @@ class _Run:
     """What all places have in common; methods are of `BESIDE` places at once."""
 
     def __init__(
-        self, model: Model, texels: Texels, number: Array, fresh: Array, units: Array, known: Known | None, which: Array
+        self, model: Model, texels: Texels, fresh: Array, units: Array, known: Known | None, which: Array
     ) -> None:
         self.model, self.texels, self.fresh, self.units, self.which = model, texels, fresh, units, which
         self.levels = model.objective == "likelihood" and model.varying
@@ -163,16 +183,10 @@ class _Run:
             self.options["promise"] = PROMISE
         if self.levels:
             self.options["logarithmic"] = model.logarithmic
-        self.opened = None if known is None else self._opened(number)
 
-    def begun(self, numbers: Array) -> _Place:
-        """Places of texels of these numbers, (B,), at their starts; of known ones after the first step."""
-        at = jnp.minimum(numbers, self.texels.number - 1)
-        if self.opened is not None:
-            place = jax.tree.map(lambda part: part[at], self.opened)
-            beside = jax.tree.map(lambda part: part[self.which[at]], self.known)
-            return place._replace(texel=numbers, state=with_beside(place.state, beside))
-        return jax.vmap(self._start)(numbers, at)
+    def begun(self, numbers: Array) -> tuple[_Place, Known]:
+        """Places of texels of these numbers, (B,), at their starts, and what is known there; zeros where nothing is."""
+        return jax.vmap(self._start)(numbers, jnp.minimum(numbers, self.texels.number - 1))
 
     def stepped(self, places: _Place, trial: Known) -> tuple[_Place, Array, Array]:
         """Places after a step by what is known of their trials; which have ended there, and which converged."""
@@ -191,23 +205,15 @@ class _Run:
         at = jnp.minimum(number, self.texels.number - 1)
         return jax.tree.map(lambda part: part[at], self.texels)
 
-    def _opened(self, number: Array) -> _Place:
-        """The first `number` texels after their first step, without what is known beside them."""
-
-        def one(number: Array) -> _Place:
-            known = jax.tree.map(lambda part: part[self.which[number]], self.known)
-            place, _, _ = self._step(self._start(number, number), known)
-            return place._replace(state=with_beside(place.state, None))
-
-        return first_mapped(one, jnp.arange(self.texels.number), number)
-
-    def _start(self, number: Array, at: Array) -> _Place:
+    def _start(self, number: Array, at: Array) -> tuple[_Place, Known]:
         unit = self.units[self.which[at]]
         own = model_of(self.model, self._row(at))
         sigma = own.near_sigma(self.model.box.from_unit(unit))
         rough = self.fresh if self.levels else jnp.asarray(False)
         like = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
-        return _Place(number, rough, sigma, unit, self._state(unit, Known(like[0], like)))
+        nothing = Known(like[0], like)
+        known = nothing if self.known is None else jax.tree.map(lambda part: part[self.which[at]], self.known)
+        return _Place(number, rough, sigma, unit, self._state(unit, nothing)), known
 
     def _state(self, unit: Array, beside: Known) -> Any:
         state = _SOLVER.init(None, unit, None, self.options, None, beside, frozenset())

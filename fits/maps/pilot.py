@@ -93,11 +93,12 @@ def _fitted(problem: Problem, sample: Texels, starts: int, seed: int, size: int)
     own = sample.wi is not None
     first = np.unique(np.linspace(0, sample.number - 1, min(FIRST, sample.number)).astype(int))
     opened = from_all(problem, points, sample.rows(first), size)
-    ends = search(problem, starts_at(problem, distinct(opened), points[1:], own), sample, size)
+    ends = search(problem, starts_at(problem, distinct(opened), points[1:], own, size), sample, size)
     reduced = reduced_chi_square(ends.found, sample)
     finite = reduced[np.isfinite(reduced)]
     expected = ALLOWED * float(np.quantile(finite, USUAL)) if finite.size else 0.0
-    return Pilot(problem, starts_at(problem, distinct(ends.found), points[1:], own, expected), ends, reduced, None, "")
+    best = starts_at(problem, distinct(ends.found), points[1:], own, size, expected)
+    return Pilot(problem, best, ends, reduced, None, "")
 
 
 def from_all(problem: Problem, points: Floats, texels: Texels, size: int) -> Found:

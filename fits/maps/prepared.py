@@ -257,7 +257,7 @@ def is_whole(root: "zarr.Group") -> bool:
     return True
 
 
-def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None, **rest: Any) -> Prepared:
+def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None, size: int, **rest: Any) -> Prepared:
     """What `save` kept, for the same arguments as those of `prototype`."""
     group: Any = root[GROUP]
     about = dict(group.attrs)
@@ -282,7 +282,7 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
         parts = {name: jnp.asarray(array[f"table/{name}"]) for name in _arrays_of_table()}
         table = Table(**parts, highest=about["highest"])
     problem = completed(problem, readings.geometry is None, table)
-    starts = starts_at(problem, array["vectors"], array["random"], readings.geometry is None, about["expected"])
+    starts = starts_at(problem, array["vectors"], array["random"], readings.geometry is None, size, about["expected"])
     return Prepared(
         problem, starts, shared, about["numerical_error"], about["words"], array["reduced"], array["texels"]
     )

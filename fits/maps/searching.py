@@ -12,7 +12,7 @@ from scipy import stats
 
 from fits.maps.descending import Known
 from fits.maps.solving import Found, all_known, nearest, solve, solve_near
-from fits.maps.texels import Texels, model_of
+from fits.maps.texels import Texels, blank, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -62,13 +62,16 @@ class Ends(NamedTuple):
     restarted: NDArray[np.bool_]
 
 
-def starts_at(problem: Problem, vectors: Floats, random: Floats, own: bool, expected: float = 0.0) -> Starts:
-    """The starts at these vectors (K, P); own: texels have directions of their own."""
+def starts_at(problem: Problem, vectors: Floats, random: Floats, own: bool, size: int, expected: float = 0.0) -> Starts:
+    """The starts at these vectors (K, P); own: texels have directions of their own; size: of the program."""
     if own:
         vectors = vectors[:MOST_PREDICTED]
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(vectors)), float)
     units = np.clip(units, 0.0, 1.0)
-    return Starts(vectors, units, None if own else all_known(problem, units), random, expected)
+    if own:
+        return Starts(vectors, units, None, random, expected)
+    known = all_known(problem, units, blank(problem.model.values.shape), size)
+    return Starts(vectors, units, known, random, expected)
 
 
 def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: Integers | None = None) -> Ends:

@@ -125,7 +125,8 @@ def _opening(
     at = np.clip(np.average(found.vector[:, places], axis=0, weights=weight), problem.low[places], problem.high[places])
     held = _held(problem, places, at)
     begun = from_all(held, points[:, own], sample.rows(first), size)
-    ends = search(held, starts_at(held, distinct(begun), points[1:, own], sample.wi is not None), sample, size)
+    starts_of_all = starts_at(held, distinct(begun), points[1:, own], sample.wi is not None, size)
+    ends = search(held, starts_of_all, sample, size)
     return at, ends.found.vector
 
 

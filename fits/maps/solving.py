@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fits.inference.descent import PROMISE
 from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
 from fits.inference.uncertainty import LEAST_PULL, ON_BOUND
-from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, known_at, linear
+from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, linear
 from fits.maps.texels import Texels, chi_square, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -65,7 +65,7 @@ def solve(problem: Problem, units: Floats, texels: Texels, size: int, fresh: boo
     for first in range(0, len(distinct), TOGETHER):
         some = distinct[first : first + TOGETHER]
         rows = np.flatnonzero((which >= first) & (which < first + TOGETHER))
-        known = all_known(problem, some)
+        known = all_known(problem, some, texels, size)
         parts.append(solve_near(problem, some, known, which[rows] - first, texels.rows(rows), size, fresh))
         order.append(rows)
     back = np.argsort(np.concatenate(order))
@@ -88,19 +88,22 @@ def solve_near(
     return _all_solved(problem, padded(units), Known(*map(padded, known)), which, texels, size, fresh)
 
 
-def all_known(problem: Problem, units: Floats) -> Known:
-    """What the model says at K points (K, P) of the unit box."""
-    found = problem.call(_all_known, padded(units))
-    return Known(*(np.asarray(part, float)[: len(units)] for part in found))
+def all_known(problem: Problem, units: Floats, texels: Texels, size: int) -> Known:
+    """What the model says at K points (K, P) of the unit box; by the program that fits such texels, which is there."""
+    every, shape, together = padded(units), problem.model.values.shape, min(TOGETHER, size)
+    nothing = Known(np.zeros((len(every), *shape)), np.zeros((*every.shape, *shape)))
+    parts = []
+    for first in range(0, len(units), together):
+        which = np.arange(first, min(first + together, len(units)))
+        rows = texels.rows(np.zeros(len(which), int))
+        _, seen = _called(problem, every, which, nothing, rows, size, look=True)
+        parts.append([np.asarray(part, float) for part in seen])
+    return Known(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def padded(array: Floats) -> Floats:
     """With its last row repeated, so that there are few numbers of rows, and programs for them."""
     return np.concatenate([array, np.repeat(array[-1:], -len(array) % TOGETHER, axis=0)])
-
-
-def _all_known(model: Model, units: Array) -> Known:
-    return jax.lax.map(lambda unit: known_at(model, model.box.from_unit(unit)), units, batch_size=BESIDE)
 
 
 def _all_solved(
@@ -114,20 +117,47 @@ def _all_solved(
 ) -> Found:
     parts = []
     for first in range(0, texels.number, size):
-        count = min(size, texels.number - first)
-        places = first + np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)
-        starts, begun = (units, which[places]) if known is not None else (units[places], np.arange(len(places)))
-        given = (starts, known, begun, texels.rows(places), np.asarray(count), np.asarray(fresh))
-        parts.append([np.array(part)[:count] for part in problem.call(_solved, *given)])
+        some = np.arange(first, min(first + size, texels.number))
+        begun = (units, which[some]) if known is not None else (units[some], np.arange(len(some)))
+        found, _ = _called(problem, *begun, known, texels.rows(some), size, fresh)
+        parts.append([np.array(part) for part in found])
     return Found(*map(np.concatenate, zip(*parts, strict=True)))
 
 
+def _called(
+    problem: Problem,
+    units: Floats,
+    which: NDArray[np.int64],
+    known: Known | None,
+    texels: Texels,
+    size: int,
+    fresh: bool = False,
+    look: bool = False,
+) -> tuple[Found, Known]:
+    """Fits of up to `size` texels, and what is known at the ends of the first `TOGETHER` of them."""
+    count = texels.number
+    places = np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)
+    if known is None:
+        units, which = units[places], places
+    given = (units, known, which[places], texels.rows(places), *map(np.asarray, (count, fresh, look)))
+    found, seen = problem.call(_solved, *given)
+    return Found(*(part[:count] for part in found)), Known(*(part[:count] for part in seen))
+
+
 def _solved(
-    model: Model, units: Array, known: Known | None, which: Array, texels: Texels, number: Array, fresh: Array
-) -> Found:
+    model: Model,
+    units: Array,
+    known: Known | None,
+    which: Array,
+    texels: Texels,
+    number: Array,
+    fresh: Array,
+    look: Array,
+) -> tuple[Found, Known]:
     """Fits of the first `number` of the texels; of others whatever."""
-    ends = descents(model, texels, number, fresh, units, known, which)
-    return first_mapped(lambda row: _found(model, *row), (ends, texels), number)
+    ends = descents(model, texels, number, fresh, look, units, known, which)
+    found = first_mapped(lambda row: _found(model, *row), (ends, texels), number)
+    return found, jax.tree.map(lambda part: part[:TOGETHER], ends.known)
 
 
 def _found(model: Model, end: End, texel: Texels) -> Found:

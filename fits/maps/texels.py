@@ -83,6 +83,11 @@ def texels(
     return with_floor(Texels(np.where(used, values, 0.0), variance, variance, used, wi, wo), least)
 
 
+def blank(shape: tuple[int, ...]) -> Texels:
+    """One texel, for a model that is asked what it says whatever the readings: (N, C) zeros."""
+    return texels(np.zeros((1, *shape)))
+
+
 def _squared(numbers: Floats, largest: float) -> Floats:
     """Squares that can still be added to others."""
     with np.errstate(over="ignore"):

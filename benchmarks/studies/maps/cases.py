@@ -88,7 +88,7 @@ def job_of(one: Given, chunk: int) -> tuple[Job, list[Task]]:
     """The work of a map that has been fitted, as its workers had it, and the tasks of all chunks."""
     found = readings(one.values, one.geometry)
     rest = {"transport": one.transport, "scale": None, "objective": "likelihood", "instrument": None}
-    prepared = load(zarr.open_group(one.store, mode="r"), found, one.stack, one.noise, **rest)
+    prepared = load(zarr.open_group(one.store, mode="r"), found, one.stack, one.noise, chunk, **rest)
     error, least = prepared.numerical_error, prepared.least
     job = Job(str(one.store), prepared.problem, prepared.starts, least, chunk, error, found.portable)
     sides = tile(found.shape, chunk)

@@ -1,0 +1,125 @@
+"""Descents of many texels in turns: each against one of its own, and what is known where they begin."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+from fits.data.geometry import Geometry
+from fits.inference.descent import PROMISE, descend
+from fits.maps import descending
+from fits.maps.solving import _solved, all_known, solve
+from fits.maps.texels import blank, texels, with_own_directions
+from fits.problem.problem import Problem
+
+TRANSPORT = lj.SingleScattering()
+SIZE, TEXELS = 16, 21
+LEVEL = 0.02
+
+
+def coat(thickness, albedo):
+    return lj.Stack([lj.Medium(thickness, 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(albedo))
+
+
+@pytest.fixture(scope="module")
+def geometry():
+    every = fits.slices(incidence=[10.0, 60.0])
+    places = np.linspace(0, len(every.wi) - 1, 16).astype(int)
+    return Geometry(every.wi[places], every.wo[places])
+
+
+@pytest.fixture(scope="module")
+def readings(geometry):
+    """Of texels with numbers of their own, the last at a bound: (M, N, 1)."""
+    rng = np.random.default_rng(4)
+    truth = np.append(rng.uniform((0.2, 0.2), (2.0, 0.9), (TEXELS - 1, 2)), [[0.4, 1.0]], axis=0)
+
+    def one(numbers):
+        return lj.evaluate(coat(*numbers), jnp.asarray(geometry.wi), jnp.asarray(geometry.wo), transport=TRANSPORT)
+
+    exact = np.asarray(jax.vmap(one)(truth))
+    return exact * (1.0 + LEVEL * rng.standard_normal(exact.shape))
+
+
+def problem_of(geometry, noise, values=None, objective="likelihood"):
+    stack = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0))
+    values = np.ones((len(geometry.wi), 1)) if values is None else values
+    data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), ("bsdf",))
+    return Problem(stack, data, transport=TRANSPORT, noise=noise, objective=objective)
+
+
+FIXED = fits.Noise(relative=LEVEL, floor=1e-4)
+LEVELS = fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("noise", "objective"),
+    [(FIXED, "likelihood"), (LEVELS, "likelihood"), (FIXED, "cube_root")],
+    ids=["fixed", "free", "named"],
+)
+def test_each_ends_where_a_descent_of_its_own_does(geometry, readings, noise, objective):
+    """From starts far away, and near: within a thousandth of a standard error, however the descent is cut short."""
+    problem, rng = problem_of(geometry, noise, objective=objective), np.random.default_rng(7)
+    rows = texels(readings, least=1e-4)
+    units = rng.uniform(0.2, 0.8, (5, len(problem.names)))[np.arange(TEXELS) % 5]
+    for fresh in (True, False):
+        found = solve(problem, units, rows, SIZE, fresh)
+        for place in range(TEXELS):
+            own = problem_of(geometry, noise, readings[place], objective)
+            alone = own.call(descend, units[place], fresh, 200, PROMISE)
+            assert bool(alone.converged)
+            assert bool(found.converged[place])
+            assert found.cost[place] == pytest.approx(float(alone.cost), abs=1e-7, rel=1e-6)
+            error = np.where(np.isfinite(found.errors[place]), found.errors[place], 1e-3)
+            assert np.all(np.abs(found.vector[place] - np.asarray(alone.vector)) < 1e-3 * error)
+        ends = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(found.vector)))
+        units = np.clip(ends + rng.uniform(-0.02, 0.02, ends.shape), 0.0, 1.0)
+
+
+def test_a_start_at_the_minimum_ends_there(geometry, readings):
+    problem, rows = problem_of(geometry, FIXED), texels(readings, least=1e-4)
+    first = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
+    units = np.clip(np.asarray(jax.vmap(problem.model.box.to_unit)(first.vector)), 0.0, 1.0)
+    again = solve(problem, units, rows, SIZE, fresh=False)
+    assert np.all(again.converged)
+    np.testing.assert_allclose(again.cost, first.cost, rtol=1e-12, atol=1e-8)
+
+
+@pytest.mark.parametrize("count", [1, 40, 70])
+def test_what_is_known_is_what_the_model_says(geometry, readings, count):
+    """Values and derivatives of few points, and of more than a program takes at once; whatever the readings."""
+    problem = problem_of(geometry, LEVELS)
+    units = np.random.default_rng(count).random((count, 3))
+    rows = texels(np.full_like(readings, np.nan), least=1e-4).rows(np.arange(3))
+    for asked in (blank((16, 1)), rows):
+        known = all_known(problem, units, asked, SIZE)
+        assert known.values.shape == (count, 16, 1)
+        assert known.slopes.shape == (count, 3, 16, 1)
+        for place in (0, count - 1):
+            vector = problem.model.box.from_unit(jnp.asarray(units[place]))
+            np.testing.assert_allclose(known.values[place], problem.model.predict(vector), rtol=1e-12)
+            slopes = jax.jacrev(problem.model.predict)(vector)
+            np.testing.assert_allclose(known.slopes[place], np.moveaxis(slopes, -1, 0), rtol=1e-9, atol=1e-12)
+
+
+def test_the_model_stands_in_the_program_once(geometry, readings, monkeypatch):
+    """It takes most of the time and the memory that compiling takes."""
+    traced = []
+    original = descending.known_at
+    monkeypatch.setattr(descending, "known_at", lambda *given: traced.append(given) or original(*given))
+    model, rows = problem_of(geometry, FIXED).model, texels(readings, least=1e-4).rows(np.arange(SIZE))
+    known = descending.Known(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
+    given = np.full((64, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, False, False))
+    jax.make_jaxpr(lambda *given: _solved(model, *given))(*given)
+    assert len(traced) == 1
+
+
+def test_own_directions_begin_with_nothing_known(geometry, readings):
+    """By a program of its own, to the same ends."""
+    problem, rows = problem_of(geometry, FIXED), texels(readings, least=1e-4)
+    common = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
+    wi, wo = (np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo))
+    own = solve(with_own_directions(problem), np.full((TEXELS, 2), 0.5), texels(readings, None, 1e-4, wi, wo), SIZE)
+    np.testing.assert_allclose(own.cost, common.cost, rtol=1e-9, atol=1e-6)
