@@ -15,6 +15,8 @@ from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, table, write
 from benchmarks.suite import coated_haze
 from fits.data.measurements import Measurements
+from fits.engines import Failure, run
+from fits.problem.compiled import cores
 from fits.structures.library import Library, Structure, default_library
 from fits.structures.searching import named
 
@@ -72,7 +74,8 @@ this judges the search, not how well a transport describes a material.
 
 {rows}
 *first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
-by more than chance (see `Foresight.surely_behind`). *too complex*: how often such a one has more layers.
+by more than chance (see `Foresight.surely_behind`). *too complex*: how often such a one has more layers. *time*: of a
+search on one core.
 
 The true structure is among the first three in {found} of {repeats} (asked for: {wanted} of {asked}); a more complex one
 is preferred by more than chance in {complex}.
@@ -110,6 +113,7 @@ def study(
     directory: Path = DIRECTORY,
     resume: bool = False,
     repeats: int | None = None,
+    processes: int | None = None,
 ) -> tuple[str, tuple[Path, ...]]:
     """Run it, and write ``structures.json`` and ``.md``; returns the markdown and the paths.
 
@@ -117,15 +121,23 @@ def study(
         quick: 4 materials: a look, no result to quote.
         resume: keep the materials that the directory holds, and run those that it lacks.
         repeats: how many there are to be in all; 40 if None.
+        processes: materials at a time; one for each core if None.
     """
     wanted = repeats or (QUICK if quick else REPEATS)
     path = directory / f"{NAME}.json"
     done = [Repeat(**one) for one in json.loads(path.read_text())["repeats"]] if resume and path.exists() else []
-    for index in range(len(done), wanted):
-        done.append(run_repeat(index))
+    left = sorted(set(range(wanted)) - {one.repeat for one in done})
+    for _, found in run(_work, None, left, processes=processes or cores()):
+        if isinstance(found, Failure):
+            raise ValueError(found.error)
+        done = sorted([*done, found], key=lambda one: one.repeat)
         _save(done, directory)
-        report(f"material {index + 1}/{wanted}: {done[-1]}")
+        report(f"material {len(done)}/{wanted}: {found}")
     return _save(done, directory)
+
+
+def _work(_: None, index: int) -> Repeat:
+    return run_repeat(index)
 
 
 def material(index: int) -> tuple[Structure, Measurements]:

@@ -35,8 +35,8 @@ def test_places_are_counted(tmp_path: Path) -> None:
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(structures, "run_repeat", lambda index: asked.append(index) or repeat(index))
-    structures.study(directory=tmp_path, repeats=2)
-    structures.study(directory=tmp_path, repeats=4, resume=True)
+    structures.study(directory=tmp_path, repeats=2, processes=1)
+    structures.study(directory=tmp_path, repeats=4, resume=True, processes=1)
     assert asked == [0, 1, 2, 3]
 
 
