@@ -227,7 +227,8 @@ def test_a_disk_that_fills_up(
             assert main(words) == 2
             error = capsys.readouterr().err.splitlines()[-1]
             assert error == f"layerjax: error: {out}: no space left on device"
-            assert not list((tmp_path / "disk").rglob("*.partial"))
+            # where one of several files does not fit, zarr tells before its threads have given up the others
+            wait_until(lambda: not list((tmp_path / "disk").rglob("*.partial")))
             done.append(there(out))
         assert done[0] == done[1] == 0 < done[2] < done[3] < 16
         subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path / "disk")], check=True)
