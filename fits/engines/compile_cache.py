@@ -40,7 +40,7 @@ def _processor() -> str:
 def keep_programs(least: float | None = None) -> bool:
     """Have this process keep what takes so many seconds to compile (`LEAST_COMPILE` if None), if it keeps nothing yet.
 
-    Returns whether that is what it does now.
+    Returns whether it kept nothing before, and does now.
     """
     import jax
 

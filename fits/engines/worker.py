@@ -23,7 +23,7 @@ from fits.engines.failures import attempt
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 XLA_THREADS = "NPROC"
-"""Which it reads when it starts its threads."""
+"""A variable that XLA reads when it starts the threads that compute: so many."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 KEPT = 1 << 25
@@ -41,7 +41,7 @@ class Raised(NamedTuple):
 
 def environment() -> dict[str, str]:
     """Variables of a worker process that are not those of this one."""
-    found = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # of XLA its flags would change results
+    found = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # not by XLA_FLAGS, which change results
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
         found["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax = sys.modules.get("jax")

@@ -127,7 +127,8 @@ def fit_map(
         client: a `distributed.Client`, or the address of a scheduler, whose workers see `out` under the same path.
         transport, scale, objective, instrument: as in `fits.fit`; no instrument where texels have own directions.
         starts, seed, sample, chunk, tabulate, posterior, smooth: see `Settings`.
-        processes: 1: threads of this process, one a core; of more each has a core of its own.
+        processes: 1: threads of this process, one a core; of more each has a core of its own, and finds in the user's
+            cache of programs, which is on while this runs, what this process has compiled.
         force: throw away a store of other arguments, and begin anew.
         progress: called with (stage, done, all, note): "sample", "map" and so on.
 

@@ -90,14 +90,13 @@ def solve_near(
 
 def all_known(problem: Problem, units: Floats, texels: Texels, size: int) -> Known:
     """What the model says at K points (K, P) of the unit box; by the program that fits such texels, which is there."""
-    every, shape, together = padded(units), problem.model.values.shape, min(TOGETHER, size)
+    count, shape, together = len(units), problem.model.values.shape, min(TOGETHER, size)
+    every, which, rows = padded(units), np.arange(count), texels.rows(np.zeros(count, int))
     nothing = Known(np.zeros((len(every), *shape)), np.zeros((*every.shape, *shape)))
     parts = []
-    for first in range(0, len(units), together):
-        which = np.arange(first, min(first + together, len(units)))
-        rows = texels.rows(np.zeros(len(which), int))
-        _, seen = _called(problem, every, which, nothing, rows, size, look=True)
-        parts.append([np.asarray(part, float) for part in seen])
+    for first in range(0, count, together):
+        _, seen = _called(problem, every, nothing, which, rows, which[first : first + together], size, look=True)
+        parts.append(seen)
     return Known(*map(np.concatenate, zip(*parts, strict=True)))
 
 
@@ -115,33 +114,32 @@ def _all_solved(
     size: int,
     fresh: bool,
 ) -> Found:
+    every = np.arange(texels.number)
     parts = []
     for first in range(0, texels.number, size):
-        some = np.arange(first, min(first + size, texels.number))
-        begun = (units, which[some]) if known is not None else (units[some], np.arange(len(some)))
-        found, _ = _called(problem, *begun, known, texels.rows(some), size, fresh)
-        parts.append([np.array(part) for part in found])
+        found, _ = _called(problem, units, known, which, texels, every[first : first + size], size, fresh)
+        parts.append(found)
     return Found(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _called(
     problem: Problem,
     units: Floats,
-    which: NDArray[np.int64],
     known: Known | None,
+    which: NDArray[np.int64],
     texels: Texels,
+    some: NDArray[np.int64],
     size: int,
     fresh: bool = False,
     look: bool = False,
 ) -> tuple[Found, Known]:
-    """Fits of up to `size` texels, and what is known at the ends of the first `TOGETHER` of them."""
-    count = texels.number
-    places = np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)
-    if known is None:
-        units, which = units[places], places
-    given = (units, known, which[places], texels.rows(places), *map(np.asarray, (count, fresh, look)))
+    """Fits of some of the texels, at most `size`, and what is known at the ends of the first `TOGETHER` of them."""
+    count = len(some)
+    places = some[np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)]
+    starts, begun = (units, which[places]) if known is not None else (units[places], np.arange(len(places)))
+    given = (starts, known, begun, texels.rows(places), *map(np.asarray, (count, fresh, look)))
     found, seen = problem.call(_solved, *given)
-    return Found(*(part[:count] for part in found)), Known(*(part[:count] for part in seen))
+    return Found(*(np.asarray(part)[:count] for part in found)), Known(*(np.asarray(part)[:count] for part in seen))
 
 
 def _solved(
