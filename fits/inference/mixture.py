@@ -17,7 +17,7 @@ from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import DEGREES_OF_FREEDOM, slope_at_bounds, student, student_draws, student_peak
-from fits.inference.ridge import height, open_directions, ridge
+from fits.inference.ridge import open_directions, ridge
 from fits.inference.uncertainty import local_information
 
 LEAST_PART = 0.01  # of the squared length of an open direction
@@ -56,22 +56,20 @@ class Mixture:
         slope = slope_at_bounds(problem, optimum, held)
         # what is hardly pressed against its bound, and open with others, lies along the ridge
         if held.any():
-            part = np.sum(open_directions(problem, optimum, np.ones_like(held)) ** 2, axis=0)
+            part = np.sum(open_directions(local_information(problem, optimum)[0]) ** 2, axis=0)
             held &= (part < LEAST_PART) | (slope > LOOSE)
-        points, bounds = ridge(problem, optimum, ~held)
-        if len(points) == 1:
+        found = ridge(problem, optimum, ~held)
+        count = len(found.points)
+        if count == 1:
             return None
         reach = np.clip(1.0 / np.maximum(slope, SMALLEST_REACH), SMALLEST_REACH, WIDEST_REACH)
-        bounds = np.concatenate([bounds, np.tile(np.diag(1.0 / reach)[held], (len(points), 1, 1))], axis=1)
-        root = np.empty((len(points), len(held), len(held)))
-        for index, (point, rows) in enumerate(zip(points, bounds, strict=True)):
-            information = local_information(problem, point)[0]
-            information[:, held] = 0.0
-            wide = np.eye(len(held)) / WIDEST_REACH
-            _, values, directions = np.linalg.svd(np.vstack([information, rows, wide]))
-            root[index] = directions.T / values
-        log_weight = np.array([height(problem, point) for point in points]) + np.linalg.slogdet(root)[1]
-        return cls(points, root, log_weight - logsumexp(log_weight), held)
+        data = np.where(held, 0.0, found.rows)
+        at_bound, wide = np.diag(1.0 / reach)[held], np.eye(len(held)) / WIDEST_REACH
+        rows = [data, found.bounds, *(np.tile(part, (count, 1, 1)) for part in (at_bound, wide))]
+        _, values, directions = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
+        root = np.swapaxes(directions, 1, 2) / values[:, None]
+        log_weight = found.height + np.linalg.slogdet(root)[1]
+        return cls(found.points, root, log_weight - logsumexp(log_weight), held)
 
     @classmethod
     def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":

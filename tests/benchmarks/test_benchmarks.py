@@ -84,7 +84,7 @@ def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
         with_peers=False,
         directory=tmp_path / "new",
         forward_size=forward_models.Size(pairs=64, rounds=1, scenes=(CONDUCTOR,), precisions=("float32",)),
-        fitting_size=fitting.Size(rounds=1, many=2, few=1, numpy_steps=20, chain_steps=100),
+        fitting_size=fitting.Size(rounds=1, many=2, few=1, numpy_steps=200, chain_steps=100, samples=64),
     )
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())  # and no temporary file is left
     content = json.loads(paths[0].read_text())

@@ -1,7 +1,7 @@
 """Speed of inference: one fit, many fits and a posterior, beside scipy and emcee on a plain numpy model.
 
-Both sides see the same 2,000 noisy values, the same residuals and the same bounds, and start from the same point. The
-numpy model is written out here and shares nothing with layerjax.
+Both sides see the same noisy values, 2,000 by default, the same residuals and the same bounds, and start from the same
+point. The numpy model is written out here and shares nothing with layerjax.
 """
 
 import time
@@ -24,7 +24,6 @@ from fits.inference.repeats import fit_many
 
 Floats = NDArray[np.float64]
 
-SAMPLES = 2_000
 NOISE = 0.05
 WALKERS = 32
 TRUTH = np.array([0.6, 0.9, 0.35, 0.8, 0.4, 0.3])
@@ -40,6 +39,7 @@ class Size:
 
     rounds: interleaved repeats. many: fits at once; few: of them, those that scipy does. numpy_steps: of the chain on
     the numpy likelihood; chain_steps: the most that ours may take (it stops when it has converged).
+    samples: values that are fitted.
     """
 
     rounds: int
@@ -47,6 +47,7 @@ class Size:
     few: int
     numpy_steps: int
     chain_steps: int = 20_000
+    samples: int = 2_000
 
 
 DEFAULT, QUICK = Size(7, 1024, 20, 3000), Size(3, 256, 6, 600)
@@ -70,7 +71,7 @@ class Row:
 def run(size: Size, report: Callable[[str], None]) -> list[Row]:
     """The rows on fitting and sampling."""
     report("one fit")
-    problem = coated_lobe()
+    problem = coated_lobe(size.samples)
     rows = one_fit(problem, size)
     report(f"{size.many} fits")
     rows.append(many_fits(problem, size))
@@ -103,18 +104,18 @@ def model(p: Floats, wi: Floats, wo: Floats) -> Floats:
     return coat + haze + base / np.pi * np.exp(-crossed - deep)
 
 
-def coated_lobe(seed: int = 0) -> fits.Problem:
-    """2,000 noisy values of the six-parameter material at random directions, and what is free in it."""
-    wi, wo = pairs(SAMPLES, "reflection", seed)
+def coated_lobe(samples: int, seed: int = 0) -> fits.Problem:
+    """Noisy values of the six-parameter material at random directions, and what is free in it."""
+    wi, wo = pairs(samples, "reflection", seed)
     exact = model(TRUTH, wi, wo)
     sigma = NOISE * exact
-    values = exact + sigma * np.random.default_rng(seed + 1).standard_normal(SAMPLES)
+    values = exact + sigma * np.random.default_rng(seed + 1).standard_normal(samples)
     data = fits.Measurements(
         wi=wi,
         wo=wo,
         values=values[:, None],
         sigma=sigma[:, None],
-        mask=np.ones(SAMPLES, bool),
+        mask=np.ones(samples, bool),
         channels=("value",),
     )
     free = [fits.Free(*ends) for ends in zip(START.tolist(), LOW.tolist(), HIGH.tolist(), strict=True)]
@@ -142,7 +143,7 @@ def one_fit(problem: fits.Problem, size: Size) -> list[Row]:
     note = f"cost {ours.cost:.4f} in {ours.iterations} steps, scipy {theirs.cost:.4f} in {theirs.nfev} (+ differences)"
     rows = []
     for way, name, bar in (
-        ("solver", "6-parameter fit of 2,000 samples, with standard errors", Bar(0.35, 0.15)),
+        ("solver", f"6-parameter fit of {size.samples:,} samples, with standard errors", Bar(0.35, 0.15)),
         ("fit", "the same by fits.fit: checks of bounds, open directions, minima, status", None),
     ):
         ratio = float(np.median(seconds[way] / seconds["scipy"]))

@@ -95,7 +95,7 @@ def test_a_ridge_is_followed_from_end_to_end():
     """albedo * scale is the same at every point, and no two neighbours are far apart: in albedo it starts at 0.05."""
     fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
     unit = np.asarray(fitted.problem.model.box.to_unit(jnp.asarray(fitted.vector)), float)
-    points, _ = ridge(fitted.problem, unit, np.ones(2, bool))
+    points = ridge(fitted.problem, unit, np.ones(2, bool)).points
     albedo, scale = points[:, 0], 0.1 * 100.0 ** points[:, 1]
     np.testing.assert_allclose(albedo * scale, fitted.vector.prod(), rtol=0.02)
     ends = np.concatenate([[0.05], np.sort(albedo), [1.0]])
@@ -104,6 +104,29 @@ def test_a_ridge_is_followed_from_end_to_end():
 
 def test_what_is_known_has_no_ridge():
     fitted = fit(PAINT, paint(0), transport=lj.SingleScattering(), starts=2)
-    points, rows = ridge(fitted.problem, np.array([0.5]), np.ones(1, bool))
-    assert points.shape == (1, 1)
-    assert rows.shape == (1, 0, 1)
+    found = ridge(fitted.problem, np.array([0.5]), np.ones(1, bool))
+    assert found.points.shape == (1, 1)
+    assert found.bounds.shape == (1, 0, 1)
+
+
+def test_a_ridge_ends_where_the_model_has_no_value(monkeypatch):
+    """A bent ridge, y = x^2 to a hundredth, whose log-posterior is not a number beyond x = 0.7."""
+    asked = []
+
+    def information(_, unit):
+        asked.append(unit)
+        x, y = unit
+        rows = 100.0 * np.array([[-2.0 * x, 1.0]])
+        distance = 100.0 * (y - x * x)
+        if x > 0.7:
+            return np.full((1, 2), np.nan), np.full(2, np.nan), np.inf
+        return rows, distance * rows[0], 0.5 * distance**2
+
+    monkeypatch.setattr("fits.inference.ridge.local_information", information)
+    found = ridge(None, np.array([0.5, 0.25]), np.ones(2, bool))
+    x, y = found.points.T
+    np.testing.assert_allclose(y, x * x, atol=0.1 / 100.0)  # a tenth of a standard deviation
+    assert x.min() < 0.05
+    assert 0.6 < x.max() <= 0.7
+    np.testing.assert_allclose(found.height, -0.5 * (100.0 * (y - x * x)) ** 2, atol=1e-12)
+    assert len(asked) < 6 * len(found.points)  # every place is looked at once
