@@ -119,7 +119,8 @@ class _Pool:
         weights = np.where(self.inside & np.isfinite(weights), weights, -np.inf)
         if not np.isfinite(weights).any():
             return Weighted(self.positions, weights, np.inf)
-        _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
+        with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
+            _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
         return Weighted(self.positions, weights, float(shape))
 
 
