@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp, softmax
 
 from fits.inference.fit_result import Fit
-from fits.inference.left_out import LeftOut, leave_out
-from fits.inference.marginal_likelihood import Evidence, evidence
+from fits.inference.left_out import LeftOut, leave_out, require_groups
+from fits.inference.marginal_likelihood import Evidence, evidence_of, posterior_draws
 from fits.progress import Progress
 
 WIDEST = 30.0
@@ -54,8 +54,17 @@ class Foresight:
 
 def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
     """Of fits of the same data, by name; each is fitted again without each incidence (see `leave_out`)."""
-    left = {name: leave_out(fit, progress=_named(name, progress)) for name, fit in candidates.items()}
-    return together(left, {name: evidence(fit) for name, fit in candidates.items()})
+    seen = {name: look_closely(fit, _named(name, progress)) for name, fit in candidates.items()}
+    return together(
+        {name: left for name, (left, _) in seen.items()}, {name: found for name, (_, found) in seen.items()}
+    )
+
+
+def look_closely(fit: Fit, progress: Progress | None = None) -> tuple[LeftOut, Evidence]:
+    """What a fit foretells of each incidence without it, and its evidence: by draws of its posterior both."""
+    require_groups(fit)
+    known = posterior_draws(fit)
+    return leave_out(fit, progress=progress, known=known), evidence_of(known)
 
 
 def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> dict[str, Foresight]:

@@ -64,29 +64,42 @@ class Weighted:
         weights = self.log_weights if self.shape < UNRELIABLE else _evened(self.log_weights)
         return self.positions[_chosen(weights, generator, count)]
 
+    def mixture(self, generator: np.random.RandomState, count: int) -> "Mixture | None":
+        """A mixture fitted to so many draws of the posterior; None where it has no value at any."""
+        from fits.inference.mixture import Mixture
+
+        if not np.isfinite(self.log_weights).any():
+            return None
+        return Mixture.through(self.resampled(generator, count), generator)
+
 
 def weighted(
-    fit: Fit, draws: int, generator: np.random.RandomState, *, good: float = FINITE, along_ridge: bool = False
+    fit: Fit,
+    draws: int,
+    generator: np.random.RandomState,
+    *,
+    good: float = FINITE,
+    along_ridge: bool = False,
+    like: "Mixture | None" = None,
 ) -> Weighted:
     """Draws for a fit of a likelihood: as many of each of several approximations, until they will do.
 
     good: the shape that is enough.
     along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians. Else
-        it is asked for where the fit's own approximation will not do.
+        it is asked for where the fit's own approximation will not do, nor what is like it.
+    like: an approximation of a posterior that is like the fit's.
     """
     from fits.inference.mixture import Mixture
 
     ridge = Mixture.of(fit) if along_ridge else None
     pool = _Pool(fit, draws, generator)
     found = pool.add(ridge or Approximation.of(fit))
-    if not along_ridge and not found.is_good(UNRELIABLE) and (ridge := Mixture.of(fit)) is not None:
-        found = pool.add(ridge)
-    for _ in range(ROUNDS):
-        if found.is_good(good) or not np.isfinite(found.log_weights).any():
-            break
-        chosen = _chosen(_evened(found.log_weights), generator, draws)
-        found = pool.add(Mixture.through(found.positions[chosen], generator))
-    return found
+    if not along_ridge and not found.is_good(UNRELIABLE):
+        if like is not None:
+            found = pool.refined(pool.add(like), good)
+        if not found.is_good(UNRELIABLE) and (ridge := Mixture.of(fit)) is not None:
+            found = pool.add(ridge)
+    return pool.refined(found, good)
 
 
 class _Pool:
@@ -122,6 +135,17 @@ class _Pool:
         with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
             _, shape = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
         return Weighted(self.positions, weights, float(shape))
+
+    def refined(self, found: Weighted, good: float) -> Weighted:
+        """What was found, with draws of mixtures fitted to it while it will not do."""
+        from fits.inference.mixture import Mixture
+
+        for _ in range(ROUNDS):
+            if found.is_good(good) or not np.isfinite(found.log_weights).any():
+                break
+            chosen = _chosen(_evened(found.log_weights), self.generator, self.draws)
+            found = self.add(Mixture.through(found.positions[chosen], self.generator))
+        return found
 
 
 def _chosen(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.inference.fit_result import Fit
+from fits.inference.importance import Weighted
 from fits.inference.optimise import refit
-from fits.inference.predicting import predict
+from fits.inference.predicting import foretold
 from fits.problem.left_out import without
 from fits.progress import Progress
 
@@ -57,7 +58,9 @@ class LeftOut:
         return np.array([self.log_density[rows].size for rows in self.rows])
 
 
-def leave_out(fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress | None = None) -> LeftOut:
+def leave_out(
+    fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress | None = None, known: Weighted | None = None
+) -> LeftOut:
     """Fit anew without each incidence, from the best values on, and foretell its readings.
 
     With fewer than three incidences every scan is left out by fifths.
@@ -66,18 +69,13 @@ def leave_out(fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress
         fit: of a likelihood.
         draws, seed: see `predict`.
         progress: called with ("left out", groups done, groups, name).
+        known: draws for the posterior of the fit: those without an incidence are looked for about them.
 
     Raises:
         ValueError: a fit of a named objective, or data of a single group.
     """
-    if not fit.is_posterior:
-        raise ValueError(
-            f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
-        )
-    data = fit.problem.data.used()
-    groups = groups_of(data)
-    if len(groups) < 2:
-        raise ValueError("leave_out: the readings are all of one incidence, and too few to leave some of them out")
+    groups, data = require_groups(fit), fit.problem.data.used()
+    like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
     density, converged = np.empty(data.values.shape), True
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
@@ -85,11 +83,27 @@ def leave_out(fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress
         chosen = np.zeros(len(data), bool)
         chosen[rows] = True
         found = refit(without(fit.problem, chosen), fit.vector)
-        density[rows] = predict(found, data, draws=draws, seed=seed).log_density(data.values)[rows]
+        density[rows] = foretold(found, data, draws=draws, seed=seed, like=like).log_density(data.values)[rows]
         converged &= found.converged
     if progress is not None:
         progress("left out", len(groups), len(groups), "")
     return LeftOut(tuple(groups), tuple(groups.values()), density, converged)
+
+
+def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
+    """Rows of a fit's readings that are left out together, by name.
+
+    Raises:
+        ValueError: as `leave_out`.
+    """
+    if not fit.is_posterior:
+        raise ValueError(
+            f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
+        )
+    groups = groups_of(fit.problem.data.used())
+    if len(groups) < 2:
+        raise ValueError("leave_out: the readings are all of one incidence, and too few to leave some of them out")
+    return groups
 
 
 def groups_of(data: Measurements) -> dict[str, NDArray[np.int64]]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
-from fits.inference.importance import UNRELIABLE, weighted
+from fits.inference.importance import UNRELIABLE, Weighted, weighted
 
 DRAWS = 1000
 
@@ -45,7 +45,16 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """
     if not fit.is_posterior:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
-    found = weighted(fit, draws, np.random.RandomState(seed), along_ridge=True)
+    return evidence_of(posterior_draws(fit, draws, seed))
+
+
+def posterior_draws(fit: Fit, draws: int = DRAWS, seed: int = 0) -> Weighted:
+    """What the evidence of a fit is the mean of."""
+    return weighted(fit, draws, np.random.RandomState(seed), along_ridge=True)
+
+
+def evidence_of(found: Weighted) -> Evidence:
+    """The evidence by draws of all of a posterior."""
     total = float(logsumexp(found.log_weights))
     if not np.isfinite(total):
         return Evidence(-np.inf, np.inf, np.inf)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,9 @@ from fits.problem.logarithm import softness as soft
 from fits.problem.model import Model
 from fits.problem.nodes import places
 from fits.problem.problem import polar_angles
+
+if TYPE_CHECKING:
+    from fits.inference.mixture import Mixture
 
 LEAST_DRAWS = 400
 """Of the approximation that draws of a posterior are chosen from."""
@@ -70,12 +73,25 @@ def predict(
         raise ValueError(f"draws is {draws}; it must be at least 2")
     if not isinstance(of, Fit | Posterior):
         return of.predict(at, levels=levels, draws=draws, seed=seed)
+    return foretold(of, at, levels=levels, draws=draws, seed=seed)
+
+
+def foretold(
+    of: Fit | Posterior,
+    at: Geometry | Measurements,
+    *,
+    draws: int,
+    seed: int,
+    levels: tuple[float, ...] = LEVELS,
+    like: "Mixture | None" = None,
+) -> Prediction:
+    """`predict`, by an approximation of a posterior that the fit's is like, where there is one (see `weighted`)."""
     fit = of.fit if isinstance(of, Posterior) else of
     if not fit.is_posterior:
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
     generator = np.random.default_rng(seed)
     data = _measurements(fit, at)
-    vectors, shape = _vectors(of, draws, generator)
+    vectors, shape = _vectors(of, draws, generator, like)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
     sigma = _own_sigma(fit, values, data.sigma)
@@ -101,7 +117,9 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
     return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
 
 
-def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) -> tuple[Floats, float]:
+def _vectors(
+    of: Fit | Posterior, draws: int, generator: np.random.Generator, like: "Mixture | None" = None
+) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the shape of their weights."""
     if isinstance(of, Fit) and of.within is not None:  # what other measurements say of its parameters counts too
         whole, name = of.within
@@ -110,7 +128,7 @@ def _vectors(of: Fit | Posterior, draws: int, generator: np.random.Generator) ->
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))
-    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE)
+    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE, like=like)
     positions = jnp.asarray(found.resampled(random, draws))
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
 

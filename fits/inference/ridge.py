@@ -111,7 +111,7 @@ def _brought_back(
         move = -(deviations / axes.values) @ axes.across
         longest = step / max(float(np.linalg.norm(move)), TINY)
         known = _Known.at(problem, _moved(known.place, free, move * min(1.0, longest)))
-    return known, _axes(known, free, dimension).along if np.isfinite(known.cost) else np.empty((0, np.sum(free)))
+    return known, _axes(known, free, dimension).along if np.isfinite(known.cost) else np.empty((0, int(free.sum())))
 
 
 def _axes(known: _Known, free: NDArray[np.bool_], dimension: int) -> _Axes:

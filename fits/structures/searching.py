@@ -21,9 +21,9 @@ import numpy as np
 
 from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
-from fits.inference.foresight import Foresight, together
-from fits.inference.left_out import LeftOut, leave_out
-from fits.inference.marginal_likelihood import Evidence, evidence
+from fits.inference.foresight import Foresight, look_closely, together
+from fits.inference.left_out import LeftOut
+from fits.inference.marginal_likelihood import Evidence
 from fits.inference.optimise import fit_again, fit_problem
 from fits.inference.shared_errors import alone, are_shared, left_open
 from fits.problem.compiled import cores, make_room
@@ -255,7 +255,7 @@ class _Looked:
         found = self.fits[structure] = run(structure, self.plain[structure])
         stored = self.kept.look(structure) if self.kept is not None else None
         if stored is None:
-            stored = leave_out(found), evidence(found)
+            stored = look_closely(found)
             if self.kept is not None:
                 self.kept.keep_look(structure, *stored)
         self.left[structure], self.evidences[structure] = stored

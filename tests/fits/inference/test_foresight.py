@@ -1,5 +1,7 @@
 """What is foretold of what is left out, evidence and weights, beside linear regression, where all of them are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,12 +14,13 @@ from fits.inference.compare import compare
 from fits.inference.fit_result import Fit
 from fits.inference.foresight import foresights, stacking, together
 from fits.inference.left_out import LeftOut, groups_of, leave_out
-from fits.inference.marginal_likelihood import Evidence, evidence
+from fits.inference.marginal_likelihood import Evidence, evidence, posterior_draws
+from fits.inference.mixture import Mixture
 from fits.inference.optimise import fit
 from fits.inference.predicting import predict
 from fits.problem.left_out import without
 from fits.problem.likelihood import Noise
-from fits.problem.parameters import Free, Normal
+from fits.problem.parameters import Free, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.reporting import tables
 from tests.helpers.models import line
@@ -87,6 +90,25 @@ def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
         expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
     assert left.score == pytest.approx(left.by_group.sum())
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_what_leaves_a_ridge_open_is_foretold(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a level times a scale the product alone is known; draws for all readings spare the ridge without some."""
+    data = readings(1)
+    level = replace(data, values=1.0 + data.values - np.asarray(line({"a": 1.0, "b": 0.5}, data.wi, data.wo)))
+    stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
+    open_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(correlated=False), starts=2)
+    draws = posterior_draws(open_fit) if known else None
+    followed: list[Fit] = []
+    monkeypatch.setattr(Mixture, "of", lambda fit, of=Mixture.of: followed.append(fit) or of(fit))
+    left = leave_out(open_fit, draws=2000, known=draws)
+    assert len(followed) == (0 if known else 3)
+    for rows in left.rows:
+        others = np.setdiff1d(np.arange(len(level)), rows)
+        values, width = level.values[:, 0], SIGMA * np.sqrt(1.0 + 1.0 / len(others))
+        expected = stats.norm.logpdf(values[rows], values[others].mean(), width)
+        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
 
 
 def test_few_incidences_are_left_out_by_stretches() -> None:
