@@ -55,6 +55,7 @@ PACKAGES = [
     "layerjax.precompute",
     "fits._files",
     "fits._lazy",
+    "fits.names",
     "fits.progress",
     "fits.data",
     "fits.problem",

@@ -4,15 +4,7 @@ import argparse
 from typing import Any
 
 from fits.cli.numbers import angle, count, level, seed
-
-QUANTITIES = ("brdf", "brdf_cos", "reflectance_factor")
-FORMATS = (
-    *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
-    *("fred", "astm", "pab", "alta", "speos", "ssdd"),
-)
-OBJECTIVES = ("likelihood", "cosine_l2", "log1p_cos", "cube_root")
-EXPORTS = ("rgl", "merl", "zemax", "klems", "openpbr", "csv")
-STRATA = ("bins", "flux")
+from fits.names import FORMATS, OBJECTIVES, QUANTITIES, STRATA
 
 
 def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:

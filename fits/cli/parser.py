@@ -14,7 +14,6 @@ from typing import NoReturn
 from fits.cli.interrupts import raised_again
 from fits.cli.numbers import count, degrees, length, level, seed
 from fits.cli.options import (
-    EXPORTS,
     add_fitting,
     add_force,
     add_format,
@@ -27,6 +26,7 @@ from fits.cli.options import (
 )
 from fits.cli.parser_many import add_fit_many
 from fits.cli.parser_maps import add_fit_map
+from fits.names import EXPORTS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

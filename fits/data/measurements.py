@@ -5,16 +5,13 @@ Values are the BSDF in 1/sr without the cosine. Readers convert once, on the way
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
 from fits.data.selection import Angles, rows_of
-
-Quantity = Literal["brdf", "brdf_cos", "reflectance_factor"]
-QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+from fits.names import QUANTITIES, Quantity
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 
 from fits.data.formats import read
-from fits.data.formats.merl_bins import Strata
 from fits.data.measurements import Measurements
 from fits.data.selection import select
 from fits.data.totals import Totals
+from fits.names import Strata
 
 CHANNEL = "channel="
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,8 +16,7 @@ from fits.exporting.contents import Contents
 from fits.exporting.material import Material, material_of
 from fits.exporting.openpbr import document as openpbr
 from fits.inference.fit_result import Fit
-
-To = Literal["rgl", "merl", "zemax", "klems", "openpbr", "csv"]
+from fits.names import EXPORTS, To
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -76,8 +75,8 @@ def export(
             needs, or for "openpbr" light that passes), a transport that is random or does not carry the stack, an extra
             that is not installed, or a file that is there without `force`.
     """
-    if to not in get_args(To):
-        raise ValueError(f"to is {to!r}, must be one of {', '.join(get_args(To))}")
+    if to not in EXPORTS:
+        raise ValueError(f"to is {to!r}, must be one of {', '.join(EXPORTS)}")
     path = Path(path)
     if path.suffix.lower() != ENDINGS[to]:
         raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")

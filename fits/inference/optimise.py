@@ -21,9 +21,10 @@ from fits.inference.resolution import resolutions
 from fits.inference.shared_errors import alone, counting, points, sharing
 from fits.inference.starts import End, Solver, race, rough_end, run_starts, start_points, unit_of
 from fits.inference.uncertainty import Uncertainty
+from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.joint import Joint
-from fits.problem.likelihood import Noise, Objective
+from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed

@@ -24,7 +24,7 @@ from fits.many.rows import Row, best_of
 from fits.many.searching import Searching
 from fits.many.table import KIND, table_csv, table_json
 from fits.many.work import Job, Task, fit_one
-from fits.problem.likelihood import Objective
+from fits.names import Objective, Strata
 from fits.progress import Progress
 from fits.reporting.results import REPORT
 
@@ -70,7 +70,7 @@ def fit_files(
     format: str | None = None,
     quantity: str | None = None,
     bins: int | Literal["all"] | None = None,
-    strata: Literal["bins", "flux"] | None = None,
+    strata: Strata | None = None,
     mask_retro: float | None = None,
     mask_grazing: float | None = None,
     only: Sequence[str] = (),

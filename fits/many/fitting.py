@@ -11,7 +11,7 @@ from fits.inference.fit_result import Fit
 from fits.inference.optimise import again
 from fits.inference.optimise import fit as run_fit
 from fits.inference.starts import Solver
-from fits.problem.likelihood import Objective
+from fits.names import Objective
 from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress
 from fits.reporting import results

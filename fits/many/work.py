@@ -16,8 +16,8 @@ from fits.many.inputs import SEARCH, STACKS
 from fits.many.origin import ORIGIN, Origin, fingerprint
 from fits.many.rows import Row, row_of
 from fits.many.searching import Searching, search_into
+from fits.names import Objective
 from fits.problem.compiled import make_room
-from fits.problem.likelihood import Objective
 from fits.problem.stack_file import ProblemFile
 from fits.structures.files import IDENTITY
 

@@ -34,8 +34,9 @@ from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sample
 from fits.maps.resuming import begun, require_folder
 from fits.maps.smoothing import Smoothness
 from fits.maps.store import clean, create, left
+from fits.names import Objective
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise, Objective
+from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.problem import with_floor

@@ -12,8 +12,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from fits.names import Objective
 from fits.problem.density import Density
-from fits.problem.likelihood import Objective
 from fits.problem.model import Model, half_squares
 from fits.problem.parameters import Box
 from fits.problem.posed import Assembled, Floats, Posed

@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import gammaln
 
+from fits.names import Objective
 from fits.problem.correlated import Correlated
 from fits.problem.parameters import Free
 from fits.problem.values import shown
 
 Tails = Literal["gaussian", "student"]
-Objective = Literal["likelihood", "cosine_l2", "log1p_cos", "cube_root"]
 DEFAULT_RELATIVE = 0.05
 DEFAULT_FLOOR = 1e-4
 CUBE_ROOT_OFFSET = 1e-6

@@ -16,10 +16,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.names import Objective
 from fits.problem.density import Density
 from fits.problem.instrument import Optics, Setting
 from fits.problem.likelihood import (
-    Objective,
     Tails,
     information_weights,
     level_residual,

@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
+from fits.names import Objective
 from fits.problem.compiled import Static, run
-from fits.problem.likelihood import Objective
 
 Floats = NDArray[np.float64]
 

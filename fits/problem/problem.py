@@ -21,11 +21,12 @@ import layerjax as lj
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences
 from fits.data.totals import Totals
+from fits.names import Objective
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
 from fits.problem.instrument import Instrument, optics_of, setting_of
 from fits.problem.levels import Levels, noise_levels
-from fits.problem.likelihood import Noise, Objective
+from fits.problem.likelihood import Noise
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.posed import Assembled, Posed

@@ -37,8 +37,9 @@ import tomli_w
 
 import layerjax as lj
 from fits._files import write_text
+from fits.names import Objective
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise, Objective
+from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.tables import (
     MATERIAL,

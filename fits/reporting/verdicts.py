@@ -290,7 +290,8 @@ def starts_in_words(fit: "Fit") -> str:
 def minima(fit: "Fit") -> list[str]:
     """How many starts agree on the minimum, and whether another stack explains the data as well."""
     best, total = fit.minima[0], sum(fit.ended.values()) or sum(minimum.count for minimum in fit.minima)
-    sentences = [f"{best.count} of {total} starts reached the best minimum; {len(fit.minima)} minima were found."]
+    found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
+    sentences = [f"{best.count} of {total} starts reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
     if fit.alternatives:

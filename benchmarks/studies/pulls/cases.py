@@ -14,8 +14,8 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
 from fits.data.formats import merl
-from fits.data.formats.merl_bins import Strata
 from fits.data.scans import incidences
+from fits.names import Strata
 from fits.problem.parameters import is_free
 
 Floats = NDArray[np.float64]

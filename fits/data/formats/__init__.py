@@ -24,14 +24,9 @@ from fits.data.formats import (
     zemax,
 )
 from fits.data.formats.csv import write_csv as write_csv
-from fits.data.formats.merl_bins import Strata
 from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements, Quantity, check_quantity
-
-FORMATS = (
-    *("csv", "totals", "rxt", "merl", "rgl", "zemax", "lighttools", "klems", "tensortree"),
-    *("fred", "astm", "pab", "alta", "speos", "ssdd"),
-)
+from fits.data.measurements import Measurements, check_quantity
+from fits.names import FORMATS, Quantity, Strata
 
 _TOLD: dict[str, Callable[[Path, Quantity], Measurements]] = {  # what they hold is told, or else the BSDF
     "zemax": zemax.read,

@@ -18,7 +18,8 @@ import numpy as np
 
 from fits.data.formats._text import Line, plural, read_lines, rows
 from fits.data.geometry import TANGENT_COSINE, Floats
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _HOLDS: dict[str, tuple[Quantity, int, tuple[str, ...] | None]] = {
     "INV_STERADIAN": ("brdf", 0, None),

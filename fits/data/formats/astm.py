@@ -20,7 +20,8 @@ import numpy as np
 
 from fits.data.formats._text import Line, plural, read_lines, rows, within
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _ANGLES = ("theta_i", "phi_i", "theta_s", "phi_s")
 _NOT_VALUES = ("theta", "phi", "beta", "alpha", "psi", "angle", "polar", "cos")

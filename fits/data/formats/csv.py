@@ -26,8 +26,9 @@ from fits._files import write_text
 from fits.data import geometry
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import QUANTITIES, Measurements, Quantity, Source, channel_names, check_quantity, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, check_quantity, to_bsdf
 from fits.data.totals import Totals
+from fits.names import QUANTITIES, Quantity
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
 _NOT_NEGATIVE = (0.0, float("inf"))

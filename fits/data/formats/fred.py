@@ -17,7 +17,8 @@ import numpy as np
 
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import TANGENT_COSINE, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _FORMAT = {"angles": ("deg",), "bsdf": ("value",)}  # FRED also knows angles=sin and bsdf=log
 _TILT, _INCIDENCE, _AZIMUTH = (-90.0, 90.0), (0.0, 90.0), (-360.0, 360.0)

@@ -31,7 +31,8 @@ import numpy as np
 from fits.data.formats._rows import Rows
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import TANGENT_COSINE, Floats, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _LIGHT = 90.0
 """Azimuth of the light in these files."""

@@ -4,7 +4,7 @@ A choice follows a low-discrepancy sequence through the table, with the probabil
 counts for. All readings then stand for equally much, and none needs a weight in a likelihood.
 """
 
-from typing import Literal, cast, get_args
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from scipy.stats import qmc
 
 from fits.data.formats._text import plural
 from fits.data.geometry import Floats
-
-Strata = Literal["bins", "flux"]
+from fits.names import STRATA, Strata
 
 MOST = 100_000
 """Bins of a choice at most: beyond, every bin is as well read."""
@@ -65,8 +64,8 @@ def check(bins: object, strata: object, seed: object) -> None:
     whole = isinstance(bins, int | np.integer) and not isinstance(bins, bool)
     if bins != "all" and not (whole and cast(int, bins) >= 1):
         raise ValueError(f"bins is {bins!r}, must be a whole number of at least 1, or 'all'")
-    if strata not in get_args(Strata):
-        raise ValueError(f"strata is {strata!r}, must be one of {', '.join(get_args(Strata))}")
+    if strata not in STRATA:
+        raise ValueError(f"strata is {strata!r}, must be one of {', '.join(STRATA)}")
     if not (isinstance(seed, int) and seed >= 0):
         raise ValueError(f"seed is {seed!r}, must be a whole number of at least 0")
 

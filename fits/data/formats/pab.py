@@ -16,7 +16,8 @@ import numpy as np
 
 from fits.data.formats._text import Line, plural, read_lines, rows, within
 from fits.data.geometry import TANGENT_COSINE, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _HOLDS: dict[str, Quantity] = {"dsf": "brdf_cos", "bsdf": "brdf", "brdf": "brdf", "btdf": "brdf"}
 _COLOURS = {"cie-y": channel_names(1), "cie-xyz": ("X", "Y", "Z")}

@@ -21,7 +21,8 @@ import numpy as np
 from fits.data.formats._rows import Rows
 from fits.data.formats._text import plural, read_lines, within
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, Floats, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 MAGIC = b"OPTIS"
 _MOST = 100_000

@@ -17,7 +17,8 @@ import numpy as np
 
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, Floats, direction
-from fits.data.measurements import Measurements, Quantity, Source, channel_names, to_bsdf
+from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
+from fits.names import Quantity
 
 _CHOICES = {  # keyword -> the values that the format knows, in lower case
     "source": ("measured",),

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import FORMATS, read
+from fits.data.formats import read
 from fits.data.geometry import direction, slices
+from fits.names import FORMATS
 from tests.helpers.places import COATINGS as DATA
 
 

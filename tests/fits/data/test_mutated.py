@@ -8,8 +8,9 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.data.formats import FORMATS, read
+from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.names import FORMATS
 from tests.helpers.merl import SHAPE
 from tests.helpers.mutations import mutated
 from tests.helpers.places import ROOT
