@@ -16,7 +16,7 @@ from fits.problem.problem import Problem
 OPEN = 0.1  # boxes: a posterior that is wider may bend
 STEP = 0.5  # along a ridge, for every direction that is open
 CLOSE = 0.5  # of a step: points that lie closer are the same
-MOST_POINTS = 128
+MOST_POINTS = 64
 AS_HIGH = 12.0  # in the log-posterior: points that lie lower are left out
 NEXT_TO_BOUND = 0.02  # of the box
 ROUNDS = 5
