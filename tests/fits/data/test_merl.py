@@ -141,6 +141,7 @@ def flakes_path(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_an_exact_table_gives_back_its_stack(flakes_path):
     data = read(flakes_path)
     assert data.mask.all()

@@ -81,6 +81,7 @@ def test_draws_that_may_miss_a_part_are_said_to() -> None:
     assert UNRELIABLE in scores_table(lost, found.problem.data, "").note
 
 
+@pytest.mark.slow
 def test_wrong_models_need_shared_errors() -> None:
     """Of 10 sets whose model is wrong by 10 %: the bands hold what they say, those of noise alone do not."""
     held: dict[bool, list[float]] = {True: [], False: []}

@@ -50,6 +50,7 @@ def test_albedo_times_scale(seed):
     np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
 
 
+@pytest.mark.slow
 def test_trajectories_leap_along_it_and_go_on_from_their_file(tmp_path):
     """By NUTS, from end to end within steps: correlation goes with the leaps that are taken, not with the length."""
     pytest.importorskip("blackjax")

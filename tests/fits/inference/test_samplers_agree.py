@@ -37,7 +37,7 @@ def with_a_free_level() -> Fit:
     return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
 
 
-MADE = [pytest.param(made, marks=pytest.mark.slow) for made in (coated, on_a_bound)] + [with_a_free_level]
+MADE = [pytest.param(made, marks=pytest.mark.slow) for made in (coated, on_a_bound, with_a_free_level)]
 
 
 @pytest.fixture(scope="module", params=MADE, ids=lambda made: made.__name__)

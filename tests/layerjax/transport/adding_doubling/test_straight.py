@@ -41,7 +41,9 @@ def test_agrees_with_the_walk(numbers):
     assert np.all(np.abs(values - walked) < 4.0 * errors + 1e-3 * (walked + 0.1 * np.max(walked)))
 
 
-@pytest.mark.parametrize("above", [(), (lj.Medium(0.4, 0.5),)], ids=["slab", "haze on it"])
+@pytest.mark.parametrize(
+    "above", [pytest.param((), marks=pytest.mark.slow), (lj.Medium(0.4, 0.5),)], ids=["slab", "haze on it"]
+)
 def test_is_the_same_beside_tables(above):
     """Off tables of 12 nodes, to 2e-3 of the values and of a tenth of the largest: as along known directions at 24
     nodes; with haze outside light is never followed, and the walk tells what is true."""

@@ -34,13 +34,16 @@ STRUCTURES = {
     "haze on haze": [HAZE, COAT, HAZE],
     "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
 }
+OFTEN = ("two interfaces", "haze", "dye on a coat", "haze on a coat", "haze alone")
 
 
 def made(stack: Stack) -> HazyBase | StreamedBase:
     return make_hazy(stack) if is_hazy(stack) else make_streamed(stack)
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize(
+    "name", [name if name in OFTEN else pytest.param(name, marks=pytest.mark.slow) for name in STRUCTURES]
+)
 def test_light_from_the_base_is_as_solved(name: str) -> None:
     stack = simplify(lj.Stack(STRUCTURES[name], BASE))
     assert is_hazy(stack) is isinstance(stack.layers[0], lj.Medium)
