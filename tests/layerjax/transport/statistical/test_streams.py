@@ -35,6 +35,7 @@ STRUCTURES = {
     "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
 }
 OFTEN = ("two interfaces", "haze", "dye on a coat", "haze on a coat", "haze alone")
+"""One for each way that the base is reached; the others are slow tests."""
 
 
 def made(stack: Stack) -> HazyBase | StreamedBase:
