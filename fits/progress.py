@@ -15,6 +15,19 @@ class Progress(Protocol):
     def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None: ...
 
 
+def silent(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+    """Shows nothing."""
+
+
+def named(name: str, progress: Progress) -> Progress:
+    """Tells the same, with a name before each stage."""
+
+    def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        progress(f"{name}: {stage}", done, total, info)
+
+    return report
+
+
 class _Pace:
     """Adds to a note how long its stage takes from here on: at its pace so far, less the first step, which compiles."""
 

@@ -9,6 +9,7 @@ from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
+from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -88,15 +89,17 @@ def export(arguments: Namespace) -> int:
         transport = None
     else:
         material, transport = _material(name)
-    written = run_export(
-        material,
-        arguments.out,
-        arguments.to,
-        transport=transport,
-        wavelengths=arguments.wavelengths,
-        name=Path(name).resolve().stem,
-        force=arguments.force,
-    )
+    with show_progress() as progress:
+        written = run_export(
+            material,
+            arguments.out,
+            arguments.to,
+            transport=transport,
+            wavelengths=arguments.wavelengths,
+            name=Path(name).resolve().stem,
+            force=arguments.force,
+            progress=progress,
+        )
     print(f"{written.path}: {Path(name).name}")
     for note in written.notes:
         print(f"{note[0].upper()}{note[1:]}.")

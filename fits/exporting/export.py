@@ -17,6 +17,7 @@ from fits.exporting.material import Material, material_of
 from fits.exporting.openpbr import document as openpbr
 from fits.inference.fit_result import Fit
 from fits.names import EXPORTS, To
+from fits.progress import Progress, silent
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -56,6 +57,7 @@ def export(
     wavelengths: ArrayLike | None = None,
     name: str | None = None,
     force: bool = False,
+    progress: Progress | None = None,
 ) -> Exported:
     """Write a material for renderers or for optical design.
 
@@ -69,6 +71,7 @@ def export(
         wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
         name: what the material is called in the file; None: after the file.
         force: replace a file that is there.
+        progress: called with (stage, done, total, note).
 
     Raises:
         ValueError: the format cannot hold the material (the number of channels, or an axis that breaks the symmetry it
@@ -83,7 +86,7 @@ def export(
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     stack, chosen = _stack_and_transport(material, transport)
-    prepared = material_of(stack, chosen, name or path.stem)
+    prepared = material_of(stack, chosen, name or path.stem, progress or silent)
     written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
     write_bytes(path, written.content, force)
     return Exported(path, to, written.notes)

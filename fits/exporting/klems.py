@@ -56,7 +56,7 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
         for kind in ("Transmission", "Reflection"):
             if kind == "Transmission" and material.opaque:
                 continue
-            matrix, factor = _matrix(material, sign, through=kind == "Transmission")
+            matrix, factor = _matrix(material, f"{kind} {side}".lower(), sign, through=kind == "Transmission")
             blocks[f"{kind} {side}"] = matrix
             rescaled.append(factor)
     notes = [
@@ -83,7 +83,7 @@ def patches(points: tuple[int, int]) -> Patches:
     return Patches(np.array(directions), np.array(projected))
 
 
-def _matrix(material: Material, sign: float, through: bool) -> tuple[Floats, float]:
+def _matrix(material: Material, stage: str, sign: float, through: bool) -> tuple[Floats, float]:
     """Rows of light that leaves, columns of light that comes, (145, 145, C), and by how much sums were off at most.
 
     sign: of the side that the light comes from: 1 for the top.
@@ -95,8 +95,9 @@ def _matrix(material: Material, sign: float, through: bool) -> tuple[Floats, flo
     wo = leave.directions * np.array([-1.0, 1.0, -sign if through else sign])
     matrix = np.empty((count, count, material.channels))
     for column in range(count):
-        pairs = np.broadcast_arrays(wi[column][:, None], wo.reshape(1, -1, 3))
-        values = material.values(*(one.reshape(-1, 3) for one in pairs))
+        material.progress(stage, column, count)
+        light, view = np.broadcast_arrays(wi[column][:, None], wo.reshape(1, -1, 3))
+        values = material.values(light.reshape(-1, 3), view.reshape(-1, 3))
         matrix[:, column] = values.reshape(inside, count, outside, -1).mean(axis=(0, 2))
     shares = material.shares(wi.reshape(-1, 3))[1 if through else 0].reshape(count, inside, -1).mean(axis=1)
     sums = np.einsum("oic,o->ic", matrix, leave.projected)

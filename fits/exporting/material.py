@@ -8,18 +8,22 @@ import numpy as np
 
 import layerjax as lj
 from fits.data.geometry import Floats
+from fits.progress import Progress, silent
 from layerjax.mixture import stacks_of
 from layerjax.phase.contract import Flakes
 
 AT_ONCE = 1 << 16
 """Pairs of directions that are evaluated together."""
 
+VALUES = "values of the material"
+"""What progress calls their evaluation."""
+
 
 @dataclass(frozen=True)
 class Material:
     """A stack, or a mixture of several, prepared for its transport.
 
-    name: what it is called in a file. parts: the stacks.
+    name: what it is called in a file. parts: the stacks. progress: what writers tell how far they are.
     """
 
     name: str
@@ -27,13 +31,16 @@ class Material:
     prepared: lj.Prepared | lj.Mixture
     parts: tuple[lj.Stack, ...]
     channels: int
+    progress: Progress = silent
 
-    def values(self, wi: Floats, wo: Floats) -> Floats:
-        """BSDF in 1/sr without the cosine, (N, C), at pairs of directions (N, 3)."""
-        found = [
-            np.asarray(lj.evaluate(self.prepared, one, other), float)
-            for one, other in zip(_batches(wi), _batches(wo), strict=True)
-        ]
+    def values(self, wi: Floats, wo: Floats, stage: str = "") -> Floats:
+        """BSDF in 1/sr without the cosine, (N, C), at pairs of directions (N, 3). stage: told as it goes; "" not."""
+        found: list[Floats] = []
+        count = -(-len(wi) // AT_ONCE)
+        for one, other in zip(_batches(wi), _batches(wo), strict=True):
+            if stage:
+                self.progress(stage, len(found), count)
+            found.append(np.asarray(lj.evaluate(self.prepared, one, other), float))
         return np.concatenate(found)[: len(wi)]
 
     def shares(self, wi: Floats) -> tuple[Floats, Floats]:
@@ -85,14 +92,17 @@ class Material:
 
 
 def material_of(
-    stack: lj.Stack | lj.Mixture, transport: lj.Transport | Literal["auto"] = "auto", name: str = "stack"
+    stack: lj.Stack | lj.Mixture,
+    transport: lj.Transport | Literal["auto"] = "auto",
+    name: str = "stack",
+    progress: Progress = silent,
 ) -> Material:
     """Prepare a stack; ValueError for placeholders, a map, and a transport that is random or does not carry it."""
     if isinstance(transport, lj.Transport) and transport.random:
         raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
     parts = tuple(stacks_of(stack))
     prepared = lj.prepare(stack, transport)
-    return Material(name, stack, prepared, parts, max(part.channels for part in parts))
+    return Material(name, stack, prepared, parts, max(part.channels for part in parts), progress)
 
 
 def _batches(w: Floats) -> Iterator[Floats]:

@@ -5,7 +5,7 @@ import numpy as np
 from fits.data.formats.merl import CHANNELS, CONVENTION, SCALE, SHAPE, centre, corners_around, half_difference, index_of
 from fits.data.geometry import Floats
 from fits.exporting.contents import Contents, agreement
-from fits.exporting.material import Material
+from fits.exporting.material import VALUES, Material
 
 LIFTED = np.sin(np.radians(0.5))
 """Cosine of a direction that stands for those below the horizon, in bins that lie across it."""
@@ -24,7 +24,8 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     if material.channels not in (1, len(CHANNELS)):
         raise ValueError(f"a MERL table has red, green and blue, this stack has {material.channels} channels")
     table = np.full((len(CHANNELS), *SHAPE), UNMEASURED)
-    for index in np.array_split(np.arange(np.prod(SHAPE)), SLABS):
+    for slab, index in enumerate(np.array_split(np.arange(np.prod(SHAPE)), SLABS)):
+        material.progress(VALUES, slab, SLABS)
         wi, wo = centre(np.stack(np.unravel_index(index, SHAPE), axis=-1))
         reached = np.minimum(wi[:, 2], wo[:, 2]) > -WIDE
         values = material.values(_lifted(wi[reached]), _lifted(wo[reached]))

@@ -16,7 +16,7 @@ from fits.data.formats._text import plural
 from fits.data.formats.rgl_table import RGB, Table, from_u, look_up, table_as_bytes, unit
 from fits.data.geometry import Floats
 from fits.exporting.contents import Contents, agreement
-from fits.exporting.material import Material
+from fits.exporting.material import VALUES, Material
 
 DARK = 1e-3
 """Of the median light, what at least is drawn where there is none."""
@@ -138,6 +138,7 @@ def _filled(material: Material, empty: Table, lobes: list[float]) -> Table:
     values = np.empty((len(empty.phi_i) * len(empty.theta_i), *empty.values.shape[2:]))
     luminance = np.empty((len(values), *values.shape[2:]))
     for place in range(len(values)):
+        material.progress(VALUES, place, len(values))
         phi_i, theta_i, theta_m, phi_m = (one[0] for one in empty.nodes(slice(place, place + 1)))
         wi, half = unit(theta_i, phi_i), unit(theta_m, phi_m + phi_i if empty.isotropic else phi_m)
         facing = half @ wi

@@ -11,7 +11,7 @@ from fits.data.formats.zemax import around_specular
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
 from fits.exporting.colours import XYZ
 from fits.exporting.contents import Contents
-from fits.exporting.material import Material
+from fits.exporting.material import VALUES, Material
 
 INCIDENCE = np.array([0.0, 5, 10, 15, 20, 25, 30, 35, 40, 45, 50, 55, 60, 65, 70, 75, 80, 85])
 ROTATION = np.arange(0.0, 360.0, 15.0)
@@ -34,7 +34,7 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     wo = around_specular(theta_i, phi_i, azimuth, radial, btdf=False)
     above = wo[..., 2] > 0
     values = np.zeros((*above.shape, material.channels))
-    values[above] = material.values(np.broadcast_to(wi[:, :, None, None], wo.shape)[above], wo[above])
+    values[above] = material.values(np.broadcast_to(wi[:, :, None, None], wo.shape)[above], wo[above], VALUES)
     total = material.shares(wi.reshape(-1, 3))[0].reshape(*theta_i.shape, material.channels)
     if material.channels == len(XYZ):
         values, total = values @ XYZ.T, total @ XYZ.T

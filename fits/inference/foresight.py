@@ -12,7 +12,7 @@ from scipy.special import log_softmax, logsumexp, softmax
 from fits.inference.fit_result import Fit
 from fits.inference.left_out import LeftOut, leave_out, require_groups
 from fits.inference.marginal_likelihood import Evidence, evidence_of, posterior_draws
-from fits.progress import Progress
+from fits.progress import Progress, named, silent
 
 WIDEST = 30.0
 """Of the logarithms of ratios of weights."""
@@ -54,7 +54,7 @@ class Foresight:
 
 def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
     """Of fits of the same data, by name; each is fitted again without each incidence (see `leave_out`)."""
-    seen = {name: look_closely(fit, _named(name, progress)) for name, fit in candidates.items()}
+    seen = {name: look_closely(fit, named(name, progress or silent)) for name, fit in candidates.items()}
     return together(
         {name: left for name, (left, _) in seen.items()}, {name: found for name, (_, found) in seen.items()}
     )
@@ -113,13 +113,3 @@ def stacking(log_density: Floats) -> Floats:
         options={"ftol": 1e-14, "gtol": 1e-9},
     )
     return softmax(np.append(found.x, 0.0))
-
-
-def _named(name: str, progress: Progress | None) -> Progress | None:
-    if progress is None:
-        return None
-
-    def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        progress(f"{name}: {stage}", done, total, info)
-
-    return report

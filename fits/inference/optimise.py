@@ -29,7 +29,7 @@ from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed
 from fits.problem.problem import Problem
-from fits.progress import Progress
+from fits.progress import Progress, silent
 
 Floats = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ def fit_problem(
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
-    progress = progress or _silent
+    progress = progress or silent
     found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
     if not sharing(found):
         return found
@@ -148,7 +148,7 @@ def fit_again(
     without = sharing(found) or {name: alone(found.part(name)) for name in problem.problems}
     shared = problem.with_problems({name: counting(problem.problems[name]) for name in without})
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
-    progress = progress or _silent
+    progress = progress or silent
 
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         progress(f"{stage} with shared errors", done, total, info)
@@ -311,7 +311,3 @@ def _status(fit: Fit) -> list[str]:
             f"objective {fit.problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"
         )
     return words
-
-
-def _silent(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-    pass

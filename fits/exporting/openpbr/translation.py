@@ -16,6 +16,7 @@ from fits.exporting.openpbr.start import freed, starts
 from fits.exporting.openpbr.surface import Surface, albedo, evaluate
 from fits.inference.optimise import fit
 from fits.problem.likelihood import Noise
+from fits.progress import named
 
 PAIRS_TO_FIT, VIEWS_TO_JUDGE = 512, 2048
 """Pairs anywhere, and as many near the mirror direction; and directions of view at each incidence, half and half."""
@@ -64,7 +65,15 @@ def translated(material: Material) -> Translation:
     data = Measurements(wi, wo, values, sigma, np.ones(len(wi), bool), names, Source("", "simulated"))
     noise = Noise(relative=0.0, floor=0.0, correlated=False)
     found = [
-        fit(freed(surface, material.channels), data, transport=evaluate, noise=noise, starts=STARTS, seed=0)
+        fit(
+            freed(surface, material.channels),
+            data,
+            transport=evaluate,
+            noise=noise,
+            starts=STARTS,
+            seed=0,
+            progress=named(" and ".join(surface.lobes), material.progress),
+        )
         for surface in starts(material.parts)
     ]
     best = min(found, key=lambda one: one.cost)

@@ -25,9 +25,19 @@ HAZE = lj.Stack([lj.Medium(0.7, [0.9, 0.8, 0.7], lj.HenyeyGreenstein(0.3))])
 
 
 def written(material: object, tmp_path: Path, to: str, **options: object) -> tuple[Path, tuple[str, ...]]:
+    """Also that what takes long says how far it is."""
     path = tmp_path / f"material{ENDINGS[to]}"
-    done = fits.export(material, path, to, **options)  # type: ignore[arg-type]
+    told: list[tuple[str, int, int]] = []
+
+    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        assert total is not None
+        told.append((stage, done, total))
+
+    done = fits.export(material, path, to, progress=progress, **options)  # type: ignore[arg-type]
     assert done.path == path
+    assert bool(told) == (to != "csv")
+    for stage, total in {(stage, total) for stage, _, total in told}:
+        assert [(stage, step, total) for step in range(total)] == [one for one in told if one[0] == stage]
     return path, done.notes
 
 

@@ -225,7 +225,9 @@ def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str]) -> 
     pytest.importorskip("MaterialX")
     (work / "paint.toml").write_text('[base]\nkind = "Lambertian"\nalbedo = [0.5, 0.3, 0.1]\n')
     assert main(["export", "paint.toml", "--to", "openpbr", "--out", "paint.mtlx"]) == 0
-    said = capsys.readouterr().out.splitlines()
+    told = capsys.readouterr()
+    assert told.err.startswith("layerjax: diffuse: fit ")
+    said = told.out.splitlines()
     assert said[0] == "paint.mtlx: paint.toml"
     assert len(said) == 6
     assert read(work / "paint.mtlx")["base_weight"] == 1.0
