@@ -61,9 +61,10 @@ def fit(
     Args:
         stack: holds `Free` where a number is to be fitted; or a `Joint` of problems, in which all else is said.
         data: only the samples that its mask leaves in are used.
-        transport, noise, scale, objective, instrument: see `Problem`. A resolution that the transport leaves open is
-            chosen: coarse for the starts, at the end so fine that the numerical error of the model stays below a tenth
-            of the data's standard deviation, where that is within reach. `Fit.problem` has it.
+        transport: see `Problem`. A resolution that it leaves open is chosen: coarse for the starts, at the end so fine
+            that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
+            within reach. `Fit.problem` has it.
+        noise, scale, objective, instrument: see `Problem`.
         starts: at least 1: the `Free.start` values, then scrambled Sobol points of the box (in the logarithm for
             parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or

@@ -122,13 +122,12 @@ def write_problem(
     instrument: Instrument | None = None,
     force: bool = False,
 ) -> None:
-    """Write a TOML file that `read_problem` reads back to the same.
+    """Write a TOML file that `read_problem` reads back to the same. What is left out of the call is left out there.
 
     Args:
         path: the file.
         stack: may hold `Free`.
-        transport, noise, scale, objective, instrument: see `Problem`; what is left out of the call is left out of the
-            file.
+        transport, noise, scale, objective, instrument: see `Problem`.
         force: replace a file that is there.
 
     Raises:
