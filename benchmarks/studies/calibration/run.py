@@ -1,10 +1,11 @@
-"""Repeats of the calibration: simulated, fitted, sampled and ranked one after the other, each kept as it ends."""
+"""Repeats of the calibration: simulated, fitted, sampled and ranked, each kept as it ends."""
 
 import json
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ from benchmarks.studies.calibration.ranks import (
     spread_draws,
 )
 from fits._files import write_bytes
+from fits.engines import Failure, run
+from fits.problem.compiled import cores
 from fits.reporting.plots.data import as_png
 
 REPEATS, QUICK = 200, 20
@@ -89,6 +92,7 @@ def study(
     transport: lj.Transport | None = None,
     surrogate: bool = True,
     repeats: int | None = None,
+    processes: int | None = None,
 ) -> tuple[str, tuple[Path, ...]]:
     """Run it, and write ``calibration.json``, ``.md`` and ``.png``; returns the markdown and the paths.
 
@@ -102,33 +106,42 @@ def study(
         surrogate: of `fits.sample`, where light is carried in all orders; left to the clock, a rerun might not be the
             same.
         repeats: how many there are to be in all; 200 if None.
+        processes: repeats at a time; one for each core if None.
 
     Raises:
         ValueError: repeats to resume that were run with other settings.
     """
-    case = CASES[posterior]
-    case = case if transport is None else replace(case, transport=transport)
+    case, processes = _case(posterior, transport), processes or cores()
     wanted = repeats or (QUICK if quick else REPEATS)
     surrogate = surrogate and isinstance(case.transport, lj.AddingDoubling)
     settings = settings_of(case, surrogate)
     path = directory / f"{case.name}.json"
     done = _held(path, settings) if resume else []
+    left = sorted(set(range(wanted)) - {one.repeat for one in done})
     surroundings = environment.describe()
-    model = _simulator(case)
-    if len(done) < wanted:
-        report(f"{len(done)} of {wanted} repeats are there; the first to come compiles all programs")
-    for index in range(len(done), wanted):
-        done.append(run_repeat(index, case, surrogate, model))
+    if left:
+        report(f"{len(done)} of {wanted} repeats are there; the first to come compile all programs")
+    for _, found in run(_work, (posterior, transport, surrogate), left, processes=processes):
+        if isinstance(found, Failure):
+            raise ValueError(found.error)
+        done = sorted([*done, found], key=lambda one: one.repeat)
         _save(done, case, settings, surroundings, directory)
-        typical = float(np.median([one.seconds for one in done]))
-        report(
-            f"repeat {index + 1}/{wanted}: {done[-1].steps} steps, {done[-1].seconds:.1f} s, "
-            f"about {typical * (wanted - index - 1) / 60:.0f} min left"
-        )
+        minutes = float(np.median([one.seconds for one in done])) * (wanted - len(done)) / processes / 60
+        report(f"repeat {len(done)}/{wanted}: {found.steps} steps, {found.seconds:.1f} s, about {minutes:.0f} min left")
     text, paths = _save(done, case, settings, surroundings, directory)
     by_label = {case.labels[one]: _ranks(done, place) for place, one in enumerate(case.free)}
     write_bytes(path.with_suffix(".png"), as_png(picture(by_label)), force=True)
     return text, (*paths, path.with_suffix(".png"))
+
+
+def _case(posterior: str, transport: lj.Transport | None) -> Case:
+    case = CASES[posterior]
+    return case if transport is None else replace(case, transport=transport)
+
+
+def _work(settings: tuple[str, lj.Transport | None, bool], index: int) -> Repeat:
+    posterior, transport, surrogate = settings
+    return run_repeat(index, _case(posterior, transport), surrogate, _simulator(posterior, transport))
 
 
 def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any]) -> Repeat:
@@ -209,8 +222,10 @@ def settings_of(case: Case, surrogate: bool) -> dict[str, Any]:
     )
 
 
-def _simulator(case: Case) -> Callable[..., Any]:
+@cache
+def _simulator(posterior: str, other: lj.Transport | None) -> Callable[..., Any]:
     """The transport as the fits use it: one program for all truths, told of the directions and of nothing else."""
+    case = _case(posterior, other)
     transport = case.transport
     known = lj.known_directions(case.readings.wi, case.readings.wo) if transport.uses_known else None
     return jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, known=known))
