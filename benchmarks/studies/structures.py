@@ -121,7 +121,7 @@ def study(
         quick: 4 materials: a look, no result to quote.
         resume: keep the materials that the directory holds, and run those that it lacks.
         repeats: how many there are to be in all; 40 if None.
-        processes: materials at a time; one for each core if None.
+        processes: materials at a time, a process each; one for each core if None. 1: by threads, one a core.
     """
     wanted = repeats or (QUICK if quick else REPEATS)
     path = directory / f"{NAME}.json"

@@ -106,7 +106,7 @@ def study(
         surrogate: of `fits.sample`, where light is carried in all orders; left to the clock, a rerun might not be the
             same.
         repeats: how many there are to be in all; 200 if None.
-        processes: repeats at a time; one for each core if None.
+        processes: repeats at a time, a process each; one for each core if None. 1: by threads, one a core.
 
     Raises:
         ValueError: repeats to resume that were run with other settings.
@@ -118,6 +118,7 @@ def study(
     path = directory / f"{case.name}.json"
     done = _held(path, settings) if resume else []
     left = sorted(set(range(wanted)) - {one.repeat for one in done})
+    at_once = processes if processes > 1 else cores()
     surroundings = environment.describe()
     if left:
         report(f"{len(done)} of {wanted} repeats are there; the first to come compile all programs")
@@ -126,7 +127,7 @@ def study(
             raise ValueError(found.error)
         done = sorted([*done, found], key=lambda one: one.repeat)
         _save(done, case, settings, surroundings, directory)
-        minutes = float(np.median([one.seconds for one in done])) * (wanted - len(done)) / processes / 60
+        minutes = float(np.median([one.seconds for one in done])) * (wanted - len(done)) / at_once / 60
         report(f"repeat {len(done)}/{wanted}: {found.steps} steps, {found.seconds:.1f} s, about {minutes:.0f} min left")
     text, paths = _save(done, case, settings, surroundings, directory)
     by_label = {case.labels[one]: _ranks(done, place) for place, one in enumerate(case.free)}
