@@ -3,11 +3,9 @@
 from dataclasses import dataclass, fields
 
 from fits.problem.parameters import Free, LogNormal, Normal
-from fits.problem.process import Correlation, Process
+from fits.problem.process import Process
 from fits.problem.values import shown
-
-SHORTEST = 1.0
-"""Length of a correlation, in steps of the grid of nodes, at least."""
+from fits.problem.whitening import Correlation
 
 LONGEST = 40.0
 """Of a length whose prior is not given, in degrees. What is alike farther than that is no error of a shape: it would
@@ -55,7 +53,7 @@ class Correlated:
 
 def numbers_of(given: Correlated, process: Process, channels: int) -> Correlation:
     """The numbers of a process, those that are left out filled in."""
-    half, difference = (_length(SHORTEST * float(step)) for step in process.steps)
+    half, difference = (_length(float(shortest)) for shortest in process.shortest)
     own = given.channels
     if own is None:
         own = Free(0.8, 0.0, 0.99) if channels > 1 else 0.0

@@ -31,8 +31,9 @@ from fits.problem.likelihood import (
 )
 from fits.problem.logarithm import logarithm, size
 from fits.problem.parameters import Box, Template
-from fits.problem.process import Correlation, Process, Whitened
+from fits.problem.process import Process, Whitened
 from fits.problem.spectra import with_values
+from fits.problem.whitening import Correlation
 from layerjax._shapes import require_single
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]

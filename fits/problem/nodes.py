@@ -1,49 +1,91 @@
-"""Where a process of model errors lives: angles of half vector and difference, and a grid of nodes over them."""
+"""Where a process of model errors lives: angles of half vector and difference, and nodes among the readings there."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fits.problem.kernel import alike
+
 Floats = NDArray[np.float64]
 
-STEP, LEAST_STEP = 10.0, 0.1
-"""Of the grid of nodes, in degrees, where readings reach far, and at least."""
+SHORTEST, LEAST_SHORTEST = 5.0, 0.05
+"""Reach of errors in degrees that nodes carry where readings reach far, and at least."""
 
-STEPS = 8
+REACHES = 16
 """At least across readings that do not reach far."""
 
-MOST_NODES, COARSER = 300, 1.25
-"""Where there would be more, the grid is made so much coarser until there are not."""
+FEWEST_NODES, SOME_NODES, MOST_NODES = 80, 160, 250
+"""That many readings have at most: the first where there are many channels, the last where there are many readings."""
 
-TINY, FLAT = 1e-9, 1e-6
+A_NODE, MOST_ROWS = 50, 400
+"""Readings that one more node is for, and nodes at most with all their channels."""
+
+LOST, LONGER = 0.02, 1.25
+"""Where nodes leave more of the variance at a reading, the shortest reach is made so much longer until they do not."""
+
+CANDIDATES = 4000
+"""Places of readings that nodes are chosen from, at most."""
+
+SAME = 6
+"""Decimals of a degree in which places are the same."""
+
+TYPICAL = 2.0
+"""Readings are regressed on nodes as if errors reached so many times as far as they do at least."""
+
+TINY, ROUNDING = 1e-9, 1e-10
 
 
-class Grid(NamedTuple):
-    """Nodes are pairs of one of H in the half vector's angle and one of D in that of the difference.
+class Nodes(NamedTuple):
+    """R places among those of N readings.
 
-    half: (H,), in degrees. difference: (D, 3), along and across in degrees, and the side. half_weights,
-    difference_weights: (N, H) and (N, D), of a cubic from nodes to readings, to be multiplied. steps: (2,), in degrees.
+    where: (R, 4), see `places`. weights: (N, R), from nodes to readings. shortest: (2,), what errors reach at least, in
+    degrees of half vector and difference, so that nodes carry them.
     """
 
-    half: Floats
-    difference: Floats
-    half_weights: Floats
-    difference_weights: Floats
-    steps: Floats
+    where: Floats
+    weights: Floats
+    shortest: Floats
 
 
-def grid(wi: ArrayLike, wo: ArrayLike) -> Grid:
-    """Of readings along these directions, (N, 3) each."""
+def nodes(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Nodes:
+    """Of readings along these directions, (N, 3) each: all of their places, where these are few.
+
+    Else those that a pivoted Cholesky decomposition takes first (Fine & Scheinberg 2001): of what errors vary by given
+    those at the nodes before, the place where it is most. The other readings are regressed on them.
+    """
     where = places(wi, wo)
+    _, first = np.unique(np.round(where, SAME), axis=0, return_index=True)
+    those = where[np.sort(first)]
+    those = those[:: -(-len(those) // CANDIDATES)]
+    most = min(SOME_NODES + len(where) // A_NODE, MOST_NODES)
+    most = max(FEWEST_NODES, min(most, MOST_ROWS // channels))
     spans = np.array([np.ptp(where[:, 0]), max(np.ptp(where[:, 1]), np.ptp(where[:, 2]))])
-    steps = np.clip(spans / STEPS, LEAST_STEP, STEP)
-    while True:
-        half_weights, half = _touched(where[:, :1], steps[:1])
-        difference_weights, difference = _touched(where[:, 1:], np.array([steps[1], steps[1], 0.0]))
-        if len(half) * len(difference) <= MOST_NODES:
-            return Grid(half[:, 0], difference, half_weights, difference_weights, steps)
-        steps = COARSER * steps
+    shortest = np.clip(spans / REACHES, LEAST_SHORTEST, SHORTEST)
+    chosen, lost = _pivots(those, shortest, most)
+    while lost > LOST:
+        shortest = LONGER * shortest
+        chosen, lost = _pivots(those, shortest, most)
+    among = those[chosen]
+    typical = TYPICAL * shortest
+    own = alike(among, among, *typical) + ROUNDING * np.eye(len(among))
+    weights = np.linalg.solve(own, alike(among, where, *typical)).T
+    return Nodes(among, weights, shortest)
+
+
+def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
+    """Of places (N, 4) so many at most, in the order of their choice; and the most that they leave of the variance."""
+    rows, left, chosen = np.zeros((most, len(where))), np.ones(len(where)), list[int]()
+    for row in range(min(most, len(where))):
+        pivot = int(np.argmax(left))
+        if left[pivot] < ROUNDING:
+            break
+        rest = alike(where[pivot : pivot + 1], where, *reach)[0] - rows[:row, pivot] @ rows[:row]
+        rows[row] = rest / np.sqrt(left[pivot])
+        left = np.maximum(left - rows[row] ** 2, 0.0)
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    return chosen, float(np.max(left))
 
 
 def places(wi: ArrayLike, wo: ArrayLike) -> Floats:
@@ -66,32 +108,3 @@ def places(wi: ArrayLike, wo: ArrayLike) -> Floats:
         np.where(size > TINY, part / np.maximum(size, TINY), one) for part, one in zip(parts, (1.0, 0.0), strict=True)
     )
     return np.stack([tilt, apart * along, apart * across, side], axis=-1)
-
-
-def _touched(where: Floats, steps: Floats) -> tuple[Floats, Floats]:
-    """Weights (N, R) from the nodes that readings (N, K) touch, and these, (R, K); a step of 0: labels, no angles."""
-    entries: dict[tuple[int, ...], int] = {}
-    rows, columns, values = [], [], []
-    flat = (np.ptp(where, axis=0) < FLAT) | (steps == 0.0)
-    scaled = np.where(flat, 0.0, where / np.where(flat, 1.0, steps))
-    first = np.floor(scaled).astype(int)
-    for offsets in np.ndindex(*(1 if level else 4 for level in flat)):
-        offset = np.where(flat, 0, np.array(offsets) - 1)
-        weight = np.prod(np.where(flat, 1.0, _cubic(scaled - first - offset)), axis=-1)
-        for row in np.flatnonzero(weight):
-            label = np.where(steps == 0.0, where[row], first[row] + offset)
-            rows.append(int(row))
-            columns.append(entries.setdefault(tuple(label.astype(int).tolist()), len(entries)))
-            values.append(float(weight[row]))
-    weights = np.zeros((len(where), len(entries)))
-    np.add.at(weights, (rows, columns), values)
-    keys = np.array(list(entries), float).reshape(len(entries), -1)
-    return weights, np.where(flat & (steps != 0.0), where[0], keys * np.where(steps == 0.0, 1.0, steps))
-
-
-def _cubic(x: Floats) -> Floats:
-    """Cubic convolution (Keys 1981): what a node counts at a distance of x steps."""
-    x = np.abs(x)
-    near = 1.5 * x**3 - 2.5 * x**2 + 1.0
-    far = -0.5 * x**3 + 2.5 * x**2 - 4.0 * x + 2.0
-    return np.where(x < 1.0, near, np.where(x < 2.0, far, 0.0))

@@ -147,7 +147,7 @@ def _assemble(problem: Problem) -> Assembled:
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
     levels = noise_levels(with_floor(problem.noise, problem.instrument), used)
-    process = make_process(used.wi, used.wo) if problem.noise.correlated else None
+    process = make_process(used.wi, used.wo, used.values.shape[1]) if problem.noise.correlated else None
     if process is not None:
         process = replace(process, gram=levels.gram(process, used.values))
     template, names, free = split(_numbers(problem, levels, process), _parameter_name)

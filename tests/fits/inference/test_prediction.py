@@ -36,7 +36,7 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
     assert process is not None
     assert at is not None
-    white = generator.standard_normal((1, process.half.size, len(process.difference)))
+    white = generator.standard_normal((1, len(process.where)))
     lack = np.asarray(process.drawn(white, at))
     values = exact * (np.exp(lack) + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
