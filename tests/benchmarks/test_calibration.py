@@ -16,6 +16,16 @@ from benchmarks.studies.calibration import cases, ranks, run
 CHEAP = lj.AddingDoubling(orders="first")
 
 
+@pytest.mark.parametrize("count", [1, 4, 9])
+def test_every_parameter_has_its_panel(count: int) -> None:
+    generator = np.random.default_rng(1)
+    labels = [f"number {index}" for index in range(count)]
+    figure = ranks.picture({label: generator.integers(0, ranks.DRAWS + 1, 100) for label in labels})
+    assert [panel.get_title(loc="left") for panel in figure.axes] == labels
+    for panel in figure.axes:
+        assert np.sum(panel.patches[0].get_data().values) == 100
+
+
 @pytest.mark.parametrize(
     ("width", "shift", "uniform"),
     [(1.0, 0.0, True), (0.6, 0.0, False), (1.6, 0.0, False), (1.0, 0.5, False)],

@@ -25,6 +25,9 @@ LEVELS = (0.68, 0.9)
 LEAST_P = 0.01
 BAND = 0.99
 
+COLUMNS = 4
+"""Panels of the picture in a row, at most."""
+
 Ranks = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
@@ -83,13 +86,17 @@ def expected(repeats: int, level: float) -> tuple[float, float]:
 def picture(ranks: Mapping[str, Ranks]) -> Figure:
     """A histogram of ranks for each parameter by its label, with the band that holds 99 % of the bars if uniform."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(2.6 * len(ranks), 2.5), layout="constrained")
-        panels = np.ravel(figure.subplots(1, len(ranks), sharey=True, squeeze=False))
-        for panel, (label, found), colour in zip(panels, ranks.items(), CYCLE, strict=False):
+        columns = min(COLUMNS, len(ranks))
+        rows = -(-len(ranks) // columns)
+        figure = Figure(figsize=(2.6 * columns, 2.5 * rows), layout="constrained")
+        panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+        for panel in panels[len(ranks) :]:
+            panel.remove()
+        for panel, (label, found) in zip(panels, ranks.items(), strict=False):
             counts = _counts(found)
             edges = np.linspace(0, DRAWS + 1, len(counts) + 1)
             low, high = stats.binom.interval(BAND, len(found), 1 / len(counts))
-            panel.stairs(counts, edges, fill=True, color=colour, alpha=0.75)
+            panel.stairs(counts, edges, fill=True, color=CYCLE[0], alpha=0.75)
             for level in (low, high):
                 panel.axhline(level, color=INK, linewidth=0.8, linestyle="dashed")
             panel.axhline(len(found) / len(counts), color=INK, linewidth=0.8)
