@@ -132,8 +132,7 @@ class Model(Density):
         return total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
     def standardised_at(self, vector: Array, predicted: Array) -> Array:
-        """(datum - model) / sigma, (N, C), with these parameters and what they predict; or, for a named objective,
-        datum minus model in its own measure."""
+        """(datum - model) / sigma, (N, C); for a named objective: datum minus model in its own measure."""
         if self.objective != "likelihood":
             return -self._named(predicted)
         return (self.values - predicted) / self.sigma_at(vector, predicted)

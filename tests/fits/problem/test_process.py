@@ -102,8 +102,7 @@ def soft(of: Problem) -> np.ndarray:
 
 
 def dense(of: Problem, vector: np.ndarray, nodes: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of all logarithms asinh(x / s), (N C,) and (N C, N C): of the process on nodes, or
-    everywhere."""
+    """Mean and covariance of all logarithms asinh(x / s), (N C,) and (N C, N C): on nodes, or everywhere."""
     model = of.model
     at, process = model.build(jnp.asarray(vector)).correlation, model.process
     assert process is not None
