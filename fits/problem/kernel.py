@@ -18,15 +18,15 @@ def matern(distance: Any, length: Any) -> Any:
 
 def alike(one: Any, other: Any, half: Any, difference: Any) -> Any:
     """Correlation of errors at places (N, 4) and (M, 4), (N, M), that reach so far, in degrees: sides share none."""
-    np = one.__array_namespace__()
+    xp = one.__array_namespace__()
     tilt, along, across, side = (one[:, None, k] - other[None, :, k] for k in range(4))
-    both = matern(np.abs(tilt), half) * matern(np.hypot(along, across), difference)
-    return np.where(side == 0.0, both, 0.0)
+    both = matern(xp.abs(tilt), half) * matern(xp.hypot(along, across), difference)
+    return xp.where(side == 0.0, both, 0.0)
 
 
 def log_sizes(where: Any) -> Any:
     """Logarithms, (N,), of by what errors are larger at places (N, 4) than along the normal, at a growth of 1."""
-    np = where.__array_namespace__()
-    angles = np.abs(where[:, 0]), np.hypot(where[:, 1], where[:, 2])
-    first, second = (np.log(np.cos(np.radians(np.minimum(angle, GRAZING)))) for angle in angles)
+    xp = where.__array_namespace__()
+    angles = xp.abs(where[:, 0]), xp.hypot(where[:, 1], where[:, 2])
+    first, second = (xp.log(xp.cos(xp.radians(xp.minimum(angle, GRAZING)))) for angle in angles)
     return -first - second

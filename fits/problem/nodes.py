@@ -16,10 +16,10 @@ REACHES = 16
 """At least across readings that do not reach far."""
 
 FEWEST_NODES, SOME_NODES, MOST_NODES = 80, 160, 250
-"""That many readings have at most: the first where there are many channels, the last where there are many readings."""
+"""Nodes at most: the first where there are many channels, the last where there are many readings."""
 
 A_NODE, MOST_ROWS = 50, 400
-"""Readings that one more node is for, and nodes at most with all their channels."""
+"""Readings that one more node is for; and rows of the matrix, nodes times channels, that more nodes may not lead to."""
 
 LOST, LONGER = 0.02, 1.25
 """Where nodes leave more of the variance at a reading, the shortest reach is made so much longer until they do not."""

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from fits.problem import whitening
 from fits.problem.kernel import alike, log_sizes
 from fits.problem.nodes import nodes
-from fits.problem.whitening import Correlation, Roots, moved, numbers_of, roots_of, triangular_inverse
+from fits.problem.whitening import Correlation, Roots, moved, roots_of, triangular_inverse, vector_of
 
 LEAST = 1e-6
 """Of the information about a number of the process: what is kept of its smallest eigenvalue."""
@@ -63,12 +63,12 @@ class Process(eqx.Module):
 
     def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
         """What is left of residuals z (N, C) in units of the noise; relative: as for `gram_of`."""
-        numbers = numbers_of(at, z.shape[-1])
+        numbers = vector_of(at, z.shape[-1])
         return Whitened(*whitening.whitened(numbers, self.where, self.weights, self.gram, z, relative))
 
     def drawn(self, white: Array, at: Correlation) -> Array:
         """Errors of the readings, (N, C), from standard normal numbers (C, R)."""
-        roots = roots_of(numbers_of(at, len(white)), self.where, len(white))
+        roots = roots_of(vector_of(at, len(white)), self.where, len(white))
         return at.amplitude * self.weights @ whitening.on_nodes(roots, white.reshape(-1)).T
 
     def given_others(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ class Process(eqx.Module):
 
         With M = 1 - B^-1 and E = X + X' (see `whitening`), it is tr(M E M E) / 2.
         """
-        numbers = numbers_of(at, relative.shape[-1])
+        numbers = vector_of(at, relative.shape[-1])
         held = jax.lax.stop_gradient(numbers)
         roots, root = self._factors(relative, Correlation(*held, *[0.0] * (5 - len(held))))
         inverse = triangular_inverse(root)
@@ -115,7 +115,7 @@ class Process(eqx.Module):
     def _factors(self, relative: Array, at: Correlation) -> tuple[Roots, Array]:
         """Roots of the covariances, and of B."""
         gram = self.gram_of(relative) if self.gram is None else self.gram
-        numbers = numbers_of(at, relative.shape[-1])
+        numbers = vector_of(at, relative.shape[-1])
         roots = roots_of(numbers, self.where, relative.shape[-1])
         return roots, whitening.root_of(numbers[0], whitening.unit_square(roots, gram))
 

@@ -49,7 +49,7 @@ class Move(NamedTuple):
     factor: Array
 
 
-def numbers_of(at: Correlation, channels: int) -> Array:
+def vector_of(at: Correlation, channels: int) -> Array:
     """Those of a process that matter, (4,) or (5,)."""
     return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
 
