@@ -1,5 +1,6 @@
 """Error against run time: the norms, the verdicts of a walk, and a tiny run that leaves whole files behind."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -114,8 +115,9 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert rows["coat", "called"]["prepare_seconds"] > 0
     assert 0 < rows["coat", "coarse"]["l2"] < 0.1
     again = tmp_path / "again"
+    slower = dataclasses.replace(size, batch=64, rounds=2)  # what times alone depend on
     kept = error_vs_time.study(
-        directory=again, cases=[coated], models=models, references=references, size=size, truths=directory
+        directory=again, cases=[coated], models=models, references=references, size=slower, truths=directory
     )
     assert sorted(kept[1]) == sorted(again.iterdir())
     anew = json.loads((again / "error-vs-time.json").read_text())
@@ -125,3 +127,5 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert {row["model"] for row in anew["rows"]} == {row["model"] for row in content["rows"] if row["stack"] == "coat"}
     with pytest.raises(ValueError, match="measured with other settings"):
         error_vs_time.study(directory=directory, cases=[], models=models, references=references, resume=True)
+    with pytest.raises(ValueError, match="measured with other settings"):  # a truth by other walks
+        error_vs_time.study(directory=tmp_path, cases=[], models=models, references=references, truths=directory)

@@ -62,6 +62,9 @@ MODELS = (
 """What is compared. A model joins by a line here."""
 
 
+VALUES = 10_000
+"""Of a stack, that times are quoted for: so many at a time, what the stack costs once spread over them."""
+
 STEP = 8.0
 """A step of a model costs up to so many times the one before."""
 
@@ -75,7 +78,7 @@ class Size:
     one tells.
     """
 
-    batch: int = 2048
+    batch: int = VALUES
     walked_opaque: int = 15
     walked_transmitting: int = 20
     rounds: int = 5

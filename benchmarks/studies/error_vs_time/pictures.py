@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from benchmarks.studies.error_vs_time.models import Model, Row
-from benchmarks.studies.error_vs_time.tables import VALUES, amortised, floored
+from benchmarks.studies.error_vs_time.models import VALUES, Model, Row
+from benchmarks.studies.error_vs_time.tables import amortised, floored
 from benchmarks.studies.error_vs_time.truth import Judged
 from benchmarks.suite.cases import FAMILIES
 from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE

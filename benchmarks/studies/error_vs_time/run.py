@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,17 @@ from benchmarks.measuring.memory import keep_within
 from benchmarks.measuring.writing import DIRECTORY, rounded, write
 from benchmarks.studies.error_vs_time import pictures as error_pictures
 from benchmarks.studies.error_vs_time import tables as error_tables
-from benchmarks.studies.error_vs_time.models import MODELS, Model, Programs, Row, Size, row, run, supports
+from benchmarks.studies.error_vs_time.models import (
+    MODELS,
+    VALUES,
+    Model,
+    Programs,
+    Row,
+    Size,
+    row,
+    run,
+    supports,
+)
 from benchmarks.studies.error_vs_time.truth import (
     REFERENCES,
     Judged,
@@ -30,6 +40,9 @@ from fits.reporting.plots.data import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)
+TIMED = ("batch", "rounds", "values a stack")
+"""Settings that times alone depend on: a truth is the same without."""
+
 QUICK_STEP = 6
 """A quick run takes every so many stacks."""
 
@@ -52,7 +65,7 @@ class Setup:
         return rounded(
             {
                 **asdict(self.size),
-                "values a stack": error_tables.VALUES,
+                "values a stack": VALUES,
                 "floor": accuracy.FLOOR,
                 **references,
             }
@@ -108,7 +121,7 @@ def study(
     setup = Setup(directory, quick, models, references, size, environment.describe())
     held = _held(directory, setup.settings) if resume else Held()
     if truths is not None:
-        other = _held(truths, setup.settings)
+        other = _held(truths, setup.settings, apart_from=TIMED)
         held.kept.update({name: (judged, other.truths[name]) for name, judged in other.judged.items()})
     programs = Programs()
     for index, case in enumerate(cases, start=1):
@@ -173,13 +186,16 @@ def _save(setup: Setup, held: Held) -> tuple[str, tuple[Path, ...]]:
     return text, (*paths, truths)
 
 
-def _held(directory: Path, settings: dict[str, Any]) -> Held:
-    """What the directory holds; ValueError if that was measured with other settings."""
+def _held(directory: Path, settings: Mapping[str, Any], apart_from: Sequence[str] = ()) -> Held:
+    """What the directory holds; ValueError if that was measured with other settings (but for those of some names)."""
     path = directory / f"{NAME}.json"
     if not path.exists():
         return Held()
     content = json.loads(path.read_text())
-    if content["settings"] != settings:
+    before, now = (
+        {key: value for key, value in of.items() if key not in apart_from} for of in (content["settings"], settings)
+    )
+    if before != now:
         raise ValueError(f"{path}: measured with other settings, it cannot be resumed")
     known = {entry.name for entry in fields(Judged)}
     judged = {

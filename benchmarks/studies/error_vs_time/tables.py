@@ -8,12 +8,9 @@ import numpy as np
 import layerjax as lj
 from benchmarks.measuring import accuracy
 from benchmarks.measuring.writing import environment_lines, figure, table
-from benchmarks.studies.error_vs_time.models import Model, Row, Size
+from benchmarks.studies.error_vs_time.models import VALUES, Model, Row, Size
 from benchmarks.studies.error_vs_time.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
 from benchmarks.suite.cases import FAMILIES
-
-VALUES = 10_000
-"""Values of one stack over which the preparation is spread."""
 
 TEXT = """\
 # Error against run time

@@ -13,9 +13,9 @@ import numpy as np
 
 import layerjax as lj
 from benchmarks.measuring.writing import DIRECTORY, figure, table
-from benchmarks.studies.error_vs_time.models import MODELS, Model, Row, supports
+from benchmarks.studies.error_vs_time.models import MODELS, VALUES, Model, Row, supports
 from benchmarks.studies.error_vs_time.run import NAME as MEASURED
-from benchmarks.studies.error_vs_time.tables import VALUES, amortised
+from benchmarks.studies.error_vs_time.tables import amortised
 from benchmarks.studies.side_by_side import picture as side_by_side_picture
 from benchmarks.suite import cases as suite
 from fits._files import write_bytes, write_text
