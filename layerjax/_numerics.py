@@ -74,6 +74,11 @@ def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:
     return functools.reduce(lambda total, coefficient: coefficient + x * total, coefficients[::-1])
 
 
+def unstacked(x: Array) -> list[Array]:
+    """The rows of an array; their derivatives are stacked again, and not a sum of arrays of which most is 0."""
+    return [row.squeeze(0) for row in jax.lax.split(x, (1,) * x.shape[0])]
+
+
 def exprel(x: Array) -> Array:
     """(1 - exp(-x)) / x for x >= 0, equal to 1 at x = 0; relative error of a few units of rounding."""
     small = x < SERIES_LIMIT

@@ -125,29 +125,34 @@ def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, 
     """
     if microfacets == "single":
         total, *facing = _on_plane(cosine, alpha, "mirror", 1 + len(SLICES))
-        return channels.times((at_most(total, 1.0),), _mean_of_facets(facing, SLICES, ior, k))
+        (levels,) = _means_of_facets(facing, (SLICES,), ior, k)
+        return channels.times((at_most(total, 1.0),), levels)
     total, *rest = _on_plane(cosine, alpha, "first", 1 + len(SLICES) + len(REST) + RETURNS)
     facing, returns = rest[:-RETURNS], rest[-RETURNS:]
+    places, weights = DIFFUSE
+    facing += [jnp.full_like(total, place) for place in (*places, 1.0)]
+    sets = SLICES, REST, weights, (1.0,)
+    first, sent_on, mean, normal = _means_of_facets(facing, sets, ior, k)
     total = at_most(total, 1.0)
-    first = _mean_of_facets(facing[: len(SLICES)], SLICES, ior, k)
-    sent_on = _mean_of_facets(facing[len(SLICES) :], REST, ior, k)
-    returned = each(lambda ior, k: returned_share(returns, ior, k), ior, k)
 
-    def reflected(first: Array, sent_on: Array, returned: Array) -> Array:
-        return at_most(at_least(total * first + (1.0 - total) * sent_on * returned, 0.0), 1.0)
+    def reflected(first: Array, sent_on: Array, mean: Array, normal: Array) -> Array:
+        more = (1.0 - total) * sent_on * returned_share(returns, mean, normal)
+        return at_most(at_least(total * first + more, 0.0), 1.0)
 
-    return each(reflected, first, sent_on, returned)
+    return each(reflected, first, sent_on, mean, normal)
 
 
-def returned_share(returns: Sequence[Array], ior: Array, k: Array) -> Array:
+def returned_share(returns: Sequence[Array], mean: Array, normal: Array) -> Array:
     """Share that a metal gives back of the light that its first facets have sent on to others.
 
     A geometric series: at every facet `returns[0]` of it leaves. What these reflect is the mean over all directions,
     changed by so much of what more the metal reflects along the normal: at the second facet, and at all further ones.
+
+    Args:
+        mean, normal: reflectance of the smooth metal in diffuse light, and along the normal.
     """
-    mean = sum(w * fresnel.conductor(jnp.asarray(s, ior.dtype), ior, k) for s, w in zip(*DIFFUSE, strict=True))
-    slope = fresnel.conductor(jnp.ones((), ior.dtype), ior, k) - mean
     leaves, second, further = returns
+    slope = normal - mean
     return (mean + second * slope) * leaves / (1.0 - (mean + further * slope) * (1.0 - leaves))
 
 
@@ -168,10 +173,12 @@ def retained_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array
     The cosine counts from the critical one, in what the width of the lobe is there, and goes on beyond 1.
     """
     width = RETAINED.cosine[1] * alpha * jnp.sqrt((1.0 - critical) * (1.0 + critical) + alpha * alpha)
-    low, high = jnp.arcsinh(critical / width), jnp.arcsinh(1.0 / width)
-    along = (jnp.arcsinh((cosine - critical) / width) + low) / (low + high)
-    last = jnp.arcsinh(STEEPEST / (RETAINED.cosine[1] * alpha))
-    return along, _roughness(alpha, RETAINED.grain), jnp.arcsinh(critical / (RETAINED.cosine[1] * alpha)) / last
+    inverse = 1.0 / width
+    low, high = jnp.arcsinh(critical * inverse), jnp.arcsinh(inverse)
+    along = (jnp.arcsinh((cosine - critical) * inverse) + low) / (low + high)
+    narrow = 1.0 / (RETAINED.cosine[1] * alpha)
+    last = jnp.arcsinh(STEEPEST * narrow)
+    return along, _roughness(alpha, RETAINED.grain), jnp.arcsinh(critical * narrow) / last
 
 
 def dielectric_places(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, Array, Array]:
@@ -190,9 +197,9 @@ def mirror_places(cosine: Array, alpha: Array) -> tuple[Array, Array]:
 
 def index_variable(ior: Array) -> Array:
     """Where an index lies on the axis of its side of 1, in [0, 1]: dense near 1, where it matters to grazing light."""
-    squared = (jnp.log(ior) / math.log(LARGEST_INDEX)) ** 2
+    squared = (jnp.log(ior) * (1.0 / math.log(LARGEST_INDEX))) ** 2
     some = squared > 0
-    return jnp.where(some, jnp.exp(jnp.log(jnp.where(some, squared, 1.0)) / 6.0), 0.0)
+    return jnp.where(some, jnp.exp(jnp.log(jnp.where(some, squared, 1.0)) * (1.0 / 6.0)), 0.0)
 
 
 def _dielectric(cosine: Array, alpha: Array, ior: Array, column: int, columns: int) -> list[Array]:
@@ -215,18 +222,25 @@ def _on_plane(cosine: Array, alpha: Array, name: str, columns: int) -> list[Arra
     return read(load("energies")[name], 0, shape, mirror_places(cosine, alpha), columns, int(np.prod(shape)))
 
 
-def _mean_of_facets(facing: Sequence[Array], shares: Sequence[float], ior: Channels, k: Channels) -> Channels:
-    """Mean reflectance of the slices, by channels; in a loop, that XLA compiles a facet once."""
+def _means_of_facets(
+    facing: Sequence[Array], sets: Sequence[Sequence[float]], ior: Channels, k: Channels
+) -> list[Channels]:
+    """Mean reflectance of facets by their cosines, by channels: of the first ones with the shares of the first set,
+    of the next with those of the next; in a loop, that XLA compiles a facet once."""
 
-    def add(sums: Channels, given: tuple[Array, Array]) -> tuple[Channels, None]:
-        u, share = given
-        levels = each(lambda ior, k: share * fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
-        return tuple(total + level for total, level in zip(sums, levels, strict=True)), None
+    def add(sums: list[Channels], given: tuple[Array, Array]) -> tuple[list[Channels], None]:
+        u, shares = given
+        levels = each(lambda ior, k: fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
+        after = []
+        for total, share in zip(sums, shares, strict=True):
+            after.append(tuple(before + share * level for before, level in zip(total, levels, strict=True)))
+        return after, None
 
     shape = jnp.broadcast_shapes(facing[0].shape, *(value.shape for value in (*ior, *k)))
     zero = (jnp.zeros(shape, facing[0].dtype),) * channels.count(ior, k)
-    sums, _ = jax.lax.scan(jax.checkpoint(add), zero, (jnp.stack(facing), jnp.asarray(shares, facing[0].dtype)))
-    return sums
+    own = np.repeat(np.eye(len(sets)), [len(shares) for shares in sets], axis=0)  # (facets, sets)
+    shares = jnp.asarray(own * np.concatenate(sets)[:, None], facing[0].dtype)
+    return jax.lax.scan(jax.checkpoint(add), [zero] * len(sets), (jnp.stack(facing), shares))[0]
 
 
 def _from_root(root: Array) -> Array:
@@ -238,14 +252,15 @@ def _width(warp: Warp, alpha: Array) -> Array:
 
 
 def _stretched(cosine: Array, critical: Array, width: Array) -> Array:
-    low, high = jnp.arcsinh(critical / width), jnp.arcsinh((1.0 - critical) / width)
-    return (jnp.arcsinh((cosine - critical) / width) + low) / (low + high)
+    inverse = 1.0 / width
+    low, high = jnp.arcsinh(critical * inverse), jnp.arcsinh((1.0 - critical) * inverse)
+    return (jnp.arcsinh((cosine - critical) * inverse) + low) / (low + high)
 
 
 def _roughness(alpha: Array, grain: float) -> Array:
     if grain:
-        return jnp.arcsinh(alpha / grain) / math.asinh(1.0 / grain)
-    return 1.0 - jnp.log(at_least(alpha, LEAST_ALPHA)) / math.log(LEAST_ALPHA)
+        return jnp.arcsinh(alpha * (1.0 / grain)) * (1.0 / math.asinh(1.0 / grain))
+    return 1.0 - jnp.log(at_least(alpha, LEAST_ALPHA)) * (1.0 / math.log(LEAST_ALPHA))
 
 
 def unstretched(place: np.ndarray, critical: np.ndarray, width: np.ndarray) -> np.ndarray:

@@ -1,11 +1,12 @@
 """Uniform cubic splines in a few variables: smooth tables that are cheap to read at every texel, and to differentiate.
 
 A table is read tap by tap from a flat array, which XLA does fast on a CPU (rows of several numbers take four times as
-long), and its partial derivatives come in the same pass: nothing is differentiated through the look-up. Values have
-continuous second derivatives.
+long), in a loop that is compiled for four taps alone, and its partial derivatives come in the same pass: nothing is
+differentiated through the look-up. Values have continuous second derivatives.
 """
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 
 import jax
@@ -13,15 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import at_least, at_most, horner, unstacked
+
+BASIS = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
+"""Weights of the four coefficients that count at a place: of each the polynomial in how far it is beyond the first."""
 
 
 def design(places: np.ndarray, count: int) -> np.ndarray:
     """Values of the splines at places in [0, 1], (places, count)."""
-    first, weights, _ = taps(jnp.asarray(places), count)
+    first, beyond, _ = taps(jnp.asarray(places), count)
     matrix = np.zeros((places.size, count))
     columns = np.asarray(first)[:, None] + np.arange(4)
-    np.add.at(matrix, (np.arange(places.size)[:, None], columns), np.asarray(jnp.stack(weights, axis=-1)))
+    np.add.at(matrix, (np.arange(places.size)[:, None], columns), np.asarray(jnp.stack(weights(beyond), axis=-1)))
     return matrix
 
 
@@ -33,17 +37,20 @@ def fitted(values: np.ndarray, counts: Sequence[int]) -> np.ndarray:
     return values
 
 
-def taps(place: Array, count: Array | int) -> tuple[Array, tuple[Array, ...], tuple[Array, ...]]:
-    """First of the four coefficients that count at a place in [0, 1], their weights, and the slopes of these."""
-    intervals = jnp.asarray(count - 3, place.dtype)
-    x = at_most(at_least(place, 0.0), 1.0) * intervals
-    first = at_most(jnp.floor(x), intervals - 1.0)
-    f = x - first
-    g = 1.0 - f
-    weights = (g * g * g, 4.0 - 3.0 * f * f * (1.0 + g), 4.0 - 3.0 * g * g * (1.0 + f), f * f * f)
-    slopes = (-3.0 * g * g, f * (9.0 * f - 12.0), g * (12.0 - 9.0 * g), 3.0 * f * f)
-    sixth = intervals / 6.0
-    return first.astype(jnp.int32), tuple(w / 6.0 for w in weights), tuple(s * sixth for s in slopes)
+def taps(place: Array, count: Array | int) -> tuple[Array, Array, Array]:
+    """Of a place in [0, 1] the first of the four coefficients that count, how far it is beyond it, and the steps.
+
+    The distance is in steps, so many of which the axis has.
+    """
+    steps = jnp.asarray(count - 3, place.dtype)
+    x = at_most(at_least(place, 0.0), 1.0) * steps
+    first = at_most(jnp.floor(x), steps - 1.0)
+    return first.astype(jnp.int32), x - first, steps
+
+
+def weights(beyond: Array) -> list[Array]:
+    """Of the four coefficients that count, so far beyond the first of them."""
+    return [horner(powers, beyond) for powers in BASIS.tolist()]
 
 
 def read(
@@ -66,22 +73,21 @@ def read(
     dtype = places[0].dtype
     sizes = [jnp.asarray(count, jnp.int32) for count in counts]
     reader = _reader(len(places), columns, apart)
-    return list(reader(jnp.asarray(flat, dtype), jnp.asarray(start, jnp.int32), *sizes, *places))
+    found = reader(jnp.asarray(flat, dtype), jnp.asarray(start, jnp.int32), *sizes, *places)
+    return unstacked(found) if columns > 1 else [found]
 
 
 @functools.cache
-def _reader(axes: int, columns: int, apart: int) -> Callable[..., tuple[Array, ...]]:
+def _reader(axes: int, columns: int, apart: int) -> Callable[..., Array]:
     @jax.custom_jvp
-    def value(flat: Array, start: Array, *rest: Array) -> tuple[Array, ...]:
-        found = _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=False)
-        return tuple(column[0] for column in found)
+    def value(flat: Array, start: Array, *rest: Array) -> Array:
+        return _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=False)[0]
 
     @value.defjvp
-    def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
         flat, start, *rest = primals
-        found = _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=True)
-        changes = tuple(_dot(column[1:], tangents[2 + axes :]) for column in found)
-        return tuple(column[0] for column in found), changes
+        found, *slopes = _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=True)
+        return found, _dot(slopes, tangents[2 + axes :])
 
     return value
 
@@ -94,39 +100,39 @@ def _summed(
     columns: int,
     apart: int,
     sloped: bool,
-) -> list[list[Array]]:
-    """Of each column the value, and (if `sloped`) its derivative along each axis, summed from the last axis on."""
+) -> list[Array]:
+    """Values, (columns, ...) if there are several, and (if `sloped`) their derivatives along each axis."""
     found = [taps(place, count) for place, count in zip(places, counts, strict=True)]
     strides = [jnp.ones_like(counts[0])]
     for count in reversed(counts[1:]):
         strides.insert(0, strides[0] * count)
-    base = start + sum(first * stride for (first, _, _), stride in zip(found, strides, strict=True))
+    corner = start + sum(first * stride for (first, _, _), stride in zip(found, strides, strict=True))
+    corner = jnp.broadcast_to(corner, jnp.broadcast_shapes(*(place.shape for place in places)))
+    if columns > 1:
+        corner = corner + apart * jnp.arange(columns, dtype=corner.dtype).reshape(-1, *(1,) * corner.ndim)
+    *outer, last = (beyond for _, beyond, _ in found)
 
-    def along(axis: int, place: Array) -> list[Array]:
-        """Sums over this axis and those behind it: the value, then its derivative along each of these."""
-        if axis == len(found):
-            return [flat.at[place].get(mode="promise_in_bounds")]
-        _, weights, slopes = found[axis]
-        inner = [along(axis + 1, place + k * strides[axis]) for k in range(4)]
-        total = [_dot(weights, part) for part in zip(*inner, strict=True)]
-        return [total[0], _dot(slopes, [part[0] for part in inner]), *total[1:]] if sloped else total
+    def step(sums: list[Array], given: tuple[Array, Array]) -> tuple[list[Array], None]:
+        tap, basis = given
+        place = corner + sum(tap[axis] * strides[axis] for axis in range(len(outer)))
+        row = [flat.at[place + k].get(mode="promise_in_bounds", wrap_negative_indices=False) for k in range(4)]
+        along = _dot(weights(last), row)
+        weight = [horner([basis[axis, n] for n in range(4)], beyond) for axis, beyond in enumerate(outer)]
+        added = [math.prod(weight) * along]
+        if sloped:
+            for axis, beyond in enumerate(outer):
+                slope = horner([n * basis[axis, n] for n in range(1, 4)], beyond)
+                added.append(math.prod([slope, *weight[:axis], *weight[axis + 1 :]]) * along)
+            slopes = [horner([n * powers[n] for n in range(1, 4)], last) for powers in BASIS.tolist()]
+            added.append(math.prod(weight) * _dot(slopes, row))
+        return [before + more for before, more in zip(sums, added, strict=True)], None
 
-    _, weights, slopes = (jnp.stack(part) if isinstance(part, tuple) else part for part in found[0])
-
-    def step(k: Array, sums: list[list[Array]]) -> list[list[Array]]:
-        after = []
-        for column, total in enumerate(sums):
-            inner = along(1, base + k * strides[0] + column * apart)
-            added = [weights[k] * part for part in inner]
-            if sloped:
-                added.insert(1, slopes[k] * inner[0])
-            after.append([before + more for before, more in zip(total, added, strict=True)])
-        return after
-
-    # the first axis in a loop: else XLA copies the whole look-up into every use of it
-    zero = jnp.zeros(jnp.broadcast_shapes(*(p.shape for p in places)), places[0].dtype)
-    begin = [[zero] * (1 + len(found) if sloped else 1) for _ in range(columns)]
-    return jax.lax.fori_loop(0, 4, step, begin)
+    # all axes but the last in a loop: else XLA copies the whole look-up into every use of it
+    taken = np.stack(np.unravel_index(np.arange(4 ** len(outer)), (4,) * len(outer)), axis=-1)
+    given = jnp.asarray(taken, jnp.int32), jnp.asarray(BASIS[taken], last.dtype)
+    zero = jnp.zeros_like(corner, last.dtype)
+    value, *slopes = jax.lax.scan(step, [zero] * (1 + len(found) if sloped else 1), given)[0]
+    return [value, *(slope * steps for slope, (_, _, steps) in zip(slopes, found, strict=False))]
 
 
 def _dot(weights: Sequence[Array], values: Sequence[Array]) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.optimize import minimize
 
+from layerjax import fresnel
 from layerjax.microsurface import directional_albedo as by_quadrature
 from layerjax.microsurface import energy_tables as tables
 from layerjax.microsurface.energy_tables import (
@@ -136,10 +137,13 @@ def _returns(cosine: Array, alpha: Array, sent_on: Array) -> Array:
     wide = jnp.maximum(alpha, NARROWEST_WALKED)
     c = jnp.clip(cosine * wide / alpha, LEAST_COSINE, 1.0)
     wanted = conductor_multiple_reflectance(*jnp.broadcast_arrays(c, wide, ior, k))
+    places, weights = jnp.asarray(tables.DIFFUSE)
+    mean = weights @ fresnel.conductor(places[:, None], ior, k)
+    normal = fresnel.conductor(jnp.ones(()), ior, k)
     likely = jnp.asarray([0.8, 0.0, 0.0])
 
     def misfit(returns: Array) -> Array:
-        apart = sent_on * (tables.returned_share(tuple(returns), ior, k) - wanted)
+        apart = sent_on * (tables.returned_share(tuple(returns), mean, normal) - wanted)
         return jnp.mean((apart / TOLERATED) ** 2) + jnp.sum((returns - likely) ** 2)
 
     return minimize(misfit, likely, method="BFGS").x

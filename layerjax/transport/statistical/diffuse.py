@@ -28,7 +28,7 @@ from jax import Array
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import index_variable
-from layerjax.microsurface.splines import taps
+from layerjax.microsurface.splines import taps, weights
 from layerjax.quadrature import gauss_legendre, panels
 from layerjax.tables import load
 from layerjax.transport.statistical.variance import bounded_refracted_cosine, roughness, transmission_scale, variance
@@ -267,8 +267,8 @@ def _transmission_parts(table: Table, cosine: Array, alpha: Array, ior: Array) -
 
 def spline(place: Array, coefficients: int) -> tuple[Array, Array]:
     """First of four coefficients of a uniform cubic spline on [0, 1], all their indices, and their weights."""
-    first, weights, _ = taps(place, coefficients)
-    return first[..., None] + np.arange(4), jnp.stack(weights, axis=-1)
+    first, beyond, _ = taps(place, coefficients)
+    return first[..., None] + np.arange(4), jnp.stack(weights(beyond), axis=-1)
 
 
 def _pick(values: np.ndarray, dtype: jnp.dtype, *index: Array) -> Array:

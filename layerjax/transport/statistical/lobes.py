@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, at_most
+from layerjax._numerics import at_least, at_most, unstacked
 from layerjax.channels import Channels, each, per_channel
 from layerjax.microsurface.directional_albedo import Microfacets, is_smooth
 from layerjax.microsurface.energy_tables import conductor_energies, interface_energies, retained_share
@@ -169,18 +169,10 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     widening = variance(alpha) * one
     down = variance(transmission_scale(steep_i, ior, steep_t) * alpha)
     up = variance(transmission_scale(steep_t, 1.0 / ior, steep_i) * alpha)
+    columns = zip(*map(unstacked, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
     return [
-        Element(
-            r12=((r12[k],),),
-            t12=((t12[k],),),
-            r21=((r21[k],),),
-            t21=((t21[k],),),
-            widening=(widening[k],),
-            down=(down[k],),
-            up=(up[k],),
-            jacobian=(jacobian[k],),
-        )
-        for k in range(len(chosen))
+        Element(((r,),), ((t,),), ((r_up,),), ((t_up,),), (wide,), (after_down,), (after_up,), (j,))
+        for r, t, r_up, t_up, wide, after_down, after_up, j in columns
     ]
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax import channels, fresnel
-from layerjax._numerics import at_least, safe_sqrt
+from layerjax._numerics import at_least, safe_sqrt, unstacked
 from layerjax.channels import Channels, each
 from layerjax.directions import Vector
 from layerjax.microsurface.energy_tables import mirror_energy, retained_share, single_reflectance
@@ -172,7 +172,7 @@ def _together(energy: Callable[[Array, Array], Array], lobes: Sequence[_Lobe]) -
     if not widths:
         return [() for _ in lobes]
     cosines, alphas = (jnp.stack(jnp.broadcast_arrays(*part)) for part in zip(*widths, strict=True))
-    values = iter(energy(cosines, alphas))
+    values = iter(unstacked(energy(cosines, alphas)))
     return [tuple(next(values) for _ in lobe.alpha or ()) for lobe in lobes]
 
 

@@ -26,14 +26,12 @@ LEAST_G = 1e-3
 def variance(alpha: Array) -> Array:
     """f(alpha) = alpha^1.1 / (1 - alpha^1.1) (Belcour 2018, Eq. 6)."""
     # Eq. (6)
-    log = EXPONENT * jnp.log(at_most(at_least(alpha, NARROWEST), WIDEST))
-    return jnp.exp(log) / -jnp.expm1(log)
+    return 1.0 / jnp.expm1(-EXPONENT * jnp.log(at_most(at_least(alpha, NARROWEST), WIDEST)))
 
 
 def roughness(sigma: Array) -> Array:
     """The roughness of a variance, the inverse of `variance`."""
-    sigma = at_least(sigma, NARROWEST**EXPONENT)
-    return jnp.exp((jnp.log(sigma) - jnp.log1p(sigma)) / EXPONENT)
+    return jnp.exp(-1.0 / EXPONENT * jnp.log1p(1.0 / at_least(sigma, NARROWEST**EXPONENT)))
 
 
 def phase_variance(g: Array) -> Array:
