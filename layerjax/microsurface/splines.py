@@ -19,6 +19,9 @@ from layerjax._numerics import at_least, at_most, horner, unstacked
 BASIS = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 """Weights of the four coefficients that count at a place: of each the polynomial in how far it is beyond the first."""
 
+SLOPES = BASIS[:, 1:] * np.arange(1, 4)
+"""The same of their derivatives."""
+
 
 def design(places: np.ndarray, count: int) -> np.ndarray:
     """Values of the splines at places in [0, 1], (places, count)."""
@@ -112,26 +115,28 @@ def _summed(
         corner = corner + apart * jnp.arange(columns, dtype=corner.dtype).reshape(-1, *(1,) * corner.ndim)
     *outer, last = (beyond for _, beyond, _ in found)
 
-    def step(sums: list[Array], given: tuple[Array, Array]) -> tuple[list[Array], None]:
-        tap, basis = given
+    def step(sums: list[Array], given: tuple[Array, ...]) -> tuple[list[Array], None]:
+        tap, basis, sloping = given
         place = corner + sum(tap[axis] * strides[axis] for axis in range(len(outer)))
         row = [flat.at[place + k].get(mode="promise_in_bounds", wrap_negative_indices=False) for k in range(4)]
         along = _dot(weights(last), row)
-        weight = [horner([basis[axis, n] for n in range(4)], beyond) for axis, beyond in enumerate(outer)]
+        weight = [horner(basis[axis], beyond) for axis, beyond in enumerate(outer)]
         added = [math.prod(weight) * along]
         if sloped:
             for axis, beyond in enumerate(outer):
-                slope = horner([n * basis[axis, n] for n in range(1, 4)], beyond)
+                slope = horner(sloping[axis], beyond)
                 added.append(math.prod([slope, *weight[:axis], *weight[axis + 1 :]]) * along)
-            slopes = [horner([n * powers[n] for n in range(1, 4)], last) for powers in BASIS.tolist()]
+            slopes = [horner(powers, last) for powers in SLOPES.tolist()]
             added.append(math.prod(weight) * _dot(slopes, row))
         return [before + more for before, more in zip(sums, added, strict=True)], None
 
     # all axes but the last in a loop: else XLA copies the whole look-up into every use of it
     taken = np.stack(np.unravel_index(np.arange(4 ** len(outer)), (4,) * len(outer)), axis=-1)
-    given = jnp.asarray(taken, jnp.int32), jnp.asarray(BASIS[taken], last.dtype)
+    powers = [jnp.asarray(table[taken], last.dtype) for table in (BASIS, SLOPES)]
     zero = jnp.zeros_like(corner, last.dtype)
-    value, *slopes = jax.lax.scan(step, [zero] * (1 + len(found) if sloped else 1), given)[0]
+    value, *slopes = jax.lax.scan(
+        step, [zero] * (1 + len(found) if sloped else 1), (jnp.asarray(taken, jnp.int32), *powers)
+    )[0]
     return [value, *(slope * steps for slope, (_, _, steps) in zip(slopes, found, strict=False))]
 
 

@@ -3,7 +3,7 @@
 Nothing is prepared: all of it is found at the cosines that are asked for, from energies that are looked up.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -49,10 +49,10 @@ class ShapedLobe(NamedTuple):
 
 
 class _Lobe(NamedTuple):
-    """A lobe by its energy, its roughness (None: the facet itself) and its cosine."""
+    """A lobe by its energy, its variance (None: the facet itself) and its cosine."""
 
     energy: Channels
-    alpha: Channels | None
+    variance: Channels | None
     cosine: Array
 
 
@@ -91,17 +91,16 @@ def shaped(stack: Stack, options: Options, cosine: Array, upward: bool) -> Shape
     found = statistics(stack, cosine, options, upward)
     reflected, facet = _returning(found, cosine)
     transmitted, escaping = _passing(stack, found, cosine, upward)
-    unscaled = _together(mirror_energy, [*reflected, *transmitted])
+    alphas, unscaled = _widths(reflected, transmitted, escaping)
     if facet is not None:  # its lobe is the first
         unscaled[0] = _of_facet(*facet, cosine)
-    count = len(reflected)
-    beyond = [channels.times(energy, share) for energy, share in zip(unscaled[count:], escaping, strict=True)]
-    return Shaped(tuple(map(_scaled, reflected, unscaled[:count])), tuple(map(_scaled, transmitted, beyond)), facet)
+    lobes = tuple(map(_scaled, [*reflected, *transmitted], alphas, unscaled))
+    return Shaped(lobes[: len(reflected)], lobes[len(reflected) :], facet)
 
 
-def _scaled(lobe: _Lobe, unscaled: Channels) -> ShapedLobe:
+def _scaled(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> ShapedLobe:
     scale = each(lambda energy, of: energy / at_least(of, LEAST_ENERGY), lobe.energy, unscaled)
-    return ShapedLobe(lobe.energy, scale, lobe.alpha)
+    return ShapedLobe(lobe.energy, scale, alpha or None)
 
 
 def index_below(stack: Stack) -> Array:
@@ -135,23 +134,23 @@ def _returning(found: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | N
     lobes = []
     for entry in found.reflected:
         for order, energy in enumerate(entry.lobe.energy):
-            alpha: Channels | None = None
+            sigma: Channels | None = None
             if entry.facet is not None and order == 0:
                 facet = entry.facet
             else:
-                alpha = tuple(map(lobe_roughness, _widened(entry.lobe.variance, entry.spread, order)))
-            lobes.append(_Lobe(energy, alpha, cosine))
+                sigma = _widened(entry.lobe.variance, entry.spread, order)
+            lobes.append(_Lobe(energy, sigma, cosine))
     return lobes, facet
 
 
-def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], list[Channels]]:
+def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], Array]:
     """The transmitted lobes by orders, in the medium of the reference index, none over a base.
 
-    Also the share of each that is not totally reflected on the way out of that medium. What nothing meets (no
-    interface, no collision) passes straight and is no lobe.
+    Also the largest sine there that is not totally reflected on the way out. What nothing meets (no interface, no
+    collision) passes straight and is no lobe.
     """
     if found.transmitted is None:
-        return [], []
+        return [], jnp.ones_like(cosine)
     below, reference = index_below(stack), reference_index(stack)
     enters, leaves = (below, jnp.ones_like(below)) if upward else (jnp.ones_like(below), below)
     here, _ = bounded_refracted_cosine(cosine, reference / enters, 1.0 - GRAZING)
@@ -162,18 +161,32 @@ def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tu
     for order, energy in enumerate(found.transmitted.energy):
         if order > 0 or met:
             sigma = _widened(found.transmitted.variance, found.transmitted_spread, order)
-            lobes.append(_Lobe(energy, tuple(lobe_roughness(widening * part) for part in sigma), here))
-    return lobes, _together(lambda cosine, width: retained_share(cosine, width, leaves / reference), lobes)
+            lobes.append(_Lobe(energy, tuple(widening * part for part in sigma), here))
+    return lobes, leaves / reference
 
 
-def _together(energy: Callable[[Array, Array], Array], lobes: Sequence[_Lobe]) -> list[Channels]:
-    """energy(cosine, alpha) of every lobe and channel, at one look; nothing for a lobe that is the facet itself."""
-    widths = [(lobe.cosine, width) for lobe in lobes for width in lobe.alpha or ()]
-    if not widths:
-        return [() for _ in lobes]
-    cosines, alphas = (jnp.stack(jnp.broadcast_arrays(*part)) for part in zip(*widths, strict=True))
-    values = iter(unstacked(energy(cosines, alphas)))
-    return [tuple(next(values) for _ in lobe.alpha or ()) for lobe in lobes]
+def _widths(
+    reflected: Sequence[_Lobe], transmitted: Sequence[_Lobe], escaping: Array
+) -> tuple[list[Channels], list[Channels]]:
+    """Roughness and unscaled energy of every lobe and channel, at one look; nothing for the facet itself.
+
+    escaping: of what is transmitted, the largest sine that is not totally reflected.
+    """
+    lobes = [*reflected, *transmitted]
+    parts = [(lobe.cosine, sigma) for lobe in lobes for sigma in lobe.variance or ()]
+    if not parts:
+        return [() for _ in lobes], [() for _ in lobes]
+    cosine, sigma = (jnp.stack(jnp.broadcast_arrays(*part)) for part in zip(*parts, strict=True))
+    alpha = lobe_roughness(sigma)
+    energy = mirror_energy(cosine, alpha)
+    beyond = sum(len(lobe.variance or ()) for lobe in transmitted)
+    if beyond:
+        cosine, width = cosine[-beyond:], alpha[-beyond:]
+        passed = energy[-beyond:] * retained_share(cosine, width, escaping)
+        energy = jnp.concatenate([energy[:-beyond], passed])
+    rows = zip(unstacked(alpha), unstacked(energy), strict=True)
+    found = [[next(rows) for _ in lobe.variance or ()] for lobe in lobes]
+    return [tuple(a for a, _ in lobe) for lobe in found], [tuple(e for _, e in lobe) for lobe in found]
 
 
 def _widened(variance: Channels, spread: Channels | None, order: int) -> Channels:
