@@ -6,6 +6,7 @@ differentiated through the look-up. Values have continuous second derivatives.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -131,12 +132,11 @@ def _summed(
         return [before + more for before, more in zip(sums, added, strict=True)], None
 
     # all axes but the last in a loop: else XLA copies the whole look-up into every use of it
-    taken = np.stack(np.unravel_index(np.arange(4 ** len(outer)), (4,) * len(outer)), axis=-1)
+    taken = np.array([*itertools.product(range(4), repeat=len(outer))], int).reshape(4 ** len(outer), len(outer))
     powers = [jnp.asarray(table[taken], last.dtype) for table in (BASIS, SLOPES)]
     zero = jnp.zeros_like(corner, last.dtype)
-    value, *slopes = jax.lax.scan(
-        step, [zero] * (1 + len(found) if sloped else 1), (jnp.asarray(taken, jnp.int32), *powers)
-    )[0]
+    sums = [zero] * (1 + len(found) if sloped else 1)
+    value, *slopes = jax.lax.scan(step, sums, (jnp.asarray(taken, jnp.int32), *powers))[0]
     return [value, *(slope * steps for slope, (_, _, steps) in zip(slopes, found, strict=False))]
 
 
