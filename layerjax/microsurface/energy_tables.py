@@ -129,10 +129,11 @@ def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, 
         return channels.times((at_most(total, 1.0),), levels)
     total, *rest = _on_plane(cosine, alpha, "first", 1 + len(SLICES) + len(REST) + RETURNS)
     facing, returns = rest[:-RETURNS], rest[-RETURNS:]
-    places, weights = DIFFUSE
-    facing += [jnp.full_like(total, place) for place in (*places, 1.0)]
-    sets = SLICES, REST, weights, (1.0,)
-    first, sent_on, mean, normal = _means_of_facets(facing, sets, ior, k)
+    first, sent_on = _means_of_facets(facing, (SLICES, REST), ior, k)
+    cosines, weights = DIFFUSE
+    # by itself: of one metal it is the same in all directions
+    smooth = [jnp.asarray(u, total.dtype) for u in (*cosines, 1.0)]
+    mean, normal = _means_of_facets(smooth, (weights, (1.0,)), ior, k)
     total = at_most(total, 1.0)
 
     def reflected(first: Array, sent_on: Array, mean: Array, normal: Array) -> Array:

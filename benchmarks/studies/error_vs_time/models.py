@@ -63,7 +63,7 @@ MODELS = (
 
 
 VALUES = 10_000
-"""Of a stack, that times are quoted for: so many at a time, what the stack costs once spread over them."""
+"""Of one stack: so many are timed at once, and what the stack costs once is spread over as many."""
 
 STEP = 8.0
 """A step of a model costs up to so many times the one before."""

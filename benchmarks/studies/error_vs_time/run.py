@@ -12,17 +12,7 @@ from benchmarks.measuring.memory import keep_within
 from benchmarks.measuring.writing import DIRECTORY, rounded, write
 from benchmarks.studies.error_vs_time import pictures as error_pictures
 from benchmarks.studies.error_vs_time import tables as error_tables
-from benchmarks.studies.error_vs_time.models import (
-    MODELS,
-    VALUES,
-    Model,
-    Programs,
-    Row,
-    Size,
-    row,
-    run,
-    supports,
-)
+from benchmarks.studies.error_vs_time.models import MODELS, VALUES, Model, Programs, Row, Size, row, run, supports
 from benchmarks.studies.error_vs_time.truth import (
     REFERENCES,
     Judged,
@@ -40,11 +30,11 @@ from fits.reporting.plots.data import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)
-TIMED = ("batch", "rounds", "values a stack")
-"""Settings that times alone depend on: a truth is the same without."""
-
 QUICK_STEP = 6
 """A quick run takes every so many stacks."""
+
+TIMED = ("batch", "rounds", "values a stack")
+"""Settings that times alone depend on: a truth is the same without."""
 
 
 @dataclass(frozen=True)

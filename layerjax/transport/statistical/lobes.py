@@ -169,10 +169,19 @@ def _interfaces(met: Sequence[Part], cosines: Sequence[Array], options: Options)
     widening = variance(alpha) * one
     down = variance(transmission_scale(steep_i, ior, steep_t) * alpha)
     up = variance(transmission_scale(steep_t, 1.0 / ior, steep_i) * alpha)
-    columns = zip(*map(unstacked, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
+    rows = zip(*map(unstacked, (r12, t12, r21, t21, widening, down, up, jacobian)), strict=True)
     return [
-        Element(((r,),), ((t,),), ((r_up,),), ((t_up,),), (wide,), (after_down,), (after_up,), (j,))
-        for r, t, r_up, t_up, wide, after_down, after_up, j in columns
+        Element(
+            r12=((above_r,),),
+            t12=((above_t,),),
+            r21=((below_r,),),
+            t21=((below_t,),),
+            widening=(wider,),
+            down=(going_down,),
+            up=(going_up,),
+            jacobian=(outside,),
+        )
+        for above_r, above_t, below_r, below_t, wider, going_down, going_up, outside in rows
     ]
 
 
