@@ -11,7 +11,8 @@ import layerjax as lj
 from benchmarks import __main__
 from benchmarks.measuring import accuracy
 from benchmarks.studies.error_vs_time import run as error_vs_time
-from benchmarks.studies.error_vs_time.models import MODELS, Model, Size, named
+from benchmarks.studies.error_vs_time import tables as error_tables
+from benchmarks.studies.error_vs_time.models import MODELS, Model, Row, Size, named
 from benchmarks.studies.error_vs_time.truth import References, compare
 from benchmarks.suite.cases import Case, Directions
 
@@ -66,9 +67,22 @@ def test_models_are_registered_by_name() -> None:
 
 def test_bad_usage_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in (["--families", "paints"], ["--models", "walk"], ["--stacks", "sond"]):
-        with pytest.raises(SystemExit):
+        with pytest.raises(SystemExit) as stopped:
             __main__.main(["error-vs-time", *arguments])
-        assert len(capsys.readouterr().err.strip().splitlines()[-1:]) == 1
+        assert stopped.value.code != 0
+        printed = capsys.readouterr().err.strip()
+        assert "Traceback" not in printed
+        assert "error: " in printed.splitlines()[-1]
+        assert arguments[1] in printed.splitlines()[-1]
+
+
+def test_differences_that_timings_cannot_tell_are_no_figures() -> None:
+    """Few values cost 1 ms, that is 100 ns of each of 10,000."""
+    row = Row("a", "coated_metals", "m", "s", 1, 1e-3, 1e-3, None, 0.0, 1e-3, None, 1, False)
+    found = [dataclasses.replace(row, nanoseconds_per_value=each) for each in (0.0, 50.0, 70.0)]
+    assert error_tables.each(found, called=True) == "50.0"
+    assert error_tables.each([*found, found[0]], called=True) == "-"
+    assert error_tables.each([*found, found[0]], called=False) == "25.0"
 
 
 def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:

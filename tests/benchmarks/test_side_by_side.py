@@ -26,6 +26,11 @@ def row(stack, model, step, l2, nanoseconds, family="coated_metals", limits=Fals
     )
 
 
+def cheapest(rows, limits):
+    """The cells of the one family that the rows are of."""
+    return [cell.strip() for cell in side_by_side.cheapest(rows, limits).splitlines()[2].split("|")[1:-1]]
+
+
 def test_the_page_in_the_docs_holds_the_numbers_of_the_results():
     _, text = side_by_side.page()
     assert (side_by_side.DOCS / side_by_side.PAGE).read_text() == text
@@ -35,8 +40,7 @@ def test_the_cheapest_that_is_good_enough():
     fast = [row(name, "fast", "once", error, 5.0) for name, error in zip("abcd", (0.2, 0.2, 0.2, 0.9), strict=True)]
     slow = [row(name, "slow", "fine", 0.02, 800.0) for name in "abcd"]
     some = [row("a", "some", "once", 1e-5, 1.0)]  # of no use for the family
-    cells = side_by_side.cheapest(fast + slow + some).splitlines()[2].split("|")
-    assert [cell.strip() for cell in cells[1:-1]] == [
+    assert cheapest(fast + slow + some, dict.fromkeys("abcd", 1e-6)) == [
         "coated metals",
         "fast, once (5.00)",  # three of four stacks are within 30 %
         "slow, fine (800)",
@@ -44,6 +48,22 @@ def test_the_cheapest_that_is_good_enough():
         "-",
         "-",
     ]
+
+
+def test_a_truth_that_is_not_known_so_well_judges_nobody():
+    rows = [row(name, "fast", "once", 0.02, 5.0, limits=name == "d") for name in "abcd"]
+    limits = {"a": 1e-6, "b": 1e-6, "c": 1e-6, "d": 0.05}
+    assert cheapest(rows, limits)[1:] == [
+        "fast, once (5.00)",
+        "fast, once (5.00)",
+        "fast, once (5.00, 3 of 4)",
+        "-",
+        "-",
+    ]
+    cells = side_by_side.examples(
+        [MODELS[0]], [row("fabric", MODELS[0].name, "x", 1e-9, 5.0, limits=True)], {"fabric": 0.05}
+    )
+    assert "| <= 5.0 % (5.00 ns) |" in cells
 
 
 def test_every_family_has_a_panel():

@@ -1,6 +1,6 @@
 """The picture of the error-against-time benchmark: a panel a family, a curve or a point a model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from benchmarks.studies.error_vs_time.models import VALUES, Model, Row
-from benchmarks.studies.error_vs_time.tables import amortised, floored
+from benchmarks.studies.error_vs_time.tables import amortised, floored, limits_of
 from benchmarks.studies.error_vs_time.truth import Judged
 from benchmarks.suite.cases import FAMILIES
 from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
@@ -36,13 +36,13 @@ def picture(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Ro
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(3.3 * columns, 3.1 * lines + 0.3), layout="constrained")
         panels = np.ravel(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False))
-        by_name = {judgement.stack: judgement for judgement in judged}
+        limits = limits_of(judged)
         for panel, family in zip(panels, families, strict=False):
             members = [judgement for judgement in judged if judgement.family == family]
             for index, model in enumerate(models):
                 finite = [row for row in rows if row.l2 is not None]
                 chosen = [row for row in finite if (row.family, row.model) == (family, model.name)]
-                _curve(panel, index, model, chosen, by_name)
+                _curve(panel, index, model, chosen, limits)
             limit = float(np.median([judgement.limit for judgement in members]))
             panel.axhline(max(limit, LOWEST), color=GREY, linestyle=":", linewidth=1.0)
             panel.set(xscale="log", yscale="log", title=f"{FAMILIES[family]} ({len(members)})")
@@ -57,7 +57,7 @@ def picture(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Ro
     return figure
 
 
-def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], judged: dict[str, Judged]) -> None:
+def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], limits: Mapping[str, float]) -> None:
     colour, marker = _look(index)
     points = []
     for step in model.steps:
@@ -65,7 +65,7 @@ def _curve(panel: Axes, index: int, model: Model, rows: Sequence[Row], judged: d
         if not here:
             continue
         times = np.array([amortised(row) for row in here])
-        errors = np.array([min(max(floored(row, judged), LOWEST), HIGHEST) for row in here])
+        errors = np.array([min(max(floored(row, limits), LOWEST), HIGHEST) for row in here])
         panel.plot(times, errors, marker, color=colour, markersize=2.0, markeredgewidth=0, alpha=0.35)
         low, middle, high = np.quantile(errors, [0.25, 0.5, 0.75])
         open_mark = float(np.mean([row.truth_limits for row in here])) >= 0.5

@@ -12,6 +12,9 @@ from benchmarks.studies.error_vs_time.models import VALUES, Model, Row, Size
 from benchmarks.studies.error_vs_time.truth import STANDARD_ERRORS, TOLERANCE, Judged, References
 from benchmarks.suite.cases import FAMILIES
 
+TOLD = 0.1
+"""By what share of a call for few values a call for many has to be dearer for the difference to be told."""
+
 TEXT = """\
 # Error against run time
 
@@ -28,6 +31,9 @@ compiled and prepared ({batch:,} pairs at a time; walks {opaque} over a base, {t
 is the first call less a later one, of both, of stacks whose programs no cache on disk held; stacks that differ in
 numbers alone share it. *operations* counts those of
 the lowered program of an evaluation. Steps that would take longer than {longest:g} s on a stack are left out.
+Models that are given the stack itself ({called}) are
+timed for few values and for {values:,}: *ns a value* is from the difference, and a dash where that is less than
+{told:.0f} % of what few cost at half of the stacks: timings scatter by as much.
 
 The truth is {truth}, solved {dates}. Its uncertainty is its distance from its next coarser resolution,
 and {check} must not find it further off than noise explains: the larger of the two is its limit.
@@ -74,6 +80,8 @@ def markdown(
         transmitting=size.walked_transmitting,
         values=VALUES,
         longest=size.longest,
+        called=_listed(model.name for model in models if model.called),
+        told=100 * TOLD,
         truth=_name(references.truth),
         dates=_dates(judged),
         check=_name(references.check),
@@ -89,9 +97,14 @@ def markdown(
     )
 
 
+def once(row: Row) -> float:
+    """Nanoseconds of the preparation, spread over `VALUES` values."""
+    return 1e9 * row.prepare_seconds / VALUES
+
+
 def amortised(row: Row) -> float:
     """Nanoseconds a value, the preparation spread over `VALUES` of them."""
-    return row.nanoseconds_per_value + 1e9 * row.prepare_seconds / VALUES
+    return row.nanoseconds_per_value + once(row)
 
 
 def steps(models: Sequence[Model]) -> list[tuple[str, str]]:
@@ -99,13 +112,35 @@ def steps(models: Sequence[Model]) -> list[tuple[str, str]]:
     return [(model.name, step) for model in models for step in model.steps]
 
 
-def floored(row: Row, judged: Mapping[str, Judged]) -> float:
+def limits_of(judged: Sequence[Judged]) -> dict[str, float]:
+    """Relative L2 error that the truth of each stack can tell."""
+    return {judgement.stack: judgement.limit for judgement in judged}
+
+
+def floored(row: Row, limits: Mapping[str, float]) -> float:
     """Relative L2 error, not below what the truth can tell; NaN where the model's values were not finite."""
-    return float("nan") if row.l2 is None else max(row.l2, judged[row.stack].limit)
+    return float("nan") if row.l2 is None else max(row.l2, limits[row.stack])
+
+
+def percent(value: float) -> str:
+    """A share in percent; a dash for none."""
+    return figure(100.0 * value, digits=2) if np.isfinite(value) else "-"
+
+
+def limited_percent(row: Row, limits: Mapping[str, float]) -> str:
+    """The relative L2 error in percent, "<=" before it where it is the truth's limit."""
+    return ("<= " if row.truth_limits else "") + percent(floored(row, limits))
+
+
+def each(found: Sequence[Row], called: bool) -> str:
+    """The median of nanoseconds a value; a dash for differences that half of the stacks do not tell."""
+    told = sum(row.nanoseconds_per_value >= TOLD * once(row) for row in found)
+    return figure(_median(row.nanoseconds_per_value for row in found)) if not called or 2 * told > len(found) else "-"
 
 
 def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:
-    by_name = {judgement.stack: judgement for judgement in judged}
+    by_name, error_limits = {judgement.stack: judgement for judgement in judged}, limits_of(judged)
+    called = {model.name for model in models if model.called}
     header = ("model", "stacks", "L2 error, %", "worst, %", "albedo, %", "ns a value", "prepare, ms", "all, ns",
               "compile, s", "operations")  # fmt: skip
     parts = []
@@ -125,10 +160,10 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
                 [
                     f"{model}, {step}",
                     f"{len(found)}/{whole}",
-                    limited + _percent(_median(floored(row, by_name) for row in found)),
+                    limited + percent(_median(floored(row, error_limits) for row in found)),
                     _largest((row.worst, by_name[row.stack].worst_uncertainty) for row in found),
                     _largest((row.albedo, by_name[row.stack].albedo_uncertainty) for row in found),
-                    figure(_median(row.nanoseconds_per_value for row in found)),
+                    each(found, model in called),
                     figure(1e3 * _median(row.prepare_seconds for row in found)),
                     figure(_median(map(amortised, found))),
                     _compile([row.compile_seconds for row in found]),
@@ -137,7 +172,7 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
             )
         parts.append(
             f"### {title.capitalize()}\n\n{table(header, lines)}\n"
-            f"Limit of the truth: median {_percent(float(np.median(limits)))} %, at most {_percent(max(limits))} %.\n"
+            f"Limit of the truth: median {percent(float(np.median(limits)))} %, at most {percent(max(limits))} %.\n"
         )
     return "\n".join(parts)
 
@@ -149,8 +184,8 @@ def _agreement(failing: Sequence[Judged]) -> str:
             judgement.stack,
             str(judgement.compared),
             *map(str, judgement.failures),
-            _percent(judgement.worst),
-            _percent(judgement.limit),
+            percent(judgement.worst),
+            percent(judgement.limit),
             f"{judgement.z_root_mean_square:.2f}",
         )
         for judgement in failing
@@ -160,7 +195,7 @@ def _agreement(failing: Sequence[Judged]) -> str:
 
 
 def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[Row]) -> str:
-    by_name = {judgement.stack: judgement for judgement in judged}
+    limits = limits_of(judged)
     cells = {(row.stack, row.model, row.step): row for row in rows}
     columns = steps(models)
     header = ("%", "limit of truth", "truth z rms", "agree", *(f"{_short(model)} {step}" for model, step in columns))
@@ -170,7 +205,7 @@ def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
         for judgement in judged:
             if judgement.family != family:
                 continue
-            line = [judgement.stack, _percent(judgement.limit), f"{judgement.z_root_mean_square:.2f}"]
+            line = [judgement.stack, percent(judgement.limit), f"{judgement.z_root_mean_square:.2f}"]
             line.append("yes" if judgement.agrees else "no")
             for model, step in columns:
                 row = cells.get((judgement.stack, model, step))
@@ -179,7 +214,7 @@ def _details(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
                 elif row.l2 is None:
                     line.append("not finite")
                 else:
-                    line.append(("<= " if row.truth_limits else "") + _percent(floored(row, by_name)))
+                    line.append(limited_percent(row, limits))
             lines.append(line)
         if lines:
             parts.append(f"### {title.capitalize()}, stack by stack\n\n{table(header, lines)}")
@@ -203,13 +238,14 @@ def _short(name: str) -> str:
     return "".join(word[0].upper() for word in words) if len(words) > 1 else name
 
 
+def _listed(names: Iterable[str]) -> str:
+    """The names as code, with commas."""
+    return ", ".join(f"`{name}`" for name in names)
+
+
 def _compile(seconds: Sequence[float | None]) -> str:
     known = [value for value in seconds if value is not None]
     return figure(_median(known) if known else None, digits=2)
-
-
-def _percent(value: float) -> str:
-    return figure(100.0 * value, digits=2) if np.isfinite(value) else "-"
 
 
 def _median(values: Iterable[float]) -> float:
@@ -223,4 +259,4 @@ def _largest(errors: Iterable[tuple[float | None, float]]) -> str:
     if not finite:
         return "-"
     error, limited = max(finite)
-    return ("<= " if limited and error > 0 else "") + _percent(error)
+    return ("<= " if limited and error > 0 else "") + percent(error)
