@@ -82,8 +82,18 @@ def test_links_exist(page):
 def test_files_and_tests_that_contributing_names_exist():
     for path in re.findall(r"`((?:layerjax|fits|tests|tools|benchmarks|docs|examples|\.ci)/[\w./-]*)", text_of_guide()):
         assert (ROOT / path).exists(), path
-    for test in re.findall(r"pytest (?:-\S+ )*(tests/\S+)::(\w+)", text_of_guide()):
-        assert f"def {test[1]}(" in (ROOT / test[0]).read_text(), test
+    named = re.findall(r"pytest .*?(tests/\S+)::(\w+)", text_of_guide())
+    assert named
+    for path, test in named:
+        assert f"def {test}(" in (ROOT / path).read_text(), test
+
+
+def test_files_that_results_name_exist():
+    for page in (ROOT / "benchmarks" / "results").glob("*.md"):
+        for path in re.findall(
+            r"`((?:layerjax|fits|tests|tools|benchmarks|docs|examples)/[\w./-]*)`", page.read_text()
+        ):
+            assert (ROOT / path).exists() or "NAME" in path, (page.name, path)
 
 
 def text_of_guide():

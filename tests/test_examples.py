@@ -1,5 +1,6 @@
 """Examples that are programs: the quick ones run."""
 
+import json
 import re
 import runpy
 import sys
@@ -17,6 +18,23 @@ def test_a_mixture_is_told_from_a_metal(capsys: pytest.CaptureFixture[str]) -> N
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     (found,) = (line for line in lines if line[:1] == ["weights.coat"])
     assert float(found[2]) == pytest.approx(0.7, abs=0.01)
+
+
+def test_what_stacks_foretell_is_told_as_it_was_found() -> None:
+    """The first table of the README beside the results of `unseen`, which it rounds."""
+    rows = json.loads((ROOT / "benchmarks" / "results" / "unseen.json").read_text())["rows"]
+    found = {(row["coating"], row["stack"], row["shared"]): row for row in rows}
+    text = (ROOT / "examples" / "README.md").read_text()
+    header, _, *lines = text[text.index("| stack | what it says | Aeroglaze") :].split("\n\n")[0].splitlines()
+    coatings = [cell.strip() for cell in header.split("|")[3:6]]
+    told = [(line.split("|"), line.split("`")[1].removesuffix(".toml")) for line in lines]
+    assert 2 * len(told) * len(coatings) == len(found)
+    for cells, stack in told:
+        for coating, cell in zip(coatings, cells[3:6], strict=True):
+            error, noise_error, *held = map(float, re.findall(r"[\d.]+", cell))
+            both, noise = found[coating, stack, True], found[coating, stack, False]
+            assert [error, noise_error] == [pytest.approx(100 * row["error"], abs=0.051) for row in (both, noise)]
+            assert held == [pytest.approx(100 * share, abs=0.51) for share in (*both["held"], *noise["held"])]
 
 
 def test_a_painted_plate_is_found_again(

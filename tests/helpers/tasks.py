@@ -41,8 +41,9 @@ def deadly(shared: str, task: int) -> int:
 
 
 def slow(shared: str, task: int) -> int:
-    """Tells its process in a file, takes a while, and squares."""
-    Path(shared, f"{os.getpid()}").touch()
+    """Adds a letter to a file of its process, takes a while, and squares."""
+    with Path(shared, f"{os.getpid()}").open("a") as file:
+        file.write(".")
     time.sleep(0.15)
     return task * task
 

@@ -57,7 +57,7 @@ def test_refraction_obeys_snell_and_flags_total_reflection():
         assert d.dot(t, m) * d.dot(w, m) < 0
         sine_in, sine_out = (np.sqrt(1 - d.dot(v, m) ** 2) for v in (w, t))
         np.testing.assert_allclose(sine_in, ior * sine_out, rtol=1e-12)
-    # sheet values: theta 0.8, ior 1.5
+    # theta 0.8, ior 1.5
     t, _ = d.refract(d.split(lj.direction(0.8, 0.0)), d.split(lj.direction(0.0, 0.0)), 1.5)
     np.testing.assert_allclose(d.join(t), [-0.47823739, 0.0, -0.87823060], atol=5e-9)
     _, exists = d.refract(d.split(lj.direction(1.0, 0.0)), d.split(lj.direction(0.0, 0.0)), 1 / 1.5)

@@ -70,8 +70,8 @@ the ratios within a round. Errors are the largest relative ones, values below 1e
 Of a fixed series of resolutions (nodes x modes of `AddingDoubling`, streams x modes of DISORT) each solver of the full
 BRDF runs at the one that reaches the error in the least time, from the parameters to the values, `AddingDoubling` as
 one compiled function of them; it has 16 x 16 cosines and 33 azimuths. Otherwise `AddingDoubling` runs at the first that
-reaches the error. The layers with axes are measured by their rms error from the walk. The bars are those of the
-project's performance sheet: at least, and in brackets the aim. {peers}
+reaches the error. The layers with axes are measured by their rms error from the walk. Bars: at least, and in
+brackets the aim. {peers}
 
 {rows}
 {speed}"""

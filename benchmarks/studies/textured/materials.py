@@ -124,7 +124,7 @@ MATERIALS = (
     ),
     Material("interface over metal, one bounce", COAT | METAL, lambda p: lj.Stack([_coat(p)], _metal(p)), lj.ENDF()),
 )
-"""Those of the project's sheet, each with its bar, and what other transports take beside them."""
+"""Those that have a bar, and what other transports take beside them."""
 
 PRINCIPLED = {
     "base_color": Range(0.1, 0.9, 3),

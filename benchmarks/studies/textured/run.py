@@ -26,6 +26,8 @@ BRIGHTER = 1.1
 """The loss is the mean squared difference from the values times this."""
 PROBED = 4096
 """Texels by which the time of a map is estimated; smaller maps than were asked for have a multiple of them."""
+MANY = 500_000
+"""Texels of a map that tells how memory grows: what is held for the last block of a smaller one outweighs it."""
 GRADIENT, COMPILE, COMPILE_GRADIENT, TO_PRINCIPLED = Bar(5.0, 3.0), Bar(3.0, 1.5), Bar(8.0, 4.0), Bar(5.0, 2.0)
 """In times of a value; in seconds; in times of Mitsuba's principled BSDF."""
 
@@ -36,9 +38,9 @@ TEXT = """\
 Every texel is a stack of its own, of which each parameter is a map, under a pair of directions of its own. Medians of
 {rounds} rounds, everything compiled; *gradient* is a value with the derivatives of a mean squared difference in all
 parameter maps, in values; *memory* is what the program of a value holds beside inputs and results, and grows by with
-each texel. Where a map would take longer than {longest:g} s, fewer *texels* stand for it. *principled* and *conductor*
-are times of our value over those of Mitsuba's `principled` and `roughconductor` (`llvm_ad_rgb`, float32) with a texture
-for every parameter, in the same rounds. {peers}
+each texel, of {many:,} and more. Where a few texels say that a map takes longer than {longest:g} s, fewer *texels*
+stand for it. *principled* and *conductor* are times of our value over those of Mitsuba's `principled` and
+`roughconductor` (`llvm_ad_rgb`, float32) with a texture for every parameter, in the same rounds. {peers}
 
 {rows}
 ## Verdicts
@@ -65,7 +67,7 @@ QUICK = Size((10_000,), ("float32",), 3, 1.0)
 
 @dataclass(frozen=True)
 class Row:
-    """One material at one size. value: microseconds a texel; gradient: in values; memory: bytes a texel.
+    """One material at one size. value: microseconds a texel; gradient: in values; memory: bytes a texel, of `MANY`.
 
     principled, conductor: the median over rounds of our time over Mitsuba's.
     """
@@ -78,7 +80,7 @@ class Row:
     gradient: float
     compile_value: float
     compile_gradient: float
-    memory: float
+    memory: float | None
     principled: float | None
     conductor: float | None
 
@@ -109,6 +111,7 @@ def study(
         environment=environment_lines(surroundings),
         rounds=size.rounds,
         longest=size.longest,
+        many=MANY,
         peers="" if missing is None else f"Mitsuba did not run: {missing}.",
         rows=table(HEADER, [_cells(row) for row in rows]),
         gradient=GRADIENT.words(),
@@ -127,7 +130,7 @@ def measure(material: Material, precision: str, texels: int, size: Size, with_pe
     few = _Problem(material, precision, probed)
     seconds = min(once(few.compiled_value()[0]) for _ in range(2))
     count = min(texels, probed * max(1, int(size.longest / seconds)))
-    problem, half = _Problem(material, precision, count), _Problem(material, precision, count // 2)
+    problem = _Problem(material, precision, count)
     value, compile_value, memory = problem.compiled_value()
     gradient, compile_gradient = problem.compiled_gradient()
     ways: dict[str, Callable[[], Any]] = {"value": value, "gradient": gradient}
@@ -144,17 +147,23 @@ def measure(material: Material, precision: str, texels: int, size: Size, with_pe
         gradient=1.0 / ratios["gradient"],
         compile_value=compile_value,
         compile_gradient=compile_gradient,
-        memory=(memory - half.compiled_value()[2]) / (count - count // 2),
+        memory=_growth(problem, memory) if count >= MANY else None,
         principled=ratios.get("principled"),
         conductor=ratios.get("conductor"),
     )
+
+
+def _growth(problem: "_Problem", memory: float) -> float:
+    """Bytes that each texel adds, by a map of half as many."""
+    half = _Problem(problem.material, problem.precision, problem.texels // 2)
+    return (memory - half.compiled_value()[2]) / (problem.texels - half.texels)
 
 
 class _Problem:
     """A material of so many texels, with a pair of directions for each."""
 
     def __init__(self, material: Material, precision: str, texels: int) -> None:
-        self.material, self.texels = material, texels
+        self.material, self.precision, self.texels = material, precision, texels
         self.plain = material.maps(texels, precision)
         self.directions = [w.astype(precision) for w in pairs(texels, "reflection")]
         self._arguments: tuple[Any, ...] = ({name: jnp.asarray(value) for name, value in self.plain.items()},)

@@ -13,8 +13,8 @@ TEXT = """\
 
 {environment}
 Wall times, medians of {rounds} interleaved rounds, everything warm; *ratio* is layerjax over the other, the median of
-the ratios within a round. BLAS has one thread, which suits such small matrices best. The bars
-are those of the project's performance sheet: at least, and in brackets the aim. {peers}
+the ratios within a round. BLAS has one thread, which suits such small matrices best. Bars:
+at least, and in brackets the aim. {peers}
 
 ## Forward models
 
@@ -26,6 +26,9 @@ kernel a parameter; the bars refer to the peer's gradient as one writes it down.
 
 {forward}
 ## Fits and posteriors
+
+As one calls them: `fits` uses all cores; scipy in a loop, and emcee with its default move and one walker at a time,
+use one.
 
 {inference}"""
 

@@ -165,9 +165,8 @@ def test_a_worker_takes_away_what_its_parent_cannot(tmp_path: Path, monkeypatch:
 def test_whoever_leaves_the_loop_ends_the_workers_at_once(tmp_path: Path) -> None:
     found = run(tasks.slow, str(tmp_path), range(1000), processes=2)
     next(found)
-    began = time.monotonic()
     found.close()  # type: ignore[attr-defined]
-    assert time.monotonic() - began < 20.0  # all of them would take 75 s
+    assert sum(len(path.read_text()) for path in tmp_path.iterdir()) < 1000
     assert multiprocessing.active_children() == []
 
 

@@ -232,7 +232,7 @@ def test_killed_at_any_moment_it_ends_with_the_same_summary(result: Fit, posteri
     command = [sys.executable, "-c", SCRIPT, str(path), str(saved)]
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     environment = {**os.environ, "PYTHONPATH": str(root), **cache}
-    generator = np.random.default_rng()
+    generator = np.random.default_rng(0)
     kills, kept = 0, 0
     while not saved.exists():
         with subprocess.Popen(command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True) as process:

@@ -133,9 +133,10 @@ def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
 
 
 def test_repeats_have_the_resolution_of_the_start(sharp):
-    problem = Problem(STACK, sharp)
-    repeats = fit_many(problem, sharp.used().values[None])
-    assert repeats.converged.all()
+    values = sharp.used().values[None]
+    open_one, coarse = (fit_many(problem, values) for problem in (Problem(STACK, sharp), Problem(STACK, sharp, COARSE)))
+    assert open_one.converged.all()
+    np.testing.assert_array_equal(open_one.vectors, coarse.vectors)
 
 
 def coated(index, alpha, axis=None):

@@ -5,11 +5,14 @@ import pytest
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
+from fits.inference import starts as starts_module
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
+from fits.inference.starts_file import Floats
 from fits.problem.correlated import Correlated
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
+from fits.problem.posed import Posed
 from fits.reporting import tables, verdicts
 from fits.reporting.results import load_fit, save_fit
 from tests.helpers.models import line
@@ -72,29 +75,26 @@ def test_both_are_told(wrong: Fit) -> None:
     assert len(table.rows[0]) == len(table.columns)
 
 
-def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit) -> None:
+def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
     kept = tmp_path / "starts"
-    seen: list[tuple[str, int]] = []
 
     def stop(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        seen.append((stage, done))
         if stage.endswith("shared errors") and done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, progress=stop, checkpoint=kept)
-    again: list[tuple[str, int]] = []
-    found = fit(
-        STACK,
-        readings(0.1),
-        transport=line,
-        noise=NOISE,
-        starts=2,
-        progress=lambda stage, done, total=None, info="": again.append((stage, done)),
-        checkpoint=kept,
-    )
+    run: list[str] = []
+    end = starts_module.rough_end
+
+    def counted(problem: Posed, point: Floats) -> starts_module.End:
+        run.append(type(problem).__name__)
+        return end(problem, point)
+
+    monkeypatch.setattr(starts_module, "rough_end", counted)
+    found = fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(found.vector, wrong.vector)
-    # what was done is told of at once, and only the rest is run
+    assert len(run) == 1  # of two starts and, with shared errors, three
     assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-shared"}
 
 

@@ -45,7 +45,7 @@ def test_published_slab_values(row):
     [(1.0, 1.0, 0.3413288, 0.2907918), (1.0, 0.5, 0.4983755, 0.3662892), (5.0, 1.0, 0.7387212, 0.2545409)],
 )
 def test_isotropic_slab_against_milne(thickness, cosine, reflected, transmitted):
-    # R6.1 to R6.3, from a discretised Milne equation
+    # from a discretised Milne equation
     found = lj.albedo(Stack([Medium(thickness)]), lj.direction(np.arccos(cosine), 0.0), ENERGY)
     np.testing.assert_allclose(np.ravel(found), [reflected, transmitted], atol=2e-6)
 
@@ -59,8 +59,8 @@ def test_isotropic_slab_against_milne(thickness, cosine, reflected, transmitted)
     ],
     ids=["two flakes", "thick flakes", "fibers"],
 )
-def test_flakes_against_walks_of_the_sheet(layers, reflected, transmitted):
-    # R6.5: two and more collisions, standard error 5e-4
+def test_flakes_against_published_walks(layers, reflected, transmitted):
+    # two and more collisions, standard error 5e-4
     transport = lj.AddingDoubling(nodes=24, modes=2, orders="multiple")
     found = lj.albedo(Stack(layers), lj.direction(0.5, 0.3), transport)
     np.testing.assert_allclose(np.ravel(found), [reflected, transmitted], atol=4 * 5e-4)

@@ -24,7 +24,7 @@ def agree(found, error, expected, slack=0.0):
 
 
 def test_milne_slabs():
-    # R6.1 to R6.4: isotropic and lossless, from the Milne equation
+    # isotropic and lossless, from the Milne equation
     def energies(tau, mu):
         wi = lj.direction(jnp.arccos(mu), 0.0)
         seen = measure(lj.Stack([lj.Medium(tau, phase=lj.SGGX("surface", 1.0))]), wi)
@@ -53,11 +53,11 @@ def test_milne_slabs():
     ],
 )
 def test_multiple_scattering_by_flakes(layers, up, down):
-    seen = measure(lj.Stack(layers), lj.direction(*INCIDENT))  # R6.5, itself a walk with a standard error of 5e-4
+    seen = measure(lj.Stack(layers), lj.direction(*INCIDENT))  # of a walk with a standard error of 5e-4
     agree(seen.orders[:, 1, 0], np.hypot(seen.orders_error[:, 1, 0], 5e-4), [up, down])
 
 
-@pytest.mark.parametrize("name", ["R4.1", "R4.2", "R4.3", "R4.4", "R4.5", "R4.6"])
+@pytest.mark.parametrize("name", ["flakes", "fibers", "two flakes", "three tilted", "three tilted, from below", "haze"])
 def test_single_scattering(name):
     layers, direction, up, down, straight = HEMISPHERES[name]
     seen = measure(lj.Stack(layers()), lj.direction(*direction))
