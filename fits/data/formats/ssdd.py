@@ -11,6 +11,7 @@
 A block holds the BSDF in 1/sr, without the cosine, over the product of its lists, PARAM0 running fastest; angles are
 degrees. Directions are those of libbsdf: the light at azimuth 0 where there is no PARAM1_LIST, the mirror direction at
 180; around it, azimuth 0 points towards the normal. A BTDF is written as if it were reflected, and turned below here.
+Where lists name one pair of directions again, as all azimuths do around the pole, and 360 beside 0, the first is taken.
 As in its "SSDD file format", and in `SpecularCoordinateSystem.h`, `HalfDifferenceCoordinateSystem.h` and `Btdf.h`.
 """
 
@@ -18,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fits.data.formats._text import Line, plural, rows
 from fits.data.geometry import TANGENT_COSINE, Floats, direction
@@ -62,15 +64,19 @@ def read(path: Path) -> Measurements:
     for block in tables[1:]:
         if _channels(block) != channels:
             raise block.line.error("this block has other colours than the first")
-    parts = [_directions(block) for block in tables]
-    wi, wo = (np.concatenate(one) for one in zip(*parts, strict=True))
-    values = np.concatenate([block.values for block in tables])
-    below = [block.kind == "btdf" for block in tables for _ in range(len(block.values))]
+    directions = [_directions(block) for block in tables]
+    firsts = [_once(*pair) for pair in directions]
+    wi, wo = (np.concatenate([pair[k][rows] for pair, rows in zip(directions, firsts, strict=True)]) for k in (0, 1))
+    values = np.concatenate([block.values[rows] for block, rows in zip(tables, firsts, strict=True)])
+    below = np.repeat([block.kind == "btdf" for block in tables], [len(rows) for rows in firsts])
     seen = np.minimum(wi[:, 2], wo[:, 2]) > TANGENT_COSINE
     wo[below, 2] *= -1.0
     if not seen.any():
         raise ValueError(f"{path}: no value has light and viewer above the horizon")
     notes = [" and ".join(f"{block.kind} in a {block.said['PARAM_TYPE'][1][0]}" for block in tables)]
+    again = sum(len(block.values) for block in tables) - len(values)
+    if again:
+        notes.append(f"left out: {plural(again, 'value')} at directions that the file holds already")
     if not seen.all():
         notes.append(f"left out: {plural(int((~seen).sum()), 'value')} at or beyond the horizon")
     if any("REDUCTION_TYPE" in block.said for block in tables):
@@ -217,6 +223,12 @@ def _directions(block: _Block) -> tuple[Floats, Floats]:
     offset = block.lists.get(4, np.zeros(len(lists[0])))
     tilt = zeroth + np.broadcast_to(offset, block.shape).ravel()
     return wi, _tilted(local, -tilt, first)
+
+
+def _once(wi: Floats, wo: Floats) -> NDArray[np.int_]:
+    """Rows at which a pair of directions (N, 3) stands first, in their order."""
+    pairs = np.round(np.concatenate([wi, wo], axis=-1), 9) + 0.0  # no -0
+    return np.sort(np.unique(pairs, axis=0, return_index=True)[1])
 
 
 def _tilted(local: Floats, theta: Floats, phi: Floats) -> Floats:
