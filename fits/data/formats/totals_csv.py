@@ -12,6 +12,7 @@ One to three of the kinds; for several channels one column each: total_reflectan
 
 import csv
 import io
+import itertools
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -90,6 +91,8 @@ def read(path: Path) -> Totals:
 def write(totals: Totals, path: str | Path, force: bool = False) -> None:
     """Write totals so that they come back as they are, but for spheres, of which no column tells.
 
+    What was read several times at an angle has as many rows of it.
+
     Raises:
         ValueError: the file exists and `force` is False, rows are masked, light comes along several directions of one
             angle, or the name of a channel would not come back.
@@ -102,18 +105,16 @@ def write(totals: Totals, path: str | Path, force: bool = False) -> None:
     kinds = [kind for kind in KINDS if kind in totals.kinds]
     spreads = [""] if totals.sigma is None else ["", SUFFIXES[0]]
     names = [f"{COLUMNS[kind]}{_end(name)}{suffix}" for kind in kinds for suffix in spreads for name in totals.channels]
-    angles = np.unique(np.round(totals.theta_i, 9))
+    arrays = [totals.values] if totals.sigma is None else [totals.values, totals.sigma]
     rows = []
-    for angle in angles:
-        cells: list[str] = []
-        for kind in kinds:
-            own = [k for k, one in enumerate(totals.kinds) if one == kind and abs(totals.theta_i[k] - angle) < 1e-8]
-            if len(own) > 1:
-                raise ValueError(f"{path}: {kind} was read {len(own)} times at {angle:g} degrees")
-            for array in (totals.values, totals.sigma)[: len(spreads)]:
-                assert array is not None
-                cells += [repr(float(number)) for number in array[own[0]]] if own else [""] * len(totals.channels)
-        rows.append([repr(float(angle)), *cells])
+    for angle in np.unique(np.round(totals.theta_i, 9)):
+        here = np.flatnonzero(abs(totals.theta_i - angle) < 1e-8)
+        if np.ptp(totals.wi[here], axis=0).max() > 1e-6:
+            raise ValueError(f"{path}: light comes from several azimuths at {angle:g} degrees, no column tells of them")
+        own = [[k for k in here if totals.kinds[k] == kind] for kind in kinds]
+        for at in itertools.zip_longest(*own):
+            cells = [_cells(array, k) for k in at for array in arrays]
+            rows.append([repr(float(angle)), *itertools.chain.from_iterable(cells)])
     text = io.StringIO()
     text.writelines(f"# note: {' '.join(note.split())}\n" for note in totals.source.notes)
     writer = csv.writer(text, lineterminator="\n")
@@ -123,6 +124,10 @@ def write(totals: Totals, path: str | Path, force: bool = False) -> None:
 
 def _end(channel: str) -> str:
     return "" if channel == channel_names(1)[0] else f"_{channel}"
+
+
+def _cells(array: Floats, row: int | None) -> list[str]:
+    return [""] * array.shape[1] if row is None else [repr(float(number)) for number in array[row]]
 
 
 def _channels(names: list[str], column: str) -> dict[str, str]:

@@ -1,9 +1,12 @@
 """Totals as columns of a CSV: read as they stand, refused on one line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from fits.data.formats import read, write_csv
+from fits.data.formats import read, totals_csv, write_csv
+from fits.data.geometry import direction
 from fits.data.totals import Totals
 
 HEADER = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"
@@ -32,6 +35,23 @@ def test_channels_and_unscattered_light(tmp_path):
     assert found.channels == ("red", "blue")
     assert found.kinds == ("unscattered",)
     assert found.sigma is None
+
+
+def test_readings_that_were_repeated_come_back(tmp_path):
+    names = "theta_i,total_reflectance,total_reflectance_std,unscattered_transmittance,unscattered_transmittance_std"
+    found = read(written(tmp_path, names, "0,0.3,0.01,0.2,0.01", "0,0.31,0.02,,", "30,0.4,0.01,0.1,0.01"))
+    totals_csv.write(found, tmp_path / "again.csv")
+    again = read(tmp_path / "again.csv")
+    assert again.kinds == found.kinds == ("reflectance",) * 3 + ("unscattered",) * 2
+    for name in ("theta_i", "values", "sigma"):
+        np.testing.assert_allclose(getattr(again, name), getattr(found, name), atol=1e-9)
+
+
+def test_azimuths_of_the_light_are_not_lost_silently(tmp_path):
+    found = Totals.of([30, 30], reflectance=0.3)
+    turned = replace(found, wi=direction(30, [180, 90]))
+    with pytest.raises(ValueError, match="several azimuths at 30 degrees"):
+        totals_csv.write(turned, tmp_path / "turned.csv")
 
 
 def test_they_are_not_written_as_what_they_are_not(tmp_path):
