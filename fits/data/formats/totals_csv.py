@@ -7,7 +7,8 @@ total_transmittance          all that leaves on the other side, what passes stra
 unscattered_transmittance    of this, what no medium has scattered
 <that column>_std | _sigma   its standard deviation (all of a kind, or none)
 
-One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read.
+One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read; of
+several channels all are empty then.
 """
 
 import csv
@@ -18,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fits._files import write_text
 from fits.data.formats._text import content, read_lines
@@ -35,9 +37,9 @@ _SHARE, _ANGLE, _POSITIVE = (0.0, np.inf), (0.0, np.nextafter(90.0, 0.0)), (np.n
 
 
 def recognises(first_line: str) -> bool:
-    """Whether the first line that is no comment names a column of totals."""
+    """Whether the first line that is no comment names a column of totals, and no viewer."""
     names = [name.strip().strip('"') for name in first_line.split(delimiter_of(first_line))]
-    return any(name.startswith(tuple(COLUMNS.values())) for name in names)
+    return "theta_o" not in names and any(name.startswith(tuple(COLUMNS.values())) for name in names)
 
 
 def read(path: Path) -> Totals:
@@ -47,6 +49,8 @@ def read(path: Path) -> Totals:
         ValueError: on one line, which names file, line, column, value and allowed range.
     """
     lines = content(read_lines(path))
+    if not lines:
+        raise ValueError(f"{path}: the file holds only comments, must have a header line")
     header, body = lines[0], lines[1:]
     table = Table(header, body)
     angles = table.column("theta_i", _ANGLE)
@@ -62,7 +66,7 @@ def read(path: Path) -> Totals:
             raise header.error(f"channels {', '.join(columns)}: every kind must have the same, {', '.join(channels)}")
         spreads = [name + suffix for name in columns.values() for suffix in SUFFIXES if name + suffix in table.names]
         part = _numbers(table, columns.values(), _SHARE)
-        given = ~np.isnan(part).any(axis=1)
+        given = _given(table, list(columns.values()), part)
         if spreads:
             if len(spreads) != len(columns):
                 raise header.error(f"{', '.join(spreads)}: every channel must have one standard deviation, or none")
@@ -74,6 +78,8 @@ def read(path: Path) -> Totals:
         known |= {*columns.values(), *spreads}
     if sigma and len(sigma) != len(named):
         raise header.error("only some kinds have standard deviations: all must, or none")
+    if not kinds:
+        raise header.error("all cells of shares are empty, must be one reading at least")
     ignored = [name for name in table.names if name not in known]
     totals = Totals(
         wi=np.concatenate(wi),
@@ -108,7 +114,7 @@ def write(totals: Totals, path: str | Path, force: bool = False) -> None:
     arrays = [totals.values] if totals.sigma is None else [totals.values, totals.sigma]
     rows = []
     for angle in np.unique(np.round(totals.theta_i, 9)):
-        here = np.flatnonzero(abs(totals.theta_i - angle) < 1e-8)
+        here = np.flatnonzero(abs(totals.theta_i - angle) < 1e-8).tolist()
         if np.ptp(totals.wi[here], axis=0).max() > 1e-6:
             raise ValueError(f"{path}: light comes from several azimuths at {angle:g} degrees, no column tells of them")
         own = [[k for k in here if totals.kinds[k] == kind] for kind in kinds]
@@ -140,3 +146,12 @@ def _channels(names: list[str], column: str) -> dict[str, str]:
 def _numbers(table: Table, names: Iterable[str], allowed: tuple[float, float]) -> Floats:
     """The columns (N, C), NaN where a cell is empty."""
     return np.stack([table.column(name, allowed, empty=np.nan) for name in names], axis=-1)
+
+
+def _given(table: Table, names: list[str], values: Floats) -> NDArray[np.bool_]:
+    """Rows (N,) of values (N, C) that were read; ValueError for one that only some channels were read in."""
+    empty = np.isnan(values)
+    for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1)):
+        name = names[int(np.argmax(empty[row]))]
+        raise table.body[row].error("the cell is empty, must hold a number where other channels do", name)
+    return np.asarray(~empty.any(axis=1))

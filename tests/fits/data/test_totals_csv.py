@@ -54,6 +54,12 @@ def test_azimuths_of_the_light_are_not_lost_silently(tmp_path):
         totals_csv.write(turned, tmp_path / "turned.csv")
 
 
+def test_a_bsdf_beside_a_column_of_totals_is_a_bsdf(tmp_path):
+    found = read(written(tmp_path, "theta_i,theta_o,brdf,total_reflectance", "0,20,0.1,0.3"))
+    assert not isinstance(found, Totals)
+    assert "columns not used: total_reflectance" in found.source.notes
+
+
 def test_they_are_not_written_as_what_they_are_not(tmp_path):
     with pytest.raises(ValueError, match="totals are no BSDF values"):
         write_csv(Totals.of(reflectance=0.3), tmp_path / "new.csv")
@@ -76,10 +82,13 @@ def test_more_than_all_the_light_is_noted(tmp_path):
         (("total_reflectance", "0.3"), "no column 'theta_i'"),
         (("theta_i,total_reflectance,total_reflectance_std,total_transmittance", "0,0.3,0.1,0.2"), "only some kinds"),
         (("theta_i,total_reflectance_a,total_transmittance_b", "0,0.3,0.1"), "every kind must have the same"),
+        (("theta_i,total_reflectance_a,total_reflectance_b", "0,0.3,"), "line 2, column 'total_reflectance_b': the cell"),
+        (("theta_i,total_reflectance", "0,", "10,"), "line 1: all cells of shares are empty"),
+        (("# a comment",), "the file holds only comments, must have a header line"),
     ],
 )
 def test_bad_files_are_refused_on_one_line(tmp_path, lines, words):
     with pytest.raises(ValueError, match=words) as refused:
-        read(written(tmp_path, *lines))
+        read(written(tmp_path, *lines), format="totals")
     assert "\n" not in str(refused.value)
     assert "slab.csv" in str(refused.value)
