@@ -45,6 +45,11 @@ def write_measurements(data: Measurements, arguments: Namespace) -> int:
     from fits.data.formats.csv import write_csv
 
     if isinstance(data, Totals):
+        if data.spheres is not None:
+            raise ValueError(
+                f"{data.source.path}: integrating spheres read these shares, of which no column of a CSV tells; "
+                "`layerjax fit` takes the file as it is"
+            )
         totals_csv.write(data, arguments.out, force=arguments.force)
         print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the light")
         return DONE

@@ -111,10 +111,10 @@ def _read_as(
 ) -> Measurements:
     if kind == "csv":
         return csv.read(path, checked)
-    if kind == "totals":
-        return totals_csv.read(path)
-    if kind == "rxt":
-        return rxt.read_slab(path).totals
+    if kind in ("totals", "rxt"):
+        if checked is not None:
+            raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
+        return totals_csv.read(path) if kind == "totals" else rxt.read_slab(path).totals
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {checked!r}, a MERL file always holds 'brdf'")

@@ -87,9 +87,19 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
             "--only chooses nothing",
         ),
         (["fit", "totals.csv", "--stack", "slab.toml", "--out", "r", "--mask-grazing", "50"], "--mask-grazing chooses"),
+        (["info", "totals.csv", "--quantity", "brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
         (["search", "totals.csv", "--out", "r"], "a search takes values along directions"),
     ):
         assert message in refused(words, capsys, folder)
+
+
+def test_readings_of_spheres_are_not_converted_to_what_tells_of_none(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(folder)
+    sphere = "200 25 12 1 0.96"
+    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
+    assert "slab.rxt: integrating spheres" in refused(["convert", "slab.rxt", "slab.csv"], capsys, folder)
 
 
 def test_many_channels_have_a_range(tmp_path: Path) -> None:
