@@ -46,6 +46,8 @@ def came_as(data: "Measurements") -> str:
 def _sigma_words(data: "Measurements") -> str:
     if data.sigma is None:
         return "none"
+    if not data.mask.any():
+        return "no reading is used"
     with np.errstate(divide="ignore", invalid="ignore"):
         relative = (data.sigma / np.abs(data.values))[data.mask]
     return f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"

@@ -257,6 +257,11 @@ def test_info_says_what_is_there_and_draws_it(work: Path, capsys: pytest.Capture
     assert (work / "data.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_info_of_what_is_all_masked(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", "data.csv", "--mask-grazing", "1"]) == 0
+    assert "no reading is used" in capsys.readouterr().out
+
+
 def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> None:
     assert main(["convert", "data.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
