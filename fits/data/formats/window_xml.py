@@ -65,14 +65,22 @@ def read(path: Path) -> Measurements:
         raise ValueError(f"{path}: no WavelengthData of 'Visible'")
     colours = tuple(one for one in ("X", "Y", "Z") if matrices.get(one, {}).keys() == matrices["Y"].keys())
     chosen = colours if len(colours) == len(CHANNELS) else ("Y",)
-    return _readings(path, [matrices[one] for one in chosen], used, chosen if len(chosen) > 1 else channel_names(1))
+    left_out = sorted(matrices.keys() - set(chosen))
+    notes = [f"left out: {' and '.join(left_out)}, the blocks are not those of the visible"] if left_out else []
+    channels = chosen if len(chosen) > 1 else channel_names(1)
+    return _readings(path, [matrices[one] for one in chosen], used, channels, notes)
 
 
 def _readings(
-    path: Path, matrices: list[dict[str, Floats]], used: dict[str, tuple[Basis, Basis]], channels: tuple[str, ...]
+    path: Path,
+    matrices: list[dict[str, Floats]],
+    used: dict[str, tuple[Basis, Basis]],
+    channels: tuple[str, ...],
+    more_notes: list[str],
 ) -> Measurements:
     wi, wo, values, mask = [], [], [], []
-    for name, (come, leave) in used.items():
+    for name in matrices[0]:
+        come, leave = used[name]
         kind, _, side = name.partition(" ")
         sign = COME[side]
         through = kind == "transmission"
@@ -86,9 +94,10 @@ def _readings(
         straight = through & (np.abs(pairs[0] + pairs[1]).max(axis=-1) < 1e-9)
         mask.append(~straight.ravel())
     notes = (
-        ", ".join(used) + "; WINDOW's front is the top (Radiance calls it the back)",
+        ", ".join(matrices[0]) + "; WINDOW's front is the top (Radiance calls it the back)",
         "means over patches, read at their middles",
         *(["masked: patches in which light passes straight"] if not all(part.all() for part in mask) else []),
+        *more_notes,
     )
     source = Source(str(path), "klems", "brdf", notes)
     parts = [np.concatenate(one) for one in (wi, wo, values, mask)]

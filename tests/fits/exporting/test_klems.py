@@ -164,3 +164,13 @@ def test_what_is_wrong_is_named(tmp_path: Path, grey: bytes, old: bytes, new: by
     with pytest.raises(ValueError, match=message) as error:
         fits.read(bad)
     assert str(error.value).startswith(f"{bad}: ")
+
+
+def test_blocks_that_the_visible_lacks_are_left_out(tmp_path: Path, grey: bytes) -> None:
+    start, end = grey.index(b"<WavelengthData>"), grey.index(b"</WavelengthData>") + len(b"</WavelengthData>")
+    more = grey[start:end].replace(b">Visible<", b">CIE-X<").replace(b"Reflection Front", b"Reflection Back")
+    path = tmp_path / "two.xml"
+    path.write_bytes(grey[:end] + more + grey[end:])
+    data = fits.read(path)
+    assert len(data) == 145**2
+    assert data.source.notes[-1] == "left out: X, the blocks are not those of the visible"
