@@ -17,7 +17,7 @@ from fits.data.geometry import LIGHT_AZIMUTH, Floats, Geometry
 from fits.data.measurements import Measurements, Source
 
 MOST = 20_000
-"""Readings, unless all or some number of them are asked for."""
+"""Readings of twice as many nodes or more, unless all or some number of them are asked for."""
 
 LOWEST = 0.01
 """Cosine of the viewer, of readings that are taken."""
@@ -34,7 +34,7 @@ def read(
     """Read such a file; of an isotropic material the light stands at azimuth 180 degrees.
 
     geometry: directions above the surface, to look up as renderers do; None: the nodes of the file themselves.
-    bins: so many nodes from all over the file, at most 100,000, or "all"; None: all, or 20,000 if they are more.
+    bins: so many nodes from all over the file, at most 100,000, or "all"; None: all, or 20,000 of 40,000 and more.
     seed: of a choice.
     """
     if bins is not None:
@@ -74,7 +74,7 @@ def _at_nodes(
     if not readable.any():
         raise ValueError(f"{path}: no node has light and viewer above the horizon")
     count = int(readable.sum())
-    if bins == "all" or (bins is None and count <= MOST):
+    if bins == "all" or (bins is None and count < 2 * MOST):
         place = np.argwhere(readable)
         note = f"readings at all {plural(count, 'node')} above the horizon"
     else:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
+from fits.data.formats import read, rgl
 from fits.data.formats._tensor_file import fields_as_bytes, read_fields
 from fits.data.formats.rgl_table import Table, read_table, table_as_bytes
 from fits.data.geometry import Floats, Geometry, slices
@@ -65,6 +65,15 @@ def test_some_nodes_from_all_over(path: Path) -> None:
     data = read(path, bins=200, seed=4)
     assert len(data) == 200
     assert len(read(path, bins="all")) == len(read(path))
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.5, 0.5), (0.51, 1.0), (0.9, 1.0)])
+def test_all_nodes_are_read_unless_they_are_twice_as_many(
+    path: Path, monkeypatch: pytest.MonkeyPatch, share: float, count: float
+) -> None:
+    nodes = len(read(path, bins="all"))
+    monkeypatch.setattr(rgl, "MOST", int(share * nodes))
+    assert len(read(path)) == int(count * nodes)
 
 
 def test_spectra_are_channels_by_their_wavelengths(tmp_path: Path) -> None:
