@@ -9,6 +9,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import NoReturn
 
 from fits.cli.interrupts import raised_again
@@ -31,6 +32,8 @@ from fits.names import EXPORTS
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; bad usage leaves through `SystemExit` as argparse does."""
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="replace")  # degrees and Greek are not in every encoding
     arguments = build_parser().parse_args(argv)
 
     try:

@@ -1,6 +1,7 @@
 """The `layerjax` command: bad input is one line and exit code 2 with nothing written; good input does the work."""
 
 import gc
+import io
 import json
 import os
 import signal
@@ -280,6 +281,13 @@ def test_help_imports_no_jax() -> None:
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "simulate" in done.stdout
+
+def test_a_terminal_that_lacks_a_sign_gets_a_question_mark(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="ascii"))
+    assert main(["info", "data.csv"]) == 0
+    assert "50?" in shown.getvalue().decode("ascii")
+
 
 
 def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
