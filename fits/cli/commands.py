@@ -20,6 +20,7 @@ from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
 from fits.cli.materials import write_measurements
+from fits.cli.options import MAX_STEPS, SAMPLING, refuse_alone
 from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.predictions import predict as predict
 from fits.cli.predictions import print_scores
@@ -38,6 +39,8 @@ DONE, DOUBTFUL = 0, 1
 
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
+    if not arguments.sample:
+        refuse_alone(arguments, SAMPLING, "sample")
     use_jax()
     from fits.inference.nuts import require_blackjax
     from fits.many.fitting import fit_into, require_posterior
@@ -100,10 +103,10 @@ def _sample(directory: Path, arguments: Namespace) -> int:
             **settings,
             surrogate=arguments.surrogate,
             ess=arguments.ess,
-            max_steps=arguments.max_steps,
+            max_steps=arguments.max_steps or MAX_STEPS,
             path=directory / results.CHAIN,
             resume=not arguments.force,
-            allow_short=arguments.allow_short,
+            allow_short=bool(arguments.allow_short),
             progress=progress,
         )
         progress("pictures and report", 0, 1)

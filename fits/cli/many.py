@@ -5,6 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from fits.cli.interrupts import hint
+from fits.cli.options import refuse_alone
 from fits.cli.reading import reading
 from fits.cli.searches import searching
 from fits.cli.setting import use_jax
@@ -23,9 +24,9 @@ def fit_many(arguments: Namespace) -> int:
     from fits.reporting.tables import print_table
     from fits.structures.searching import STARTS
 
-    for name in ("library", "instrument", "noise"):
-        if not arguments.search and getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is given without --search: a stack file says it itself")
+    if not arguments.search:
+        only_searches = ("library", "layers", "instrument", "noise", "calibration")
+        refuse_alone(arguments, only_searches, "search: a stack file says it itself")
     out = Path(arguments.out)
     again = f"{out} keeps what was fitted; the same command again goes on with it"
     with show_progress() as progress, hint(again):

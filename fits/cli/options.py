@@ -6,6 +6,22 @@ from typing import Any
 from fits.cli.numbers import angle, count, level, seed
 from fits.names import FORMATS, OBJECTIVES, QUANTITIES, STRATA
 
+MAX_STEPS = 20_000
+LAYERS = 3
+
+SAMPLING = ("sampler", "walkers", "ess", "surrogate", "max_steps", "allow_short")
+"""Options of `add_sampling`."""
+
+READING = ("format", "quantity", "bins", "all", "strata")
+"""Options of `add_format`."""
+
+
+def refuse_alone(arguments: argparse.Namespace, names: tuple[str, ...], needed: str) -> None:
+    """ValueError for the first of these options that is given, where the one that they belong to is not."""
+    for name in names:
+        if getattr(arguments, name) not in (None, ()):
+            raise ValueError(f"--{name.replace('_', '-')} is given without --{needed}")
+
 
 def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:
     """One of the commands: what it does, and an example."""
@@ -32,7 +48,7 @@ def add_format(parser: "argparse._ActionsContainer") -> None:
     parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
     several = parser.add_mutually_exclusive_group()
     several.add_argument("--bins", type=count, metavar="N", help="of a MERL or RGL table, N bins from all over it")
-    several.add_argument("--all", action="store_true", help="of such a table, every bin that holds a measurement")
+    several.add_argument("--all", action="store_const", const=True, help="of such a table, every bin that holds a measurement")
     parser.add_argument(
         "--strata", choices=STRATA, help="what each of N bins has an equal share of: the table, or flux (default: bins)"
     )
@@ -61,9 +77,12 @@ def add_sampling(parser: argparse.ArgumentParser) -> None:
         action=argparse.BooleanOptionalAction,
         help="proposals from a surrogate of the model (default: the chain's, or where an evaluation is costly)",
     )
-    group.add_argument("--max-steps", type=count, default=20000, metavar="N", help="hard limit (default: %(default)s)")
+    group.add_argument("--max-steps", type=count, metavar="N", help=f"hard limit (default: {MAX_STEPS})")
     group.add_argument(
-        "--allow-short", action="store_true", help="report estimates from a chain under 50 autocorrelation times too"
+        "--allow-short",
+        action="store_const",
+        const=True,
+        help="report estimates from a chain under 50 autocorrelation times too",
     )
 
 
@@ -110,7 +129,7 @@ def add_hold_out(parser: argparse.ArgumentParser) -> None:
 def add_searching(parser: "argparse._ActionsContainer") -> None:
     """What is looked for, and how readings are believed."""
     parser.add_argument("--library", metavar="TOML", help="layers and bases to choose from (default: built in)")
-    parser.add_argument("--layers", type=int, default=3, metavar="N", help="over the base, at most (default: 3)")
+    parser.add_argument("--layers", type=int, metavar="N", help=f"over the base, at most (default: {LAYERS})")
     parser.add_argument("--instrument", metavar="TOML", help="a stack file, or any other, with an [instrument]")
     parser.add_argument(
         "--noise",
@@ -121,7 +140,6 @@ def add_searching(parser: "argparse._ActionsContainer") -> None:
     parser.add_argument(
         "--calibration",
         type=level,
-        default=0.0,
         metavar="SD",
         help="relative, of a common factor (default: it is exact)",
     )

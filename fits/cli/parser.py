@@ -136,7 +136,7 @@ def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
     parser.add_argument("--incidence", type=degrees, nargs="+", metavar="DEG", help="polar angles of the light")
     parser.add_argument(
-        "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
+        "--azimuth", type=float, nargs="+", metavar="DEG", help="planes; 0 holds the light (default: 0)"
     )
     parser.add_argument("--at", metavar="FILE", help="in place of --incidence: readings, whose prediction is scored")
     add_format(parser)

@@ -28,8 +28,9 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument(
         "--out", required=True, metavar="DIR", help="directory to write, or to go on with: DIR/FILE/STACK is a result"
     )
-    parser.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")
-    parser.add_argument(
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")
+    where.add_argument(
         "--scheduler",
         metavar="ADDRESS",
         help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fits._files import write_text
+from fits.cli.options import READING, refuse_alone
 from fits.cli.places import require_free_place
 from fits.cli.reading import reading
 from fits.cli.setting import use_jax
@@ -36,6 +37,10 @@ def predict(arguments: Namespace) -> int:
         raise ValueError("predict needs one of --incidence and --at")
     if arguments.at is None and arguments.out is None:
         raise ValueError("predict --incidence needs --out FILE")
+    if arguments.at is None:
+        refuse_alone(arguments, ("only", *READING), "at")
+    else:
+        refuse_alone(arguments, ("azimuth",), "incidence")
     if arguments.out is not None:
         require_free_place(arguments, ".csv", "predictions")
     use_jax()
@@ -47,7 +52,7 @@ def predict(arguments: Namespace) -> int:
     posterior = results.load_posterior(directory)
     of = posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
     if arguments.at is None:
-        at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth)
+        at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,))
     else:
         at = _predicted_readings(arguments)
     found = run_prediction(of, at)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fits.cli.interrupts import hint
+from fits.cli.options import LAYERS
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.progress import show_progress
@@ -43,9 +44,9 @@ def searching(arguments: Namespace, starts: int) -> "Searching":
 
     return Searching(
         library=None if arguments.library is None else read_library(arguments.library),
-        layers=arguments.layers,
+        layers=LAYERS if arguments.layers is None else arguments.layers,
         noise=arguments.noise,
-        calibration=arguments.calibration,
+        calibration=arguments.calibration or 0.0,
         instrument=None if arguments.instrument is None else read_instrument(arguments.instrument),
         starts=starts,
         seed=arguments.seed,

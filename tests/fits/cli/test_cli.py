@@ -29,6 +29,7 @@ TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6  # of the stack behind coat_data
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf\n"
 ROWS = "10,180,20,0,0.1\n10,180,30,0,0.1\n10,180,40,0,0.1\n"
 
+FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
 
 BAD_DATA = {
     "missing column": ("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n", "brdf"),
@@ -107,6 +108,9 @@ def test_a_layer_that_the_transport_cannot_carry_is_named(work: Path, capsys: py
             "cube_root",
         ),
         (["fit", "data.csv", "--stack", "coat.toml", "--out", "x", "--mask-grazing", "1"], "no sample"),
+        ([*FIT, "--ess", "100"], "--ess is given without --sample"),
+        ([*FIT, "--allow-short"], "--allow-short is given without --sample"),
+        ([*FIT, "--no-surrogate"], "--surrogate is given without --sample"),
         (["convert", "data.csv", "data.csv"], "--force"),
         (["convert", "data.csv", "data.bsdf"], ".csv"),
         (["simulate", "--stack", "coat.toml", "--out", "data.csv"], "--force"),
@@ -276,18 +280,18 @@ def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> 
     np.testing.assert_array_equal(read(work / "new.csv").values, first.values)
 
 
-def test_help_imports_no_jax() -> None:
-    script = "import sys; from fits.cli import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "simulate" in done.stdout
-
 def test_a_terminal_that_lacks_a_sign_gets_a_question_mark(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="ascii"))
     assert main(["info", "data.csv"]) == 0
     assert "50?" in shown.getvalue().decode("ascii")
 
+
+def test_help_imports_no_jax() -> None:
+    script = "import sys; from fits.cli import main\ntry: main(['--help'])\nfinally: assert 'jax' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "simulate" in done.stdout
 
 
 def test_an_interrupt_that_a_callback_drops_comes_again() -> None:

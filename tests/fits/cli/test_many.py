@@ -58,6 +58,8 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
         (["scans", "--stacks", "bare.toml", "--only", "everything"], "'everything' is no selection"),
         (["scans", "--stacks", "bare.toml", "--strata", "flux"], "--strata is given without --bins"),
         (["scans", "--stacks", "bare.toml", "--noise", "0.1"], "--noise is given without --search"),
+        (["scans", "--stacks", "bare.toml", "--calibration", "0"], "--calibration is given without --search"),
+        (["scans", "--stacks", "bare.toml", "--layers", "2"], "--layers is given without --search"),
         (["scans", "--stacks", "bare.toml", "--objective", "cube_root", "--hold-out", "incidence=50"], "--hold-out"),
     ],
 )
@@ -68,18 +70,27 @@ def test_bad_input_is_one_line(
     assert not (folder / "out").exists()
 
 
-def test_no_processes_are_bad_usage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([*MANY[:-1], "0"], "must be a whole number >= 1"),
+        ([*MANY, "--scheduler", "tcp://127.0.0.1:1"], "--scheduler: not allowed with argument --processes"),
+    ],
+)
+def test_processes_are_some_and_none_beside_a_cluster(
+    folder: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
     with pytest.raises(SystemExit) as stop:
-        main([*MANY[:-1], "0"])
+        main(words)
     assert stop.value.code == 2
-    assert "must be a whole number >= 1" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_cluster_that_is_not_there_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     dask = pytest.importorskip("dask")
     pytest.importorskip("distributed")
     with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
-        assert main([*MANY, "--scheduler", "tcp://127.0.0.1:9"]) == 2
+        assert main([*MANY[:-2], "--scheduler", "tcp://127.0.0.1:9"]) == 2
     assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 

@@ -12,6 +12,7 @@ from fits.reporting.results import load_fit, save_fit
 from tests.helpers.commands import refused
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "2"]
+ALONG = ["predict", "result", "--incidence", "30", "--out", "new.csv"]
 
 
 def test_readings_are_held_out_and_scored(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +64,9 @@ def test_predictions_are_written(work: Path, capsys: pytest.CaptureFixture[str],
         (["predict", "result", "--incidence", "30", "--at", "data.csv"], "predict needs one of --incidence and --at"),
         (["predict", "result", "--incidence", "30"], "predict --incidence needs --out FILE"),
         (["predict", "result", "--incidence", "30", "--out", "new.txt"], ".csv"),
+        ([*ALONG, "--only", "plane=0"], "--only is given without --at"),
+        ([*ALONG, "--all"], "--all is given without --at"),
+        (["predict", "result", "--at", "data.csv", "--azimuth", "90"], "--azimuth is given without --incidence"),
         (["predict", "nowhere", "--incidence", "30", "--out", "new.csv"], "nowhere"),
         (["predict", "result", "--at", "nowhere.csv"], "nowhere.csv"),
         (["predict", "result", "--at", "data.csv", "--only", "incidence=40"], "incidence 40 is not in the data"),
