@@ -26,6 +26,7 @@ from fits.cli.predictions import predict as predict
 from fits.cli.predictions import print_scores
 from fits.cli.reading import measurements, reading
 from fits.cli.setting import use_jax
+from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.maps.fitted_map import is_store
 from fits.progress import show_progress
@@ -33,8 +34,11 @@ from fits.progress import show_progress
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
     from fits.inference.posterior import Posterior
+    from fits.inference.sampling import Sampler
+    from fits.problem.stack_file import ProblemFile
 
 DONE, DOUBTFUL = 0, 1
+SAMPLER: "Sampler" = "emcee"
 
 
 def fit(arguments: Namespace) -> int:
@@ -42,7 +46,6 @@ def fit(arguments: Namespace) -> int:
     if not arguments.sample:
         refuse_alone(arguments, SAMPLING, "sample")
     use_jax()
-    from fits.inference.nuts import require_blackjax
     from fits.many.fitting import fit_into, require_posterior
     from fits.problem.stack_file import read_problem
     from fits.reporting import results, tables, verdicts
@@ -54,8 +57,8 @@ def fit(arguments: Namespace) -> int:
     data, unseen = reading(arguments).parts(arguments.data)
     given = read_problem(arguments.stack)
     require_posterior(arguments.objective or given.objective, "--sample" if arguments.sample else None)
-    if arguments.sample and arguments.sampler == "nuts":
-        require_blackjax()
+    if arguments.sample:
+        _require_sampling(given, data, arguments)
     kept = f"{directory} was not written; the same command again goes on with the starts that are done"
     with show_progress() as progress, hint(kept):
         result, foretold = fit_into(
@@ -79,6 +82,22 @@ def fit(arguments: Namespace) -> int:
     if arguments.sample:
         return _sample(directory, arguments)
     return DONE if result.converged else DOUBTFUL
+
+
+def _require_sampling(given: "ProblemFile", data: Measurements, arguments: Namespace) -> None:
+    """ValueError, before anything is fitted, for settings of a sampler that is to follow."""
+    from fits.inference.sampling import require_settings
+    from fits.problem.problem import Problem
+
+    problem = Problem(given.stack, data, given.transport, given.noise, given.scale, instrument=given.instrument)
+    require_settings(
+        len(problem.names),
+        sampler=SAMPLER if arguments.sampler is None else arguments.sampler,
+        walkers=arguments.walkers,
+        surrogate=arguments.surrogate,
+        ess=arguments.ess,
+        max_steps=arguments.max_steps or MAX_STEPS,
+    )
 
 
 def sample(arguments: Namespace) -> int:
@@ -134,7 +153,7 @@ def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
 
     stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
     settings: dict[str, Any] = {}
-    for name, kind, default in (("sampler", str, "emcee"), ("walkers", int, None), ("seed", int, 0)):
+    for name, kind, default in (("sampler", str, SAMPLER), ("walkers", int, None), ("seed", int, 0)):
         wanted, there = getattr(arguments, name), stored.get(name)
         if wanted is not None and there is not None and wanted != there:
             raise ValueError(f"--{name} is {wanted}, the chain in {path} has {there} (--force starts it again)")

@@ -71,9 +71,12 @@ def sample(
         OSError: the disk is full, say. What was sampled is kept.
     """
     problem = fit.problem
-    _require_possible(fit, sampler, surrogate, ess, max_steps, path)
-    walkers = _walkers(sampler, walkers, len(problem.names))
-    identity, count = identity_of(problem, walkers, seed, sampler), len(problem.names)
+    _require_possible(fit, path)
+    count = len(problem.names)
+    walkers = require_settings(
+        count, sampler=sampler, walkers=walkers, surrogate=surrogate, ess=ess, max_steps=max_steps
+    )
+    identity = identity_of(problem, walkers, seed, sampler)
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
         moved = Nuts(fit, chain, seed) if sampler == "nuts" else Ensemble(fit, chain, seed)
@@ -101,12 +104,18 @@ def _run(
     chain.checkpoint()  # what a killed run left in the journal alone
 
 
-def _require_possible(
-    fit: Fit, sampler: str, surrogate: bool | None, ess: float | None, max_steps: int, path: str | Path | None
-) -> None:
-    """ValueError for what `sample` cannot do, before anything is written."""
+def _require_possible(fit: Fit, path: str | Path | None) -> None:
+    """ValueError for a fit that cannot be sampled, or a place that a chain cannot be kept in."""
     if not fit.is_posterior:
         raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
+    if path is not None and not Path(path).parent.is_dir():
+        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
+
+
+def require_settings(
+    count: int, *, sampler: Sampler, walkers: int | None, surrogate: bool | None, ess: float | None, max_steps: int
+) -> int:
+    """The walkers, or chains, of `sample`. ValueError for settings by which it cannot sample so many parameters."""
     if sampler not in get_args(Sampler):
         raise ValueError(f"sampler is {sampler!r}; it must be one of {', '.join(get_args(Sampler))}")
     if sampler == "nuts":
@@ -117,8 +126,7 @@ def _require_possible(
         raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
     if ess is not None and not ess > 0:
         raise ValueError(f"ess is {ess}; it must be above 0")
-    if path is not None and not Path(path).parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {Path(path).parent}")
+    return _walkers(sampler, walkers, count)
 
 
 def _walkers(sampler: Sampler, walkers: int | None, count: int) -> int:
