@@ -48,7 +48,9 @@ def add_format(parser: "argparse._ActionsContainer") -> None:
     parser.add_argument("--quantity", choices=QUANTITIES, help="what the values are (default: what the file says)")
     several = parser.add_mutually_exclusive_group()
     several.add_argument("--bins", type=count, metavar="N", help="of a MERL or RGL table, N bins from all over it")
-    several.add_argument("--all", action="store_const", const=True, help="of such a table, every bin that holds a measurement")
+    several.add_argument(
+        "--all", action="store_const", const=True, help="of such a table, every bin that holds a measurement"
+    )
     parser.add_argument(
         "--strata", choices=STRATA, help="what each of N bins has an equal share of: the table, or flux (default: bins)"
     )

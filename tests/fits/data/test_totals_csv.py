@@ -82,7 +82,10 @@ def test_more_than_all_the_light_is_noted(tmp_path):
         (("total_reflectance", "0.3"), "no column 'theta_i'"),
         (("theta_i,total_reflectance,total_reflectance_std,total_transmittance", "0,0.3,0.1,0.2"), "only some kinds"),
         (("theta_i,total_reflectance_a,total_transmittance_b", "0,0.3,0.1"), "every kind must have the same"),
-        (("theta_i,total_reflectance_a,total_reflectance_b", "0,0.3,"), "line 2, column 'total_reflectance_b': the cell"),
+        (
+            ("theta_i,total_reflectance_a,total_reflectance_b", "0,0.3,"),
+            "line 2, column 'total_reflectance_b': the cell",
+        ),
         (("theta_i,total_reflectance", "0,", "10,"), "line 1: all cells of shares are empty"),
         (("# a comment",), "the file holds only comments, must have a header line"),
     ],
