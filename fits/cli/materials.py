@@ -1,5 +1,6 @@
 """What commands do with a material rather than with data: simulate its readings, draw it, write it for renderers."""
 
+import tomllib
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ DONE = 0
 
 
 def simulate(arguments: Namespace) -> int:
-    """Write what a goniometer would measure of a stack."""
+    """Write what a goniometer would measure of a stack; what its file says of readings is left out, and told."""
     require_free_place(arguments, ".csv", "measurements")
     use_jax()
     from fits.data.geometry import slices
@@ -36,7 +37,13 @@ def simulate(arguments: Namespace) -> int:
         floor=arguments.floor,
         seed=arguments.seed,
     )
-    return write_measurements(data, arguments)
+    unseen = [f"[{name}]" for name in ("noise", "scale", "instrument") if name in tomllib.loads(given.text)]
+    if not unseen:
+        return write_measurements(data, arguments)
+    note = f"not simulated: {', '.join(unseen)} of {arguments.stack}"
+    write_measurements(data.noted(note), arguments)
+    print(f"{note[0].upper()}{note[1:]}")
+    return DONE
 
 
 def write_measurements(data: Measurements, arguments: Namespace) -> int:

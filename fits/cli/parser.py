@@ -241,7 +241,10 @@ def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "layerjax simulate --stack coat.toml --incidence 10 30 50 70 --noise 0.05 --out simulated.csv",
     )
     parser.add_argument(
-        "--stack", required=True, metavar="TOML", help="the stack; free parameters take their start value"
+        "--stack",
+        required=True,
+        metavar="TOML",
+        help="the stack, free parameters at their start; its [noise], [scale] and [instrument] are left out",
     )
     parser.add_argument("--out", required=True, metavar="CSV", help="file to write; its name ends in .csv")
     parser.add_argument(

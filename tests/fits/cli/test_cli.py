@@ -16,8 +16,6 @@ import pytest
 
 from fits.cli.interrupts import raised_again
 from fits.cli.parser import main
-from fits.data.formats import read
-from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.problem.problem import Problem
 from fits.reporting.results import load_fit, load_posterior, save_fit
@@ -248,38 +246,6 @@ def test_an_interrupted_sampler_says_how_to_go_on(
     monkeypatch.setattr("fits.inference.sampling.sample", interrupted)
     assert main(["sample", "result"]) == 130
     assert "`layerjax sample result` goes on with it" in capsys.readouterr().err
-
-
-def test_info_says_what_is_there_and_draws_it(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", "data.csv", "--out", "data.png", "--mask-retro", "8"]) == 0
-    output = capsys.readouterr().out
-    for word in ("csv", "brdf", "10°", "50°", "sigma", "median 3.00%"):
-        assert word in output
-    assert (work / "data.png").read_bytes().startswith(b"\x89PNG")
-    (work / "data.png").write_bytes(b"precious")
-    assert main(["info", "data.csv"]) == 0
-    assert "--force" in capsys.readouterr().out
-    assert (work / "data.png").read_bytes() == b"precious"
-    assert main(["info", "data.csv", "--force"]) == 0
-    assert (work / "data.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_info_of_what_is_all_masked(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["info", "data.csv", "--mask-grazing", "1"]) == 0
-    assert "no reading is used" in capsys.readouterr().out
-
-
-def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> None:
-    assert main(["convert", "data.csv", "copy.csv"]) == 0
-    np.testing.assert_array_equal(read(work / "copy.csv").values, coat_data.values)
-    words = ["simulate", "--stack", "coat.toml", "--incidence", "20", "40", "--noise", "0.1", "--out", "new.csv"]
-    assert main([*words, "--seed", "3"]) == 0
-    first = read(work / "new.csv")
-    assert sorted(set(first.theta_i)) == [20.0, 40.0]
-    # Lambertian paint alone would be albedo / pi = 0.159; the coat's start values darken it
-    assert 0.02 < float(np.median(first.values)) < 0.16
-    assert main([*words, "--seed", "3", "--force"]) == 0
-    np.testing.assert_array_equal(read(work / "new.csv").values, first.values)
 
 
 def test_a_terminal_that_lacks_a_sign_gets_a_question_mark(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
