@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 CHECKSUM = "checksum"
+_UMASK = os.umask(0)  # it can be read by setting it alone: once, before other threads make files
+os.umask(_UMASK)
 
 
 def write_text(path: str | Path, text: str, force: bool = False) -> None:
@@ -145,6 +147,4 @@ def _holder(path: Path) -> str:
 
 def permissions(mode: int) -> int:
     """The mode less what the user's umask takes away."""
-    current = os.umask(0)
-    os.umask(current)
-    return mode & ~current
+    return mode & ~_UMASK
