@@ -18,6 +18,14 @@ _UMASK = os.umask(0)  # it can be read by setting it alone: once, before other t
 os.umask(_UMASK)
 
 
+def require_file(path: Path) -> None:
+    """ValueError for what is no file: files are read more than once, which pipes are not."""
+    if path.is_dir():
+        raise ValueError(f"{path}: is a directory, must be a file")
+    if not path.is_file():
+        raise ValueError(f"{path}: {'is a pipe or a device, must be a file' if path.exists() else 'no such file'}")
+
+
 def write_text(path: str | Path, text: str, force: bool = False) -> None:
     """Write a UTF-8 text file; an existing file is a ValueError unless `force`."""
     write_bytes(path, text.encode(), force)

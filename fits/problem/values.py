@@ -13,6 +13,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from fits._files import require_file
+
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
 MOST = 2**31 - 1  # of a whole number: counts are kept in 32 bits
@@ -24,10 +26,7 @@ _LONG_NUMBER = re.compile(r"[0-9](?:_?[0-9]){400,}")
 
 def read_tables(path: Path) -> tuple[str, dict[str, Any]]:
     """The text of a TOML file, without a byte order mark, and its tables. ValueError that names the file."""
-    if path.is_dir():
-        raise ValueError(f"{path}: is a directory, must be a file")
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    require_file(path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
         return text, _parse(text)

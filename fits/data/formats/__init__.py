@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from fits._files import require_file
 from fits.data.formats import (
     alta,
     astm,
@@ -84,8 +85,7 @@ def read(
     """
     path = Path(path)
     checked = check_quantity(quantity)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    require_file(path)
     kind = sniff(path) if format is None else format
     if kind not in ("merl", "rgl") and (geometry is not None or bins is not None):
         raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")

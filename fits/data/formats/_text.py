@@ -8,6 +8,7 @@ import numpy as np
 
 from fits.data.geometry import Floats
 
+BOM = b"\xef\xbb\xbf"
 ANY_NUMBER = (-math.inf, math.inf)
 
 
@@ -41,9 +42,9 @@ class Line:
         return [self.parse(cell, column, allowed) for column, cell in enumerate(self.text.split(), start=1)]
 
 
-def read_lines(path: Path, encoding: str = "utf-8-sig") -> list[Line]:
-    """All lines of a text file; ValueError for an empty file or one that is not text."""
-    raw = path.read_bytes()
+def read_lines(path: Path, encoding: str = "utf-8") -> list[Line]:
+    """All lines of a text file, without a byte order mark; ValueError for an empty file or one that is not text."""
+    raw = path.read_bytes().removeprefix(BOM)
     if not raw.strip():
         raise ValueError(f"{path}: the file is empty")
     try:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fits._files import require_file
 from fits.data.formats._text import Line, read_lines
 from fits.data.geometry import Floats
 from fits.data.measurements import Source
@@ -90,8 +91,7 @@ def read_slab(
         ValueError: on one line: no such file, another format, or numbers that are missing or out of range.
     """
     path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    require_file(path)
     lines = read_lines(path)
     words = [word for line in lines for word in _words(line)]
     if not words or words[0][1] != FIRST:

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.formats._text import Line, plural, rows
+from fits.data.formats._text import BOM, Line, plural, rows
 from fits.data.geometry import TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
@@ -51,7 +51,7 @@ class _Block:
 
 def recognises(head: bytes) -> bool:
     """Whether a file starts as this format."""
-    return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
+    return head.removeprefix(BOM).lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
 
 
 def read(path: Path) -> Measurements:

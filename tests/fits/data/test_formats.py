@@ -1,11 +1,13 @@
 """Choosing a reader, and FRED tables."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fits.data.formats import read
+from fits.data.formats._text import read_lines
 from fits.data.geometry import direction, slices
 from fits.names import FORMATS
 from tests.helpers.places import COATINGS as DATA
@@ -57,6 +59,20 @@ def test_bad_arguments(tmp_path):
         read(path, format="fred")
     with pytest.raises(ValueError, match="unknown keyword"):
         read(path, format="zemax")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
+def test_what_is_no_file_is_said(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe: is a pipe or a device, must be a file"):
+        read(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="is a directory, must be a file"):
+        read(tmp_path)
+
+
+def test_a_byte_order_mark_is_no_text(tmp_path):
+    path = _file(tmp_path, b"\xef\xbb\xbf1 2\n\xb0\n")
+    assert [line.text for line in read_lines(path, "latin-1")] == ["1 2", "°"]
 
 
 def test_fred_file_is_the_csv_plus_the_laboratory_floor():
