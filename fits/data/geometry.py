@@ -103,7 +103,7 @@ def slices(
     planes = _angles("azimuth", azimuth, -360.0, 360.0)
 
     plane, theta_o = (grid.ravel() for grid in np.meshgrid(planes, signed, indexing="ij"))
-    repeated_pole = (np.sin(np.radians(theta_o)) == 0.0) & (plane != planes[0])
+    repeated_pole = (abs(np.sin(np.radians(theta_o))) < 1e-12) & (plane != planes[0])
     wo = direction(theta_o, plane)[~repeated_pole]
     wi = direction(incident, LIGHT_AZIMUTH)
     return Geometry(wi=np.repeat(wi, len(wo), axis=0), wo=np.tile(wo, (len(wi), 1)))

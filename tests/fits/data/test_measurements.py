@@ -127,6 +127,7 @@ def test_slices_are_where_they_say():
     expected = [[-sine, 0], [0, 0], [sine, 0], [0, -sine], [0, sine]]
     np.testing.assert_allclose(geometry.wo[:5, :2], expected, atol=1e-15)
     assert len(slices()) == 4 * 35
+    assert len(slices(10.0, [0, 180], azimuth=[0, 90])) == 2  # straight down once as well
 
 
 @pytest.mark.parametrize(
