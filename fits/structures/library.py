@@ -19,7 +19,8 @@ class Library:
     """Layers and bases by name; a base is a surface, or a stack of its own that lets no light pass.
 
     Raises:
-        ValueError: no base, a name that is used twice, or one with a slash.
+        ValueError: no base, a name that is used twice, or one that would be no name of a file, or that of another part:
+            with a slash, a + or a dot in front, the same but for case, blanks and hyphens, or a base called "search".
     """
 
     layers: Mapping[str, lj.Interface | lj.Medium]
@@ -36,6 +37,14 @@ class Library:
         for name in (*self.layers, *self.bases):
             if not name or any(sign in name for sign in "/\\+") or name.startswith("."):
                 raise ValueError(f"library: {name!r} is no name; it must have no slash, no + and no dot in front")
+        files: dict[str, str] = {}
+        for name in (*self.layers, *self.bases):
+            other = files.setdefault(name.replace(" ", "-").casefold(), name)
+            if other != name:
+                raise ValueError(f"library: {other!r} and {name!r} are one name as files; they must differ by letters")
+        for name in self.bases:
+            if name.casefold() == "search":
+                raise ValueError(f"library: a base is called {name!r}, must be another: a search keeps search.json")
 
     def stack(self, structure: Structure) -> lj.Stack:
         """The stack with these layers over this base."""

@@ -64,7 +64,12 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("layers", "bases", "message"),
-    [({"a": COAT}, {"a": BASE}, "'a' names a layer and a base"), ({"a/b": COAT}, {"c": BASE}, "'a/b' is no name")],
+    [
+        ({"a": COAT}, {"a": BASE}, "'a' names a layer and a base"),
+        ({"a/b": COAT}, {"c": BASE}, "'a/b' is no name"),
+        ({"a": COAT}, {"b c": BASE, "B-c": BASE}, "'b c' and 'B-c' are one name as files"),
+        ({"a": COAT}, {"Search": BASE}, "a base is called 'Search'"),
+    ],
 )
 def test_bad_names_are_refused(layers: dict, bases: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
