@@ -38,6 +38,8 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     notes = [CONVENTION, agreement(material, look_up)]
     if material.channels == 1:
         notes.append("one channel, written as grey")
+    if not material.opaque:
+        notes.append("what passes through is left out: the format has reflection alone")
     return Contents(np.array(SHAPE, "<i4").tobytes() + table.astype("<f8").tobytes(), tuple(notes))
 
 

@@ -12,8 +12,10 @@ from fits.cli.parser import main
 from fits.data.formats._square import Between
 from fits.data.formats.rgl_table import read_table
 from fits.data.measurements import Measurements
+from fits.exporting import merl
 from fits.exporting.contents import pairs
 from fits.exporting.export import ENDINGS
+from fits.exporting.material import Material, material_of
 from tests.helpers.commands import refused
 from tests.helpers.merl import centre_pairs
 
@@ -121,6 +123,13 @@ def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path: Path) -> None:
     np.testing.assert_allclose(stored, true, rtol=1e-9)
     agrees(fits.read(path), METAL, lj.SingleScattering(), 1e-9)
     assert any("in the median" in note for note in notes)
+    assert not any("passes through" in note for note in notes)
+
+
+def test_a_merl_table_says_that_light_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Material, "values", lambda self, wi, wo, stage="": np.ones((len(wi), 3)))
+    notes = merl.contents(material_of(HAZE, lj.SingleScattering())).notes
+    assert any("passes through is left out" in note for note in notes)
 
 
 @pytest.mark.parametrize(("stack", "total"), [(HAZE, 1), (FIBERS, 24)], ids=["haze", "fibers"])
