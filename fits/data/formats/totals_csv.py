@@ -7,8 +7,8 @@ total_transmittance          all that leaves on the other side, what passes stra
 unscattered_transmittance    of this, what no medium has scattered
 <that column>_std | _sigma   its standard deviation (all of a kind, or none)
 
-One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read; of
-several channels all are empty then.
+One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read;
+of several channels all are empty then.
 """
 
 import csv
