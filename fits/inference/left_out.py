@@ -34,7 +34,8 @@ class LeftOut:
     """How readings were foretold that were left out.
 
     groups: what was left out together. rows: the rows of each among the used samples. log_density: of each reading by
-    the fit that had not seen its group, (N, C). converged: whether all of these fits did.
+    the fit that had not seen its group, (N, C), 0 for those of planes with too few readings to leave some out, which
+    are in no group. converged: whether all of these fits did.
     """
 
     groups: tuple[str, ...]
@@ -76,7 +77,7 @@ def leave_out(
     """
     groups, data = require_groups(fit), fit.problem.data.used()
     like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
-    density, converged = np.empty(data.values.shape), True
+    density, converged = np.zeros(data.values.shape), True
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
             progress("left out", number, len(groups), name)

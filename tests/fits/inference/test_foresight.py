@@ -122,6 +122,21 @@ def test_few_incidences_are_left_out_by_stretches() -> None:
         assert np.ptp(one.theta_o[rows] * np.sign(one.wo[rows, 0])) < 40.0
 
 
+def test_readings_in_no_group_say_nothing_of_what_is_foretold() -> None:
+    """Of one incidence a scan, and three readings of another plane, too few to leave some of them out."""
+    data = readings()
+    scan = np.abs(data.theta_i - 10.0) < 1.0
+    aside = np.flatnonzero(scan)[:3]
+    wo = data.wo.copy()
+    wo[aside] = wo[aside][:, [1, 0, 2]]
+    few = replace(data, wo=wo).where(scan)
+    left = leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+    alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
+    assert alone.size == 3
+    assert np.all(left.log_density[alone] == 0.0)
+    assert left.score == pytest.approx(left.by_group.sum())
+
+
 @pytest.mark.parametrize("stack", ["line", "flat"])
 def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> None:
     data = readings()
