@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from fits.problem.compiled import cores, in_shares
+from fits.problem.joint import JointModel
 from fits.problem.model import Model
+from fits.problem.parameters import Box
 from fits.problem.problem import Problem
 
 DEGREES = (2, 3, 4)
@@ -72,16 +74,18 @@ def evaluate_many(problem: Problem, positions: Floats, walkers: int) -> tuple[Fl
     return residuals, log_posterior
 
 
-class Surrogate(Model):
-    """A `Model` whose likelihood comes from polynomials in P whitened coordinates of the box: K of them, of T terms.
+class Surrogate(eqx.Module):
+    """The posterior of a model whose likelihood comes from polynomials in P whitened coordinates: K, of T terms.
 
     Attributes:
+        box: bounds and priors of the P parameters.
         centre, whiten: (P,) and (P, P), of the coordinates.
         radius: as far as they were fitted; beyond, their values there are taken, and the posterior falls off.
         weights: (T, K), of the terms.
         degree: of the polynomials.
     """
 
+    box: Box
     centre: Array
     whiten: Array
     radius: Array
@@ -111,11 +115,10 @@ class Surrogate(Model):
 POLYNOMIALS = ("centre", "whiten", "radius", "weights")
 
 
-def with_polynomials(model: Model, arrays: dict[str, Any]) -> Surrogate:
+def with_polynomials(model: Model | JointModel, arrays: dict[str, Any]) -> Surrogate:
     """The surrogate of a model with these `Surrogate.arrays`."""
-    own: dict[str, Any] = {name: getattr(model, name) for name in Model.__dataclass_fields__}
-    own |= {name: jnp.asarray(arrays[name]) for name in POLYNOMIALS}
-    return Surrogate(**own, degree=int(arrays["degree"]))
+    own = {name: jnp.asarray(arrays[name]) for name in POLYNOMIALS}
+    return Surrogate(box=model.box, **own, degree=int(arrays["degree"]))
 
 
 def affordable_degrees(dimension: int, residuals: int, points_a_term: float) -> list[int]:
@@ -146,7 +149,7 @@ def monomials(z: Any, degree: int) -> Any:
     return xp.concatenate(blocks, axis=-1)
 
 
-def fitted(model: Model, degree: int, points: Evaluated) -> Surrogate:
+def fitted(model: Model | JointModel, degree: int, points: Evaluated) -> Surrogate:
     """The surrogate by least squares through evaluations, which count the less the lower the posterior is there."""
     unit = expit(points.positions)
     below = np.max(points.log_posterior) - points.log_posterior
