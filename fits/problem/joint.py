@@ -191,9 +191,8 @@ class Joint(Posed):
 
     @cached_property
     def _assembled(self) -> Assembled:
-        common = [name for name in next(iter(self.parts.values())).names if self._is_shared(name)]
         self._require_common()
-        names, own = list(common), []
+        names, own = self._common, []
         for part, problem in self.parts.items():
             places = []
             for name in problem.names:
@@ -254,13 +253,17 @@ class Joint(Posed):
         return {name: part.reshape(shape) for name, part, shape in zip(self.parts, split, shapes, strict=True)}
 
     def with_problems(self, changed: Mapping[str, Problem]) -> "Joint":
-        """The same with other problems in the place of those of the same names."""
-        return Joint({**self.parts, **changed}, self.shared) if changed else self
+        """The same with other problems in the place of those of the same names; what is new in them is not shared."""
+        return Joint({**self.parts, **changed}, self._common) if changed else self
 
     def __getattr__(self, name: str) -> Any:
         if name in {one.name for one in fields(Problem)}:
             raise AttributeError(f"Joint has no {name}: each of its parts has one; ask of Fit.part(name)")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    @property
+    def _common(self) -> list[str]:
+        return [name for name in next(iter(self.parts.values())).names if self._is_shared(name)]
 
     def _is_shared(self, name: str) -> bool:
         return any(_begins(name, one) for one in self.shared)

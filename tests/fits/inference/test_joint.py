@@ -9,6 +9,7 @@ from fits.data.geometry import slices
 from fits.inference.optimise import fit
 from fits.inference.predicting import predict
 from fits.inference.sampling import sample
+from fits.inference.shared_errors import counting
 from fits.problem.correlated import Correlated
 from fits.problem.joint import Joint
 from fits.problem.likelihood import Noise
@@ -146,6 +147,16 @@ def test_measurements_that_share_nothing_are_each_alone():
         np.testing.assert_allclose(together.part(name).vector, alone.vector, rtol=1e-4)
         np.testing.assert_allclose(together.part(name).errors, alone.errors, rtol=1e-3)
         np.testing.assert_allclose(together.part(name).residuals, alone.residuals, atol=1e-3)
+
+
+def test_what_is_new_in_one_measurement_is_not_shared():
+    """Errors that readings of one of them share have names that begin as those of levels of noise do."""
+    noise = Noise(relative=Free(0.1, 0.01, 1.0))
+    both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
+    changed = both.with_problems({"first": counting(both.parts["first"])})
+    added = {f"first.noise.correlated.{name}" for name in ("amplitude", "half", "difference", "growth")}
+    assert set(changed.names) == set(both.names) | added
+    assert changed.names[:2] == (SLOPE, "noise.relative")
 
 
 def test_each_measurement_is_differentiated_by_its_own_parameters():
