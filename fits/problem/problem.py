@@ -33,6 +33,7 @@ from fits.problem.posed import Assembled, Posed
 from fits.problem.process import Process, make_process
 from fits.problem.spectra import require_in_range
 from fits.problem.totalling import Totalling
+from fits.problem.values import shown
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
 from layerjax.stack import with_known
@@ -58,7 +59,7 @@ class Problem(Posed):
 
     Raises:
         ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
-            cannot carry the stack, or a named objective stands together with free noise levels or priors.
+            cannot carry the stack, or a named objective stands beside free noise levels, priors or `Free.smooth`.
     """
 
     stack: Any
@@ -231,6 +232,9 @@ def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, 
     weighted = [entry.prior for entry in free if isinstance(entry.prior, Normal | LogNormal)]
     if weighted:
         raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; leave it out")
+    smooth = [entry.smooth for entry in free if entry.smooth is not None]
+    if smooth:
+        raise ValueError(f"Free.smooth is {shown(smooth[0])}, but has no weight beside objective {objective!r}")
 
 
 def _model(

@@ -1,6 +1,6 @@
 """Problems as they are put together: any callable stands for a transport, and what does not fit is refused."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import equinox as eqx
@@ -72,6 +72,13 @@ def test_maps_of_stacks_are_refused_by_name() -> None:
             Problem(stack, DATA, transport=lj.SingleScattering())
     with pytest.raises(ValueError, match=r"takes one stack; base.roughness of shape \(3,\)"):
         simulate(lj.Stack([], lj.OrenNayar(0.4, [0.1, 0.2, 0.3])), slices(incidence=[20], outgoing=[10]))
+
+
+def test_what_holds_channels_together_has_no_weight_beside_a_named_objective() -> None:
+    stack = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, smooth=0.1)))
+    both = replace(DATA, values=np.repeat(DATA.values, 2, axis=1), sigma=None, channels=("a", "b"))
+    with pytest.raises(ValueError, match=r"Free.smooth is 0.1, but has no weight beside objective 'cosine_l2'"):
+        Problem(stack, both, objective="cosine_l2")
 
 
 def test_what_follows_from_a_problem() -> None:
