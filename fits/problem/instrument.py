@@ -126,16 +126,19 @@ def optics_of(instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incide
 
     incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use.
     """
-    row = share = None
-    pairs = wi, wo
-    if instrument.has_cones and (narrow := needs_cone(instrument.source, instrument.detector, stack, wi, wo)).any():
-        pairs, row, share = _cones(instrument, wi, wo, narrow)
-    forward = _forward(pairs[0]) if instrument.offset else None
-    free = isinstance(instrument.offset, Free)
-    if forward is not None and not free:
-        first, second = (np.asarray(_leaning(w, forward, instrument.offset), float) for w in pairs)
-        pairs, forward = (first, second), None
     gain = None if instrument.gain_per_incidence is None else _which(wi, incidences)
+    free, lean = isinstance(instrument.offset, Free), 0.0
+    forward = _forward(wi) if instrument.offset else None
+    if isinstance(instrument.offset, Free):
+        lean = float(np.max(np.abs(instrument.offset.arrays()[1:])))
+    elif forward is not None:
+        wi, wo = (np.asarray(_leaning(w, forward, instrument.offset), float) for w in (wi, wo))
+        forward = None
+    row = share = None
+    pairs, widths = (wi, wo), (instrument.source, instrument.detector)
+    if instrument.has_cones and (narrow := needs_cone(*widths, stack, wi, wo, lean)).any():
+        pairs, row, share = _cones(instrument, wi, wo, narrow)
+        forward = None if forward is None else forward[row]  # a sample leans one way, whichever ray of a cone it meets
     return Optics(
         wi=jnp.asarray(pairs[0]),
         wo=jnp.asarray(pairs[1]),

@@ -23,7 +23,9 @@ LEAST = 1e-6
 Floats = NDArray[np.float64]
 
 
-def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Floats) -> NDArray[np.bool_]:
+def needs_cone(
+    source: float, detector: float, stack: Any, wi: Floats, wo: Floats, lean: float = 0.0
+) -> NDArray[np.bool_]:
     """Readings (N,) whose mean over the cones may differ from their middle by more than `SHIFT`.
 
     GGX facets of width alpha whose half vector lies at tangent t change by at most 2 r^2 / (t^2 + alpha^2) over a disc
@@ -35,6 +37,7 @@ def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Float
         source, detector: full angles of the cones, degrees.
         stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks all may be narrow.
         wi, wo: (N, 3).
+        lean: degrees by which the sample may lean, besides.
     """
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
     if not isinstance(stack, lj.Stack | lj.Mixture):
@@ -43,7 +46,7 @@ def needs_cone(source: float, detector: float, stack: Any, wi: Floats, wo: Float
     facets, others = _narrowest(stack)
     half = wi + wo
     square = (radii[0] ** 2 + radii[1] ** 2) / np.maximum(np.sum(half**2, axis=-1), LEAST)
-    tilt = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2]))
+    tilt = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2])) - np.radians(lean)
     nearest = np.maximum(np.tan(np.minimum(tilt, STEEPEST)) - np.sqrt(square), 0.0)
     lobe = 2.0 * square / (nearest**2 + facets**2) + 2.0 * square / others**2
     steep = [0.25 * (r / np.maximum(np.abs(w[:, 2]), r)) ** 2 for r, w in zip(radii, (wi, wo), strict=True) if r > 0.0]

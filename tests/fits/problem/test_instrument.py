@@ -108,6 +108,17 @@ def test_leaning_out_of_the_plane_keeps_angles_between() -> None:
     np.testing.assert_allclose(np.degrees(np.arccos(wi[:, 2])), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("free", [False, True])
+def test_means_are_taken_about_the_peak_of_a_sample_that_leans(free: bool) -> None:
+    """Also where light comes along the normal, and rays of the source's cone from all sides."""
+    lean, alpha, geometry = 4.0, 0.1, fits.slices([0.0, 40.0], np.arange(-60.0, 61.0, 4.0))
+    offset = Free(0.0, -5.0, 5.0) if free else lean
+    found = problem(Instrument(1.5, 0.5, offset), 0.1, geometry).predict([alpha, lean] if free else [alpha])
+    leaning = problem(Instrument(offset=lean), geometry=geometry).model.optics
+    expected = mean_over_cones(metal(alpha), np.asarray(leaning.wi), np.asarray(leaning.wo), 1.5, 0.5)
+    np.testing.assert_allclose(found, expected, rtol=2e-3)
+
+
 def test_derivatives_by_the_offset() -> None:
     of = problem(Instrument(detector=1.0, offset=Free(0.0, -5.0, 5.0)))
 
