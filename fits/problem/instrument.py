@@ -43,8 +43,8 @@ class Instrument:
     much where a lobe may be narrow, and nothing elsewhere.
     offset: how far the sample's normal leans towards the mirror side of the plane of incidence, in [-10, 10]; a number,
     `Free`, or None for 0.
-    gain_per_incidence: relative standard deviation, in [1e-4, 1], of a factor of its own that every incidence has
-    beside the common scale, with a log-normal prior about 1 that they share; None: none.
+    gain_per_incidence: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
+    light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
     """
 

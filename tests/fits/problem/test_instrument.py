@@ -9,6 +9,7 @@ import pytest
 import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
+from fits.data.geometry import direction
 from fits.data.measurements import Measurements
 from fits.inference.repeats import fit_many
 from fits.problem.instrument import Instrument
@@ -141,6 +142,15 @@ def test_every_incidence_has_a_gain() -> None:
     # LogNormal(1, 0.03): the density of a gain of 1.05 is lower by (log 1.05 / 0.03)^2 / 2 + log 1.05
     gap = float(of.log_prior([0.3, 1.0, 1.0, 1.0]) - of.log_prior([0.3, 1.0, 1.0, 1.05]))
     assert gap == pytest.approx(0.5 * (np.log(1.05) / 0.03) ** 2 + np.log(1.05))
+
+
+def test_light_at_one_polar_angle_has_one_gain() -> None:
+    """From all azimuths, and where angles were measured, a hundredth of a degree apart."""
+    given = fits.slices([10.0, 40.0], np.arange(-60.0, 61.0, 20.0))
+    theta, phi = np.degrees(np.arccos(given.wi[:, 2])), np.tile([0.0, 90.0, 180.0], len(given))[: len(given)]
+    wi = direction(theta + 0.05 * np.sin(7.0 * np.arange(len(given))), phi)
+    optics = problem(Instrument(gain_per_incidence=0.03), geometry=fits.Geometry(wi, given.wo)).model.optics
+    np.testing.assert_array_equal(optics.incidence, theta > 25.0)
 
 
 def test_readings_at_other_incidences_have_a_gain_that_is_not_known() -> None:
