@@ -7,6 +7,7 @@ is written in one go as its start ends; a broken last line is as good as none.
 import hashlib
 import json
 import os
+import re
 import zlib
 from contextlib import ExitStack
 from pathlib import Path
@@ -99,7 +100,9 @@ def _checked(line: bytes) -> dict[str, Any] | None:
 def _identity(problem: Posed, points: Floats, solver: Solver) -> str:
     """A fingerprint of everything that the ends of the starts depend on."""
     arrays, static = problem.split_model
-    digest = hashlib.sha256(repr((layerjax.__version__, solver, problem.names, static.tree)).encode())
+    told = repr((layerjax.__version__, solver, problem.names, static.tree))
+    # functions are shown with their places in memory, which no other process has
+    digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", told).encode())
     # a transport of the user's own may have changed its body under the same name
     for array in (*jax.tree.leaves(arrays), points, here(problem, points[0]).predicted):
         digest.update(repr((np.shape(array), str(np.asarray(array).dtype))).encode())

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,13 +15,14 @@ from fits.inference.bounded import cost_and_gradient
 from fits.inference.fit_result import ENDED
 from fits.inference.optimise import fit
 from fits.inference.starts import WORTH, run_starts
+from fits.inference.starts_file import End, StartsFile
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.priors import LogUniform
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
-from tests.helpers.models import LOBE, LOBE_STACK, directions, lobe, measured, noisy_lobe
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
 from tests.helpers.places import EXAMPLES
 
 COATINGS = EXAMPLES / "arizona_black_coatings"
@@ -118,6 +120,24 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
     assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)
+
+
+class Dimmed:
+    """A transport that shows as an object in memory."""
+
+    def __call__(self, stack, wi, wo):
+        return 0.5 * line(stack, wi, wo)
+
+
+@pytest.mark.parametrize("made", [lambda: jax.jit(lambda *a: line(*a)), Dimmed], ids=["compiled", "object"])
+def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path):
+    data, points, path = line_data(), np.full((1, 2), 0.5), tmp_path / "starts"
+    transports = made(), made()  # both at once, so that they differ in place
+    first, second = (Problem(LINE, data, one) for one in transports)
+    with StartsFile(path, first, points, "least_squares") as kept:
+        kept.add(0, End(np.array([1.0, 0.5]), 1.0, 5, True, False))
+    with StartsFile(path, second, points, "least_squares") as kept:
+        assert list(kept.ends) == [0]
 
 
 def test_a_fit_does_not_end_on_a_plateau():
