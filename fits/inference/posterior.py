@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from fits._lazy import shown_by
 from fits.inference.chain import MemoryChain
 from fits.inference.fit_result import Fit
 from fits.inference.length import BURN_IN, LONG_ENOUGH, STEADY, autocorrelation_times, long_enough
+from fits.problem.logarithm import logarithm
 from fits.problem.model import Model
 
 if TYPE_CHECKING:
@@ -110,6 +112,7 @@ class Posterior:
         """ArviZ data: posterior, log_likelihood of each datum, posterior_predictive with noise, observed_data.
 
         A walker is a chain. Draws are thinned so that about 2,000 remain: they serve predictions and model comparison.
+        Simulated readings share errors that are drawn anew, where `predict` has those that the data tell of.
         """
         self._require_converged()
         import arviz
@@ -118,14 +121,14 @@ class Posterior:
         draws = min(max(REPORTED_DRAWS // walkers, 1), steps)
         picked = np.linspace(0, steps - 1, draws).astype(int)
         chosen = np.swapaxes(self.chain[self.burn_in :][picked], 0, 1)
-        problem = self.fit.problem
-        density, predicted, sigma = problem.call(_over_samples, chosen.reshape(-1, count))
-        shape = (walkers, draws, *problem.model.values.shape)
-        generator = np.random.default_rng(0)
+        problem, generator = self.fit.problem, np.random.default_rng(0)
+        shape, process = (walkers, draws, *problem.model.values.shape), problem.model.process
+        white = generator.standard_normal((walkers * draws, shape[-1], 0 if process is None else len(process.where)))
+        density, expected, sigma = problem.call(_over_samples, chosen.reshape(-1, count), white)
         student = problem.noise.tails == "student"
         freedom = problem.noise.degrees_of_freedom
         noise = generator.standard_t(freedom, shape) if student else generator.standard_normal(shape)
-        simulated = np.asarray(predicted).reshape(shape) + np.asarray(sigma).reshape(shape) * noise
+        simulated = np.asarray(expected).reshape(shape) + np.asarray(sigma).reshape(shape) * noise
         return arviz.from_dict(
             posterior={name: chosen[..., index] for index, name in enumerate(self.names)},
             log_likelihood={"value": np.asarray(density).reshape(shape)},
@@ -171,11 +174,22 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
     )
 
 
-def _over_samples(model: Model, vectors: Array) -> tuple[Array, Array, Array]:
-    def one(vector: Array) -> tuple[Array, Array, Array]:
-        return model.log_likelihood_per_datum(vector), model.predict(vector), model.sigma(vector)
+def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Array, Array]:
+    """Of each vector, with white numbers (C, R) of its own for what readings share: log-densities of the data, and
+    what readings scatter about, by how much; (N, C) each."""
 
-    return jax.lax.map(one, vectors)
+    def one(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        vector, numbers = given
+        predicted = expected = model.predict(vector)
+        if model.process is not None:
+            at = model.build(vector).correlation
+            assert at is not None
+            assert model.softness is not None
+            lack = model.process.drawn(numbers, at)
+            expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + lack)
+        return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
+
+    return jax.lax.map(one, (vectors, white))
 
 
 def _constrained(model: Model, positions: Array) -> Array:

@@ -8,9 +8,12 @@ from fits.data.measurements import Measurements
 from fits.inference import starts as starts_module
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
+from fits.inference.posterior import Posterior
 from fits.inference.starts_file import Floats
 from fits.problem.correlated import Correlated
+from fits.problem.kernel import log_sizes
 from fits.problem.likelihood import Noise
+from fits.problem.nodes import places
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed
 from fits.reporting import tables, verdicts
@@ -50,6 +53,18 @@ def test_a_wrong_shape_is_fitted_with_them(wrong: Fit) -> None:
     assert 0.03 < wrong.values["noise.correlated.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
+
+
+def test_simulated_readings_share_errors(wrong: Fit) -> None:
+    steps, walkers = 64, 32
+    chain = np.tile(wrong.vector, (steps, walkers, 1))
+    posterior = Posterior(wrong, chain, chain[..., 0], np.ones(chain.shape[-1]), 1.0, converged=True)
+    simulated = posterior.inference_data.posterior_predictive["value"].to_numpy().reshape(-1, *wrong.predicted.shape)
+    found = simulated / wrong.predicted
+    at = wrong.problem.build(wrong.vector).correlation
+    shared = at.amplitude * np.exp(at.growth * np.asarray(log_sizes(places(GEOMETRY.wi, GEOMETRY.wo))))
+    # of 2048 draws, and a regression on nodes between them
+    np.testing.assert_allclose(np.log(found).std(axis=0)[:, 0], np.hypot(shared, 0.02), rtol=0.1)
 
 
 def test_a_right_one_is_not() -> None:
