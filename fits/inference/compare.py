@@ -81,11 +81,14 @@ def compare(
         progress: called with (name and stage, done, total, note) meanwhile.
 
     Raises:
-        ValueError: fewer than two candidates, different data, or different objectives.
+        ValueError: fewer than two candidates, different data, different objectives, or fits of several measurements,
+            of which one may be compared, but not with `refit`.
     """
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     fits = {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}
+    for fit in fits.values():
+        fit.require_one("compare")
     first_name, first = next(iter(fits.items()))
     for name, fit in fits.items():
         if not _same_data(first, fit):

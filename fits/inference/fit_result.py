@@ -157,6 +157,18 @@ class Fit:
         if problems.get("") is not self.problem:
             raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
 
+    def require_alone(self, what: str) -> None:
+        """Refuse, for `what` asks the data anew, one measurement of several, whose problem knows nothing of the others.
+
+        Raises:
+            ValueError: it is one.
+        """
+        if self.within is not None:
+            raise ValueError(
+                f"{what}: {self.within[1]!r} is a part of a joint fit, and without the others it says something else; "
+                "fit it by itself, or take the whole fit"
+            )
+
     @property
     def values(self) -> dict[str, float]:
         """Best value of each parameter."""
@@ -179,7 +191,8 @@ class Fit:
 
     @cached_property
     def scale(self) -> float | tuple[float, ...]:
-        """The calibration factor, one number or one a channel."""
+        """The calibration factor, one number or one a channel. ValueError for a fit of several measurements."""
+        self.require_one("scale")
         scale = np.asarray(self.problem.build(self.vector).scale, float)
         return float(scale) if scale.ndim == 0 else tuple(scale.tolist())
 

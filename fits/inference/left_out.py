@@ -73,7 +73,7 @@ def leave_out(
         known: draws for the posterior of the fit: those without an incidence are looked for about them.
 
     Raises:
-        ValueError: a fit of a named objective, or data of a single group.
+        ValueError: a fit of a named objective, or data of a single group; one of several measurements, or part of it.
     """
     groups, data = require_groups(fit), fit.problem.data.used()
     like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
@@ -101,6 +101,9 @@ def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
         raise ValueError(
             f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
         )
+    fit.require_alone("leave_out")
+    if fit.problem.problems.get("") is not fit.problem:
+        raise ValueError("leave_out: it takes a fit of one measurement by itself, not a joint one")
     groups = groups_of(fit.problem.data.used())
     if len(groups) < 2:
         raise ValueError("leave_out: the readings are all of one incidence, and too few to leave some of them out")

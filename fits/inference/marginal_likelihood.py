@@ -41,10 +41,11 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
         seed: of the draws.
 
     Raises:
-        ValueError: a fit of a named objective.
+        ValueError: a fit of a named objective, or a part of one of several measurements.
     """
     if not fit.is_posterior:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
+    fit.require_alone("evidence")
     return evidence_of(posterior_draws(fit, draws, seed))
 
 

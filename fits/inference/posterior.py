@@ -113,7 +113,9 @@ class Posterior:
 
         A walker is a chain. Draws are thinned so that about 2,000 remain: they serve predictions and model comparison.
         Simulated readings share errors that are drawn anew, where `predict` has those that the data tell of.
+        ValueError for a fit of several measurements: ask `part`.
         """
+        self.fit.require_one("inference_data")
         self._require_converged()
         import arviz
 

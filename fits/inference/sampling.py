@@ -65,7 +65,8 @@ def sample(
             ("warm-up", steps, all).
 
     Raises:
-        ValueError: the fit's objective is no likelihood; too few walkers; an unknown sampler, or one whose extra is not
+        ValueError: the fit's objective is no likelihood, or it is a part of one of several measurements, whose chain is
+            that of the whole (`Posterior.part`); too few walkers; an unknown sampler, or one whose extra is not
             installed; `path` holds a chain of something else, or is in use by another process; no start with a finite
             posterior near the optimum.
         OSError: the disk is full, say. What was sampled is kept.
@@ -108,6 +109,7 @@ def _require_possible(fit: Fit, path: str | Path | None) -> None:
     """ValueError for a fit that cannot be sampled, or a place that a chain cannot be kept in."""
     if not fit.is_posterior:
         raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
+    fit.require_alone("sample")
     if path is not None and not Path(path).parent.is_dir():
         raise ValueError(f"{path}: there is no directory {Path(path).parent}")
 

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from fits.data.geometry import slices
+from fits.inference.compare import compare
+from fits.inference.left_out import leave_out
+from fits.inference.marginal_likelihood import evidence
 from fits.inference.optimise import fit
+from fits.inference.posterior import Posterior
 from fits.inference.predicting import predict
 from fits.inference.sampling import sample
 from fits.inference.shared_errors import counting
@@ -99,6 +103,31 @@ def test_a_part_is_a_fit_of_its_own(joint):
             write()
     with pytest.raises(ValueError, match="part 'third' is not one of first, second"):
         joint.part("third")
+
+
+def test_a_part_is_not_asked_without_the_others(joint):
+    first = joint.part("first")
+    for ask in (sample, evidence, leave_out):
+        with pytest.raises(ValueError, match=f"{ask.__name__}: 'first' is a part of a joint fit"):
+            ask(first)
+    with pytest.raises(ValueError, match="leave_out: it takes a fit of one measurement by itself, not a joint one"):
+        leave_out(joint)
+
+
+def test_what_tells_of_one_measurement_asks_for_a_part(joint):
+    chain = np.tile(joint.vector, (20, 2, 1))
+    posterior = Posterior(joint, chain, chain[..., 0], np.ones(3), 1.0, converged=True)
+    asks = {
+        "compare": lambda: compare({"one": joint, "other": joint}),
+        "scale": lambda: joint.scale,
+        "inference_data": lambda: posterior.inference_data,
+    }
+    for name, ask in asks.items():
+        with pytest.raises(
+            ValueError, match=rf"{name}: of a joint fit it takes a part: fit.part\(...\) of first, second"
+        ):
+            ask()
+    assert joint.part("first").scale == 1.0
 
 
 def test_a_part_predicts_with_what_all_of_them_say(joint):
