@@ -48,7 +48,7 @@ class Normal:
 
     def __post_init__(self) -> None:
         _require_finite("Normal.mean", self.mean)
-        _require_positive("Normal.sd", self.sd)
+        _require_finite("Normal.sd", self.sd, above=0.0)
 
     def gaussian(self) -> tuple[float, float]:
         """Centre and inverse standard deviation."""
@@ -64,8 +64,8 @@ class LogNormal:
     logarithmic: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        _require_positive("LogNormal.median", self.median)
-        _require_positive("LogNormal.sd", self.sd)
+        _require_finite("LogNormal.median", self.median, above=0.0)
+        _require_finite("LogNormal.sd", self.sd, above=0.0)
 
     def gaussian(self) -> tuple[float, float]:
         """Centre and inverse standard deviation of the logarithm."""
@@ -162,11 +162,11 @@ def require_steps(smooth: NDArray[np.float64], shape: tuple[int, ...]) -> None:
         raise ValueError(f"Free.smooth is {shown(smooth.tolist())}; it must be above 0")
 
 
-def _require_finite(field: str, value: Any) -> None:
-    if not np.all(np.isfinite(value)):
-        raise ValueError(f"{field} is {value}; it must be finite")
-
-
-def _require_positive(field: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{field} is {value}; it must be finite and above 0")
+def _require_finite(field: str, value: Any, above: float = -math.inf) -> None:
+    try:
+        allowed = math.isfinite(value) and value > above
+    except (TypeError, OverflowError):  # no number, or several of them
+        allowed = False
+    if not allowed:
+        least = "" if math.isinf(above) else f" and above {above:g}"
+        raise ValueError(f"{field} is {shown(value)}; it must be one number, finite{least}")

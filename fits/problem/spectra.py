@@ -53,8 +53,9 @@ class PowerLaw(Shown):
         if not any(map(is_free, ends.values())):
             raise ValueError("PowerLaw: nothing is free; write the number of each channel instead")
         for name, value in ends.items():
-            if is_free(value) and value.shape != ():
-                raise ValueError(f"PowerLaw.{name} has {value.shape[0]} channels; it must be one number")
+            shape = value.shape if is_free(value) else np.shape(value)
+            if shape != ():
+                raise ValueError(f"PowerLaw.{name} has {shape[0]} channels; it must be one number")
         if _ends(amplitude)[0] < 0.0:
             raise ValueError(f"PowerLaw.amplitude reaches down to {_ends(amplitude)[0]:g}; it must be at least 0")
 

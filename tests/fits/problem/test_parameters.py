@@ -48,10 +48,22 @@ def test_free_refuses(arguments: tuple, message: str) -> None:
         Free(*arguments)
 
 
-@pytest.mark.parametrize("make", [lambda: Normal(0.0, 0.0), lambda: LogNormal(-1.0, 1.0), lambda: LogNormal(1.0, -1.0)])
-def test_priors_refuse(make) -> None:
-    with pytest.raises(ValueError, match="must be finite and above 0"):
-        make()
+@pytest.mark.parametrize(
+    ("kind", "numbers", "message"),
+    [
+        (Normal, (0.0, 0.0), "Normal.sd is 0.0; it must be one number, finite and above 0"),
+        (Normal, (float("nan"), 1.0), "Normal.mean is nan; it must be one number, finite$"),
+        (Normal, ((0.1, 0.2, 0.3), 0.05), r"Normal.mean is \(0.1, 0.2, 0.3\); it must be one number"),
+        (Normal, (0.5, (0.1, 0.2)), r"Normal.sd is \(0.1, 0.2\); it must be one number"),
+        (Normal, ("half", 0.1), "Normal.mean is 'half'; it must be one number"),
+        (LogNormal, (-1.0, 1.0), "LogNormal.median is -1.0; it must be one number, finite and above 0"),
+        (LogNormal, (1.0, -1.0), "LogNormal.sd is -1.0"),
+        (LogNormal, ((1.0, 2.0), 1.0), r"LogNormal.median is \(1.0, 2.0\); it must be one number"),
+    ],
+)
+def test_priors_refuse(kind, numbers: tuple, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(*numbers)
 
 
 @pytest.mark.parametrize("name", PRIORS)

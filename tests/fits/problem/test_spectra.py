@@ -76,6 +76,8 @@ def test_the_reference_is_the_geometric_mean() -> None:
         ({"reference": 0.0}, "PowerLaw.reference is .*must be finite and above 0"),
         ({"amplitude": 1.0, "exponent": 1.0}, "PowerLaw: nothing is free"),
         ({"amplitude": Free((1.0, 2.0), 0.0, 3.0)}, "PowerLaw.amplitude has 2 channels"),
+        ({"amplitude": [1.0, 2.0]}, "PowerLaw.amplitude has 2 channels; it must be one number"),
+        ({"exponent": (1.0, 2.0, 3.0)}, "PowerLaw.exponent has 3 channels; it must be one number"),
         ({"amplitude": Free(1.0, -1.0, 3.0)}, "PowerLaw.amplitude reaches down to -1"),
     ],
 )
