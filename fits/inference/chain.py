@@ -90,7 +90,7 @@ class MemoryChain(Backend):
 
 
 class FileChain(MemoryChain):
-    """A chain kept in `path` (HDF5) and a journal beside it (`path` with the suffix ``.journal``), by one process.
+    """A chain kept in `path` (HDF5) and a journal beside it (``chain.journal`` of ``chain.h5``), by one process.
 
     identity: numbers and strings that tell problems apart, stored with the chain. Opening a chain whose identity
     differs raises ValueError, and so do a file that is not a chain and one that another process is writing;
@@ -100,10 +100,10 @@ class FileChain(MemoryChain):
     def __init__(self, path: str | Path, walkers: int, count: int, identity: Mapping[str, Any], resume: bool = True):
         super().__init__(walkers, count)
         self.path = Path(path)
-        self.journal_path = self.path.with_suffix(".journal")
+        self.journal_path = beside(self.path, ".journal")
         self.identity = dict(identity)
         self._open = ExitStack()
-        self._open.enter_context(locked(self.path.with_suffix(".lock"), str(self.path)))
+        self._open.enter_context(locked(beside(self.path, ".lock"), str(self.path)))
         try:
             self._take(resume)
         except BaseException:
@@ -111,7 +111,7 @@ class FileChain(MemoryChain):
             raise
 
     def _take(self, resume: bool) -> None:
-        for name in (self.path.name, self.path.with_suffix(SURROGATE).name):
+        for name in (self.path.name, beside(self.path, SURROGATE).name):
             for left in self.path.parent.glob(f".{glob.escape(name)}.????????"):
                 left.unlink()  # what a process wrote as it was killed
         if resume and self.path.exists():
@@ -182,13 +182,18 @@ class FileChain(MemoryChain):
         self.stored = self.iteration
 
 
+def beside(path: Path, suffix: str) -> Path:
+    """A file that belongs to a chain: what says that it is HDF5 gives way to the suffix, not the 2 of ``chain_0.2``."""
+    return path.with_suffix(suffix) if path.suffix in (".h5", ".hdf5") else path.with_name(path.name + suffix)
+
+
 def stored_chain(path: str | Path, identity: Callable[[dict[str, Any]], Mapping[str, Any]]) -> MemoryChain:
     """A chain as far as it got, from its file and its journal, which are only read: a sampler may be writing them.
 
     identity: of the identity that is stored, what it should be; ValueError where they differ.
     """
     path = Path(path)
-    journal = _content(path.with_suffix(".journal"))  # before the file, which may take in what is in it at any moment
+    journal = _content(beside(path, ".journal"))  # before the file, which may take in what is in it at any moment
     stored = read_chain(path)
     _refuse_others(path, stored["identity"], identity(stored["identity"]))
     chain = MemoryChain(*stored["chain"].shape[1:])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import logit
 from scipy.stats import qmc
 
-from fits.inference.chain import SURROGATE, FileChain, MemoryChain, another, stored_chain
+from fits.inference.chain import SURROGATE, FileChain, MemoryChain, another, beside, stored_chain
 from fits.inference.design import Kept
 from fits.inference.ensemble import Ensemble, is_costly, log_posteriors
 from fits.inference.fit_result import Fit
@@ -162,8 +162,8 @@ def _decide(
         return
     if surrogate is None:
         surrogate = is_costly(sampler.problem, _fixed_points(sampler.problem))
-    beside = None if path is None else Path(path).with_suffix(SURROGATE)
-    sampler.decide(surrogate, Kept(beside, identity), progress)
+    rounds = None if path is None else beside(Path(path), SURROGATE)
+    sampler.decide(surrogate, Kept(rounds, identity), progress)
 
 
 class NoSteps(ValueError):

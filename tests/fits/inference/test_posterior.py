@@ -282,6 +282,14 @@ def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> No
         sample(result, walkers=16, seed=1, path=path)
 
 
+@pytest.mark.parametrize(("one", "other"), [("chain_0.1", "chain_0.2"), ("chain", "chain.1")])
+def test_chains_whose_names_differ_after_a_dot_have_nothing_in_common(one: str, other: str, tmp_path: Path) -> None:
+    first, second = (FileChain(tmp_path / name, 4, 1, {}) for name in (one, other))
+    assert {path.name for path in tmp_path.glob("*.journal")} == {f"{one}.journal", f"{other}.journal"}
+    first.close()
+    second.close()
+
+
 def test_inference_data(result: Fit, posterior) -> None:
     data = posterior.inference_data
     assert set(data.groups()) == {"posterior", "log_likelihood", "posterior_predictive", "observed_data"}
