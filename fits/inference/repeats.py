@@ -1,5 +1,6 @@
 """Many data sets of one problem, fitted in one compiled program."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -56,6 +57,9 @@ def fit_many(problem: Problem, values: ArrayLike, *, starts: int = 1, seed: int 
 
 
 def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, Array, Array, Array]:
+    if model.process is not None and model.process.gram is not None:  # that of the problem's own values
+        model = replace(model, process=replace(model.process, gram=None))
+
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)
         most, promise = jnp.asarray(MOST_STEPS), jnp.asarray(PROMISE)

@@ -1,5 +1,7 @@
 """Whether a fit counts errors that readings share, where that is left to the residuals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from fits.inference import starts as starts_module
 from fits.inference.fit_result import Fit
 from fits.inference.optimise import fit
 from fits.inference.posterior import Posterior
+from fits.inference.repeats import fit_many
 from fits.inference.starts_file import Floats
 from fits.problem.correlated import Correlated
 from fits.problem.kernel import log_sizes
@@ -16,6 +19,7 @@ from fits.problem.likelihood import Noise
 from fits.problem.nodes import places
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed
+from fits.problem.problem import Problem
 from fits.reporting import tables, verdicts
 from fits.reporting.results import load_fit, save_fit
 from tests.helpers.models import line
@@ -53,6 +57,15 @@ def test_a_wrong_shape_is_fitted_with_them(wrong: Fit) -> None:
     assert 0.03 < wrong.values["noise.correlated.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
+
+
+def test_repeats_are_fitted_by_what_their_own_readings_tell() -> None:
+    """Where noise is a level, readings tell the less of their logarithms the smaller they are."""
+    data, noise = readings(0.1), Noise(relative=0.0, floor=0.05, correlated=Correlated(0.1, 10.0, 10.0, 0.0))
+    small = replace(data, values=0.2 * data.values)
+    by_others, by_themselves = (fit_many(Problem(STACK, one, line, noise), small.values[None]) for one in (data, small))
+    np.testing.assert_allclose(by_others.vectors, by_themselves.vectors, rtol=1e-6)
+    np.testing.assert_allclose(by_others.standard_errors, by_themselves.standard_errors, rtol=1e-6)
 
 
 def test_simulated_readings_share_errors(wrong: Fit) -> None:
@@ -114,8 +127,6 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
 
 
 def test_a_result_directory_keeps_it(tmp_path, coat_fit: Fit) -> None:
-    from dataclasses import replace
-
     from fits.inference.shared_errors import alone
 
     problem = replace(coat_fit.problem, noise=Noise(relative=0.03, correlated=True))
