@@ -170,8 +170,8 @@ class Joint(Posed):
     Args:
         parts: the problems by name, two or more, each with a likelihood.
         shared: names of parameters that are one in all problems: ``layers[0].ior``, or how names begin, such as
-            ``layers[0]`` for all that is free in that layer. Start, bounds and priors must agree. The others are named
-            after their problem, ``plane.scale``.
+            ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as in the first.
+            The others are named after their problem, ``plane.scale``.
 
     Raises:
         ValueError: fewer than two problems, a named objective, a shared name that is not in every problem, or free
