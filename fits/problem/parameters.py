@@ -165,12 +165,6 @@ class Box(eqx.Module):
         """Physical vector from the unconstrained one."""
         return self._mix(jax.nn.sigmoid(u), jax.nn.sigmoid(-u))
 
-    def unconstrain(self, vector: Array) -> Array:
-        """Inverse of `constrain`: minus or plus infinity on the bounds."""
-        low, high = self._ends()
-        natural = self._natural(vector)
-        return jnp.log(natural - low) - jnp.log(high - natural)
-
     def log_determinant(self, u: Array) -> Array:
         """Sum of log |d physical / d unconstrained|."""
         low, high = self._ends()

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 import layerjax as lj
 from fits.problem.parameters import Box, Free, LogNormal, LogUniform, Normal, Uniform, split
@@ -123,7 +123,7 @@ def test_maps_are_inverses_and_reach_the_bounds() -> None:
     box = Box.of([Free(0.5, 0.2, 0.9), Free([1.0, 2.0], 0.01, 10.0, LogUniform())])
     for u in np.random.default_rng(1).normal(0, 4, (10, 3)):
         vector = box.constrain(u)
-        np.testing.assert_allclose(box.unconstrain(vector), u, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(special.logit(box.to_unit(vector)), u, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(box.from_unit(box.to_unit(vector)), vector, rtol=1e-13)
     np.testing.assert_allclose(box.from_unit(jnp.array([0.0, 0.5, 1.0])), [0.2, np.sqrt(0.1), 10.0], rtol=1e-14)
 
