@@ -34,10 +34,11 @@ class Average:
         seed: int = 0,
     ) -> Prediction:
         """See `fits.predict`; draws: of all of them together, in proportion to the weights."""
-        counts = {name: round(draws * weight) for name, weight in self.weights.items()}
+        # by rounded ends of their shares, which are all of the draws however many share them
+        counts = np.diff(np.round(draws * np.cumsum([0.0, *self.weights.values()])))
         parts = [
-            predict(self.candidates[name], at, levels=levels, draws=max(count, 2), seed=seed + number)
-            for number, (name, count) in enumerate(counts.items())
+            predict(self.candidates[name], at, levels=levels, draws=max(int(count), 2), seed=seed + number)
+            for number, (name, count) in enumerate(zip(self.weights, counts, strict=True))
             if count > 0
         ]
         first = parts[0]

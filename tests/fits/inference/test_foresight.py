@@ -194,6 +194,13 @@ def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
     np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
 
 
+def test_more_fits_than_draws_are_averaged(found: Fit) -> None:
+    many = {f"{number}": found for number in range(9)}
+    both = predict(average(many, dict.fromkeys(many, 1.0)), readings(), draws=4)
+    assert len(both.values) == 4 * 2  # of those that are drawn at all, two
+    np.testing.assert_allclose(both.mean, found.predicted, atol=5.0 * SIGMA)
+
+
 @pytest.mark.parametrize(
     ("weights", "message"),
     [({"line": 1.0}, "it must give each of line, flat"), ({"line": -1.0, "flat": 2.0}, "a number of at least 0")],
