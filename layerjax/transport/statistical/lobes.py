@@ -63,7 +63,10 @@ class Reflection(NamedTuple):
 
 
 class Statistics(NamedTuple):
-    """Lobes of light along some cosines: those reflected, and the one transmitted (None over a base)."""
+    """Lobes of light along some cosines: those reflected, and the one transmitted (None over a base).
+
+    transmitted_spread: as `Reflection.spread`, behind the stack.
+    """
 
     reflected: tuple[Reflection, ...]
     transmitted: Lobe | None
@@ -141,7 +144,9 @@ def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = Fal
         over = index
     if stack.base is not None:
         return Statistics(tuple(reflected), None, None)
-    return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), spread)
+    # what is transmitted is described behind the stack
+    behind = None if spread is None else each(jnp.divide, spread, above.jacobian)
+    return Statistics(tuple(reflected), Lobe(above.t0, above.s_t0), behind)
 
 
 def _mean_spread(depth: Array, spread: Array, optical: Array, mean: Array) -> Array:

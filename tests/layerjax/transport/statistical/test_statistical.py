@@ -7,6 +7,8 @@ import pytest
 
 import layerjax as lj
 from layerjax.transport.statistical.lobes import Options, lobe_roughness, statistics
+from layerjax.transport.statistical.shaped import shaped
+from layerjax.transport.statistical.variance import phase_variance, roughness
 from tests.helpers.compiled import compiled
 from tests.helpers.sampling import chi_square
 
@@ -73,6 +75,15 @@ def test_albedo_is_as_near_to_the_walk_as_the_model_can_be(name):
     reflected, _ = lj.albedo(stack, LIGHT[[0, 2]], FORWARD)
     found = 100 * (np.asarray(reflected)[:, 0] / truth - 1)
     assert np.all(np.abs(found) <= np.array(errors) + 0.5)  # 0.5 %: energies of rough faces, and rounding of the table
+
+
+def test_haze_behind_an_index_spreads_transmitted_light_alike_from_either_side():
+    """A collision adds the variance of its phase function in the medium where it happens."""
+    stack, cosine = lj.Stack([lj.Interface(1.5, 1e-4), lj.Medium(0.5, 1.0, lj.HenyeyGreenstein(0.9))]), jnp.ones(())
+    options = Options("multiple", "orders", angles=False, own_side=False)
+    for upward in (False, True):
+        once = shaped(stack, options, cosine, upward).transmitted[1].alpha[0]
+        np.testing.assert_allclose(once, roughness(phase_variance(jnp.asarray(0.9))), rtol=1e-3)
 
 
 def test_albedo_of_a_coated_diffuse_base():
