@@ -25,10 +25,11 @@ def pair_of(media: tuple[Medium, ...]) -> tuple[Medium, ...]:
     The medium that scatters more keeps its phase function and f0; its thickness grows by the other's extinction along
     the normal, and its albedo becomes the mean over both.
     """
-    while len(media) > MOST:
-        strengths = [float(np.mean(_scattering(medium))) for medium in media]
-        at = min(range(len(media) - 1), key=lambda k: min(strengths[k], strengths[k + 1]))
-        media = (*media[:at], _together(media[at], media[at + 1]), *media[at + 2 :])
+    with jax.ensure_compile_time_eval():  # numbers that are known stay known while a program is traced
+        while len(media) > MOST:
+            strengths = [float(np.mean(_scattering(medium))) for medium in media]
+            at = min(range(len(media) - 1), key=lambda k: min(strengths[k], strengths[k + 1]))
+            media = (*media[:at], _together(media[at], media[at + 1]), *media[at + 2 :])
     return media
 
 

@@ -217,6 +217,14 @@ def test_more_than_two_media_become_a_pair():
     np.testing.assert_allclose(three, two, rtol=1e-9)
 
 
+def test_known_media_become_a_pair_while_a_program_is_traced_too():
+    media = (HAZE, FIBERS, FLAKES)
+    jax.make_jaxpr(lambda wi, wo: lj.evaluate(lj.Stack(media), wi, wo, CAKE))(*pairs())
+    found = []
+    jax.make_jaxpr(lambda _: found.extend(pair_of(media)))(1.0)
+    assert eqx.tree_equal(tuple(found), pair_of(media))
+
+
 def test_refusals():
     with pytest.raises(ValueError, match=r"layers\[0\]: SpongeCake carries no Interface.*AddingDoubling"):
         lj.prepare(lj.Stack([lj.Interface(1.5, 0.1), HAZE]), CAKE)
