@@ -234,12 +234,13 @@ def draw(choices: list[tuple[Array, Any]], wi: Vector, uniforms: tuple[Array, Ar
 def density(choices: list[tuple[Array, Any]], wi: Vector, wo: Vector) -> Array:
     """The density of `draw`, 1/sr."""
     total = jnp.zeros_like(wi[2] * wo[2])
+    off_plane = sanitised(wi, jnp.abs(wi[2]) > horizon(wi[2].dtype))  # of others, zeros too, all probabilities are 0
     for probability, lobe in choices:
         if isinstance(lobe, Surface):
             above = jnp.where(is_above(wo), lobe.pdf(sanitised(wi), sanitised(wo)), 0.0)
             total = total + probability * above
         else:
-            total = total + probability * lobe.pdf(wi, wo)
+            total = total + probability * lobe.pdf(off_plane, wo)
     return total
 
 

@@ -119,12 +119,16 @@ def test_tangent_and_unnormalised_directions_give_no_nan():
         wi, wo = odd[:, None].astype(dtype), odd[None].astype(dtype)
         whole = lj.Stack(stack.layers, base)
 
+        def values(stack, a, b):
+            return lj.evaluate(stack, a, b, SINGLE), lj.pdf(stack, a, b, SINGLE)
+
         @jax.jit
         def all_of(stack, a, b):
-            values, back = jax.vjp(lambda a, b: lj.evaluate(stack, a, b, SINGLE), a, b)
-            return values, *back(jnp.ones_like(values))
+            found, back = jax.vjp(values, stack, a, b)
+            drawn = lj.sample(stack, a, jax.random.key(0), SINGLE)
+            return found, back(jax.tree.map(jnp.ones_like, found)), drawn
 
-        assert all(np.isfinite(array).all() for array in all_of(whole, wi, wo))
+        assert all(np.isfinite(array).all() for array in jax.tree.leaves(all_of(whole, wi, wo)))
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
