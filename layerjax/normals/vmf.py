@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.special import ndtr
 
-from layerjax._numerics import at_least, exprel, safe_sqrt
+from layerjax._numerics import at_least, at_most, exprel, safe_sqrt
 from layerjax.directions import Vector
 
 Masking = Literal["normal", "paper"]
@@ -126,6 +126,7 @@ def projected_area(cosine: Array, kappa: Array, masking: Masking = "normal") -> 
     "normal": <o, m> taken as normally distributed, with its own mean and variance; G1 is then exact within 0.03 from
     kappa = 2 on (0.001 at 100). "paper": Guo 2015, Eq. (8), off by 0.06 at kappa = 3 and by 0.4 at 100 near grazing.
     """
+    cosine = at_most(cosine, 1.0)  # directions may be longer than 1 by `UNIT_SLACK`
     length, _ = resultant(kappa)
     if masking == "paper":
         a, b = 0.25 * (length + 1.0) ** 2, jnp.cbrt(length)
