@@ -5,17 +5,21 @@ follow from adding. Over a diffuse base the light that has reached it leaves as 
 """
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax import channels
 from layerjax._numerics import horizon, safe_div, safe_sqrt
+from layerjax._parameters import is_placeholder
 from layerjax.channels import Channels
 from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitised, select
 from layerjax.microsurface import Microfacets
+from layerjax.microsurface.energy_tables import LARGEST_INDEX
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
 from layerjax.quadrature import gauss_legendre
@@ -46,6 +50,9 @@ from layerjax.transport.statistical.shaped import (
 )
 from layerjax.transport.statistical.streamed_base import is_streamed, make_streamed
 
+INDEX_SLACK = 1e-6
+"""Of the logarithm of a ratio of indices: those that are given in single precision are rounded."""
+
 Diffuse = Literal["tables", "exact", "lobe"]
 Energies = tuple[Channels, Channels]
 
@@ -71,6 +78,9 @@ class Statistical(DeterministicTransport):
     Carries `Interface`, `Medium` with a Henyey-Greenstein phase function (its forward lobe; backward scattering is not
     followed), and every base. One that is diffuse, but not Lambertian, counts under layers as f = A(i) A(o) / (pi rho)
     with its own directional albedo A, of mean rho: energies by its own, of its shape only what that product has.
+
+    The index of an `Interface` is 1/4 to 4 times that above it; others are refused where they are known, and traced
+    ones count as the nearer end.
 
     Args:
         symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
@@ -107,6 +117,7 @@ class Statistical(DeterministicTransport):
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         refuse_vmf(stack, names, "Statistical")
+        _check_indices(stack, names)
         for name, layer in zip(names, stack.layers, strict=True):
             if isinstance(layer, Medium) and layer.phase.forward_lobe is None:
                 raise ValueError(
@@ -280,6 +291,23 @@ class Statistical(DeterministicTransport):
 
 def _is_diffuse(base: Surface | None) -> bool:
     return base is not None and not isinstance(base, Conductor)
+
+
+def _check_indices(stack: Stack, names: Sequence[str]) -> None:
+    """Refuse steps of the index that are known to lie beyond the tables of energies."""
+    above: Any = 1.0
+    for name, layer in zip(names, stack.layers, strict=True):
+        if not isinstance(layer, Interface):
+            continue
+        if not any(isinstance(ior, jax.core.Tracer) or is_placeholder(ior) for ior in (above, layer.ior)):
+            ratios = np.asarray(layer.ior, float) / np.asarray(above, float)
+            beyond = np.abs(np.log(ratios)) > np.log(LARGEST_INDEX) + INDEX_SLACK
+            if beyond.any():
+                raise ValueError(
+                    f"{name}.ior: {ratios[beyond][0]:g} times the index above it; Statistical carries "
+                    f"{1.0 / LARGEST_INDEX:g} to {LARGEST_INDEX:g} times"
+                )
+        above = layer.ior
 
 
 def _same(w: Vector) -> Vector:

@@ -196,6 +196,10 @@ def test_what_it_does_not_carry_is_named():
     flakes = lj.Stack([lj.Interface(1.5, 0.1), lj.Medium(1.0, phase=lj.SGGX("surface", 0.3))], lj.Lambertian(0.5))
     with pytest.raises(ValueError, match=r"layers\[1\]: Statistical carries no SGGX medium .* AddingDoubling"):
         lj.prepare(flakes, SYMMETRIC)
+    low, high = lj.Interface(0.4, 0.1), lj.Interface(np.float32([1.6, 1.7]), 0.1)
+    with pytest.raises(ValueError, match=r"layers\[1\]\.ior: 4\.25 times the index above it; .* 0\.25 to 4 times"):
+        SYMMETRIC.check(lj.Stack([low, high]), ["layers[0]", "layers[1]"])
+    SYMMETRIC.check(lj.Stack([low, lj.Interface(np.float32(1.6), 0.1)]), ["layers[0]", "layers[1]"])
     with pytest.raises(ValueError, match=r"layers\[0\].f0: Statistical"):
         lj.prepare(lj.Stack([lj.Medium(1.0, f0=0.04)], lj.Lambertian(0.5)), SYMMETRIC)
     with pytest.raises(ValueError, match=r"Statistical\.scattering: 'all' is not one of 'orders', 'single'"):
