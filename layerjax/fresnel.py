@@ -55,16 +55,15 @@ def conductor(cosine: Array, ior: Array, k: Array) -> Array:
     """
     cos2 = cosine * cosine
     sin2 = 1.0 - cos2
-    real = ior * ior - k * k - sin2
+    real = (ior - 1.0) * (ior + 1.0) - k * k + cos2  # ior^2 - k^2 - sin2: at a matched index cos2 to its own digits
     product = ior * k
     modulus = safe_sqrt(real * real + 4.0 * product * product)
     # a + i b = sqrt(n^2 - sin^2): the larger part by a sum, the other from their product, so that nothing cancels
     larger = 0.5 * (modulus + jnp.abs(real))
-    smaller = safe_div(product * product, larger)
+    smaller = product * safe_div(product, larger)
     # the root of a square is written as its base: at k = 0 under total reflection its derivative is not 0
     root = safe_sqrt(larger)
     a, b2 = jnp.where(real > 0, root, safe_div(product, root)), jnp.where(real > 0, smaller, larger)
     perpendicular, below = (a - cosine) ** 2 + b2, (a + cosine) ** 2 + b2
     ratio, under = (a * cosine - sin2) ** 2 + b2 * cos2, (a * cosine + sin2) ** 2 + b2 * cos2
-    tiny = jnp.finfo(modulus.dtype).tiny
-    return 0.5 * perpendicular * (under + ratio) / (below * under + tiny)  # one division for both polarisations
+    return safe_div(0.5 * perpendicular * (under + ratio), below * under)  # one division for both polarisations

@@ -46,11 +46,20 @@ def test_conductor_against_complex_arithmetic():
         assert (value >= 0).all()
 
 
+def test_conductor_keeps_the_digits_of_grazing_light_at_nearly_matched_indices():
+    cosine = jnp.asarray([0.0, 1e-6, 1e-4, 1e-2, 0.3, 1.0], jnp.float32)
+    assert not conductor(cosine, jnp.float32(1.0), jnp.float32(0.0)).any()
+    for ior, k in ((1.0, 1e-4), (1.0 + 2.0**-13, 1e-3)):
+        expected = complex_reflectance(np.asarray(cosine, float), ior + 1j * k)
+        np.testing.assert_allclose(conductor(cosine, jnp.float32(ior), jnp.float32(k)), expected, rtol=1e-3, atol=1e-7)
+
+
 def test_gradients_are_finite_and_right():
     derivative = jax.jit(jax.vmap(jax.grad(fresnel.conductor, (0, 1, 2)), (0, None, None)))
-    for ior, k in ((0.2, 3.9), (1.5, 0.0), (0.5, 0.0), (1.0, 1e-6)):
-        values = np.asarray(derivative(COSINES, ior, k))
-        assert np.isfinite(values).all()
+    for ior, k in ((0.2, 3.9), (1.5, 0.0), (0.5, 0.0), (1.0, 0.0), (1.0, 1e-6)):
+        for dtype in (np.float32, np.float64):
+            cosines = np.array([*COSINES, 1e-9, 0.0], dtype)
+            assert np.isfinite(derivative(cosines, dtype(ior), dtype(k))).all()
     step = 1e-6
     numeric = (complex_reflectance(COSINES, 0.2 + step + 3.9j) - complex_reflectance(COSINES, 0.2 - step + 3.9j)) / (
         2 * step
