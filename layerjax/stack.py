@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from layerjax._drawn import Row, picture
+from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
 from layerjax._shapes import channel_count
 from layerjax._shown import Shown, described
@@ -21,6 +22,9 @@ from layerjax.directions import Vector
 from layerjax.normals.facets import Distribution, check_facets
 from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Surface
+
+LEAST_EXTINCTION = 1e-10
+"""In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be asked for."""
 
 
 class Interface(Shown):
@@ -98,8 +102,9 @@ class TurbidMedium(Shown):
         """The same medium by optical depth and albedo; ValueError for a concrete depth above 1e4."""
         thickness, mu_s, mu_a = (jnp.asarray(number) for number in (self.thickness_mm, self.mu_s, self.mu_a))
         extinction = mu_s + mu_a
-        some = extinction > 0
-        albedo = jnp.where(some, mu_s / jnp.where(some, extinction, 1.0), 0.0)
+        if isinstance(self.mu_s, jax.core.Tracer):  # the derivative of the depth times the albedo is d at 0 as well
+            extinction = extinction + jnp.where(extinction > 0, 0.0, LEAST_EXTINCTION)
+        albedo = safe_div(mu_s, extinction)
         # of a map of thicknesses the channels lie behind
         depth = (thickness[..., None] if thickness.ndim else thickness) * extinction
         return Medium(depth, 0.0 if is_known(self.mu_s, 0.0) else albedo, self.phase, self.f0)
