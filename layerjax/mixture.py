@@ -87,10 +87,13 @@ class Mixture(Shown):
         return eqx.tree_at(lambda mixture: mixture.parts, self, found)
 
     def weighed(self, function: Callable[[Any, Any], Any], key: Array | None = None) -> list[tuple[Array, Any]]:
-        """The weight of every part, and function(part, its own key) of it; without a key each has None."""
+        """The weight of every part, and function(part, its own key) of it; without a key each has None.
+
+        By name, as they are within transformations: there, too, a key is that of the same part.
+        """
         keys = [None] * len(self.parts) if key is None else [*jax.random.split(key, len(self.parts))]
         shares = self.shares()
-        return [(shares[name], function(part, own)) for (name, part), own in zip(self.parts.items(), keys, strict=True)]
+        return [(shares[name], function(self.parts[name], own)) for name, own in zip(sorted(shares), keys, strict=True)]
 
     def mean(self, function: Callable[[Any, Any], Any], key: Array | None = None, by_channel: bool = True) -> Any:
         """Arrays of function(part, key), weighted and summed; by_channel: their last axis counts channels."""

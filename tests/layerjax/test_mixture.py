@@ -66,6 +66,15 @@ def test_walks_are_drawn_for_each_part_by_itself() -> None:
         lj.evaluate(mixed, wi, wo, walk)
 
 
+def test_a_key_is_that_of_the_same_part_inside_of_transformations() -> None:
+    """JAX puts names in order."""
+    mixed = lj.Mixture({"paint": PAINT, "bare": BARE}, [0.3, 0.7])
+    inside = jax.tree.map(lambda leaf: leaf, mixed)
+    assert list(inside.parts) != list(mixed.parts)
+    draws = [of.weighed(lambda part, own: (type(part.base), own), jax.random.key(0)) for of in (mixed, inside)]
+    assert draws[0] == draws[1]
+
+
 @pytest.mark.parametrize("weight", [0.0, 0.3, 1.0])
 def test_derivatives_by_weights_are_differences(weight: float) -> None:
     def value(w):
