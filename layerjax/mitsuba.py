@@ -28,7 +28,7 @@ from layerjax._shapes import map_shape
 from layerjax.evaluate import evaluate, pdf, sample, unscattered
 from layerjax.mixture import Mixture, stacks_of
 from layerjax.preparation import choose_transport, prepare
-from layerjax.stack import Interface, Stack, require_numbers
+from layerjax.stack import Interface, Stack, require_numbers, simplify
 
 NAME = "layerjax"
 BATCHES = (1 << 8, 1 << 12, 1 << 15)
@@ -81,16 +81,16 @@ class Material:
             raise ValueError(f"mitsuba: the stack has {stack.channels} channels, {mi.variant()} takes {self.colours}")
         self.transport = choose_transport(stack, transport)
         self.numbers = {name: _array(name, leaf) for name, leaf in leaves_with_names(stack)}
-        self._take(stack)
         self.is_random = self.transport.random
-        parts = stacks_of(stack)
-        self.is_open = any(part.base is None for part in parts)
-        self.has_null = any(_has_null(part) for part in parts)
-        interfaces = [layer.ior for part in parts for layer in part.layers if isinstance(layer, Interface)]
-        self.eta = float(interfaces[-1]) if self.is_open and interfaces else 1.0
+        self._take(stack)
 
     def _take(self, stack: Stack | Mixture) -> None:
         self.stack, self.prepared = stack, prepare(stack, self.transport)
+        layers = [simplify(part).layers for part in stacks_of(stack) if part.base is None]
+        interfaces = [[layer.ior for layer in one if isinstance(layer, Interface)] for one in layers]
+        self.is_open = bool(layers)
+        self.has_null = not all(interfaces)
+        self.eta = next((float(found[-1]) for found in reversed(interfaces) if found), 1.0)
 
     def update(self) -> None:
         """Take over numbers that were changed.
@@ -163,6 +163,9 @@ def _plugin(variant: str) -> type:
         def __init__(self, properties: Any, material: Material | None = None):
             mi.BSDF.__init__(self, properties)
             self.material = _asked_for(properties) if material is None else material
+            self._name_components()
+
+        def _name_components(self) -> None:
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             kinds = [mi.BSDFFlags.GlossyReflection | sides]
             kinds += [mi.BSDFFlags.GlossyTransmission | sides] if self.material.is_open else []
@@ -175,6 +178,7 @@ def _plugin(variant: str) -> type:
 
         def parameters_changed(self, keys: Any) -> None:
             self.material.update()
+            self._name_components()
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             return _sample(self.material, ctx, si, sample1, sample2, active)
@@ -303,10 +307,6 @@ def _array(name: str, leaf: Array) -> Any:
     """A number as Dr.Jit has it: one, or three, of a colour or an axis."""
     kind = mi.Float if leaf.size == 1 else mi.Vector3f if name.endswith("axis") else mi.Color3f
     return kind(*(float(number) for number in np.ravel(leaf)))
-
-
-def _has_null(stack: Stack) -> bool:
-    return stack.base is None and not any(isinstance(layer, Interface) for layer in stack.layers)
 
 
 def _check(module: Any) -> None:

@@ -180,6 +180,20 @@ def test_numbers_are_seen_and_checked(mi: Any) -> None:
         numbers.update()
 
 
+def test_what_lies_behind_and_what_passes_straight_follow_the_numbers(mi: Any) -> None:
+    """An opaque part has nothing behind it; an interface of index 1 is none, until it gets another."""
+    veil, varnish = lj.Medium(0.3, 0.0), lj.Stack([lj.Interface(1.7, 0.1)], lj.Conductor(0.2, 3.0, 0.1))
+    mixed = lj.Mixture({"veil": lj.Stack([veil]), "varnish": varnish}, [0.5, None])
+    assert bsdf(mixed, lj.Statistical()).material.eta == 1.0
+    made = bsdf(lj.Stack([lj.Interface(1.0, 0.1), veil]), lj.Statistical(), id="veil")
+    assert (made.material.eta, made.material.has_null) == (1.0, True)
+    numbers = mi.traverse(made)
+    numbers["layers[0].ior"] = 1.5
+    numbers.update()
+    assert (made.material.eta, made.material.has_null) == (1.5, False)
+    assert not mi.has_flag(made.flags(), mi.BSDFFlags.Null)
+
+
 def test_what_it_cannot_take_is_refused(mi: Any) -> None:
     import drjit as dr
 
