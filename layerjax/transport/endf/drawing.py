@@ -138,7 +138,9 @@ def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) 
     """Density of `draw` in solid angle, 1/sr, for wi above."""
     lit, up, down = is_above(wi), is_above(wo), is_above(flip(wo))
     wi, over = sanitised(wi), sanitised(select(down, flip(wo), wo))
-    total = COSINE * (1.0 if opaque else 0.5) * over[2] / jnp.pi
+    lobes = [] if _is_interface(coat) else _proposals(coat, options, wi, opaque)
+    by_cosine = COSINE if lobes or _is_interface(coat) else 1.0
+    total = by_cosine * (1.0 if opaque else 0.5) * over[2] / jnp.pi
     if _is_interface(coat):
         assert coat.top is not None
         ior, alpha = coat.top.ior, width(coat.top.kappa)
@@ -147,9 +149,8 @@ def density(coat: Coat, options: Options, wi: Vector, wo: Vector, opaque: bool) 
         out = select(up, over, flip(over))
         facet = interface_pdf(jnp.where(up, reflected, passed), wi, out, ior, alpha, "vmf")
         total = total + (1.0 - COSINE) * facet
-    else:
-        for lobe in _proposals(coat, options, wi, opaque):
-            total = total + jnp.where(down if lobe.through else up, lobe.share * _density(coat, lobe, wi, over), 0.0)
+    for lobe in lobes:
+        total = total + jnp.where(down if lobe.through else up, lobe.share * _density(coat, lobe, wi, over), 0.0)
     return jnp.where(lit & (up if opaque else up | down), total, 0.0)
 
 

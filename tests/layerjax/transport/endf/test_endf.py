@@ -237,6 +237,12 @@ def test_samples_weights_and_albedo_everywhere(name, transport, theta):
     samples_weights_and_albedo(name, transport, theta)
 
 
+def test_where_nothing_is_all_draws_follow_the_cosine():
+    wo, density, weight = lj.sample(lj.Stack([GLAZE]), lj.direction(0.7, jnp.zeros(9)), jax.random.key(0), lj.ENDF())
+    np.testing.assert_allclose(density, wo[:, 2] / np.pi, rtol=1e-12)
+    assert not weight.any()
+
+
 def test_what_is_not_there_costs_nothing():
     wi, wo = lj.direction(jnp.linspace(0.1, 1.4, 50), 0.0), lj.direction(jnp.linspace(0.2, 1.3, 50), 2.0)
 
