@@ -7,5 +7,4 @@ facet at a time.
 """
 
 from layerjax.microsurface.directional_albedo import Microfacets as Microfacets
-from layerjax.microsurface.directional_albedo import conductor_energy as conductor_energy
 from layerjax.microsurface.directional_albedo import interface_energies as interface_energies

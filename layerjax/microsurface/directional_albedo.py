@@ -3,7 +3,8 @@
 ``microfacets="single"`` is one event with separable Smith masking (Walter et al. 2007), by quadrature over the facets
 that are seen. ``"multiple"`` is the walk on the microsurface of Heitz et al. 2016 ("Multiple-scattering microfacet
 BSDFs with the Smith model"): its first event by quadrature, with height-correlated masking, and of what that leaves on
-the surface the share that returns, a smooth function fitted to walks (`layerjax.precompute.microsurface`).
+the surface the share that returns, a smooth function fitted to walks (`layerjax.precompute.microsurface`). Of
+conductors there are the parts: `reflecting` facets, and `first_mirror` for `conductor_multiple_reflectance` to go on.
 
 Cosines are those of incidence, in (0, 1]; alpha is in [1e-4, 1]; all arguments broadcast. `points` is the number of
 points from pole to rim of the cap of visible facets, for each of its parts. Absolute errors, largest and rms:
@@ -36,7 +37,7 @@ from jax.typing import ArrayLike
 
 from layerjax import fresnel
 from layerjax._numerics import at_least, at_most
-from layerjax.microsurface.multiple_bounces import conductor_multiple_reflectance, interface_multiple_reflectance
+from layerjax.microsurface.multiple_bounces import interface_multiple_reflectance
 from layerjax.microsurface.visible_facets import (
     Cap,
     Facets,
@@ -80,32 +81,6 @@ def interface_energies(
     returned = interface_multiple_reflectance(cosine, alpha, ior)
     reflected = _share(first + reflected_on * returned[0] + refracted_on * returned[1])
     return reflected, 1.0 - reflected
-
-
-@partial(jax.jit, static_argnames=("microfacets", "points"))
-def conductor_energy(
-    cosine: ArrayLike,
-    alpha: ArrayLike,
-    ior: ArrayLike,
-    k: ArrayLike,
-    microfacets: Microfacets,
-    *,
-    points: int = POINTS,
-) -> Array:
-    """Reflectance of a rough conductor.
-
-    Args:
-        cosine, alpha: see above.
-        ior, k: complex index ior + i k over that of the medium above, in [0.01, 10] and [0, 20].
-        microfacets: ``"single"``, or ``"multiple"``, where light loses its Fresnel share at every facet that it meets.
-    """
-    cosine, alpha, ior, k = _arrays(cosine, alpha, ior, k)
-    if microfacets == "single":
-        upper = reflecting(make_cap(cosine, alpha), points)
-        reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
-        return upper.mean(reflectance * masking(upper.reflected(), upper.alpha))
-    first, reflected_on = first_mirror(cosine, alpha, ior, k, points=points)
-    return _share(first + reflected_on * conductor_multiple_reflectance(cosine, alpha, ior, k))
 
 
 @partial(jax.jit, static_argnames="points")

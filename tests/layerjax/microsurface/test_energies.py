@@ -7,11 +7,11 @@ import pytest
 
 import layerjax as lj
 from layerjax.microsurface.directional_albedo import (
-    conductor_energy,
     interface_energies,
     lobe_energy,
     retained,
 )
+from tests.helpers.metals import conductor_energy
 
 multiple = jax.jit(lambda c, a, n: interface_energies(c, a, n, "multiple"))
 single = jax.jit(lambda c, a, n: interface_energies(c, a, n, "single"))

@@ -8,6 +8,7 @@ import pytest
 from layerjax.microsurface import directional_albedo as by_quadrature
 from layerjax.microsurface import energy_tables as tables
 from layerjax.microsurface.splines import fitted, read
+from tests.helpers.metals import conductor_energy
 
 COUNT = 2000
 
@@ -38,7 +39,7 @@ def test_mirrors_and_metals() -> None:
     ior, k = 0.02 * 500.0 ** rng.uniform(size=COUNT), 0.3 + 20.0 * rng.uniform(size=COUNT) ** 1.5
     for microfacets, errors in (("single", (1e-3, 7e-3)), ("multiple", (2e-3, 3e-2))):
         (found,) = tables.conductor_energies(cosine, alpha, (jnp.asarray(ior),), (jnp.asarray(k),), microfacets)
-        near(found, by_quadrature.conductor_energy(cosine, alpha, ior, k, microfacets, points=24), *errors)
+        near(found, conductor_energy(cosine, alpha, ior, k, microfacets, points=24), *errors)
 
 
 @pytest.mark.parametrize("below", [False, True])

@@ -1,0 +1,23 @@
+"""Energies of rough metals by quadrature over their facets, what the tables are compared with."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from layerjax import fresnel
+from layerjax.microsurface.directional_albedo import POINTS, first_mirror, masking, reflecting
+from layerjax.microsurface.multiple_bounces import conductor_multiple_reflectance
+from layerjax.microsurface.visible_facets import make_cap
+
+
+@partial(jax.jit, static_argnames=("microfacets", "points"))
+def conductor_energy(cosine, alpha, ior, k, microfacets, *, points=POINTS):
+    """Reflectance, with the arguments of `layerjax.microsurface.energy_tables.conductor_energies`, of one channel."""
+    cosine, alpha, ior, k = jnp.broadcast_arrays(*map(jnp.asarray, (cosine, alpha, ior, k)))
+    if microfacets == "single":
+        upper = reflecting(make_cap(cosine, alpha), points)
+        reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
+        return upper.mean(reflectance * masking(upper.reflected(), upper.alpha))
+    first, reflected_on = first_mirror(cosine, alpha, ior, k, points=points)
+    return jnp.clip(first + reflected_on * conductor_multiple_reflectance(cosine, alpha, ior, k), 0.0, 1.0)
