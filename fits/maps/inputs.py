@@ -67,7 +67,8 @@ class Readings:
         return self._filled(self.values, self._whole(block))
 
     def read_sigma(self, block: Block) -> Floats | None:
-        """Their standard deviations, (block shape, N, C), NaN where unknown; None if there are none.
+        """Their standard deviations, (block shape, N, C), NaN where unknown, or of no use in a masked texel; None if
+        there are none.
 
         Raises:
             ValueError: as `read`, or one of a texel that is not masked is not above 0.
@@ -82,7 +83,7 @@ class Readings:
                 f"{self.sigma.where}: sigma is {found[bad][0]:g} in block {words(block)}, must be above 0, or NaN "
                 "where it is unknown"
             )
-        return found
+        return np.where(found > 0.0, found, np.nan)
 
     def read_mask(self, block: Block) -> NDArray[np.bool_]:
         """Which texels of a block take part, (block shape): all if there is no mask. Errors as `read`."""

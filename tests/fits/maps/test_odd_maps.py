@@ -183,6 +183,14 @@ def test_what_leaves_nothing_to_fit_is_named(tmp_path, given):
     assert not out.exists()
 
 
+def test_what_stands_in_masked_texels_is_not_looked_at(tmp_path, given, whole):
+    mask, sigma = np.ones(SHAPE, bool), np.full_like(given, 1e-9)
+    mask[0], sigma[0, :4], sigma[0, 4:] = False, 0.0, -999.0
+    found = fitted(tmp_path / "map.zarr", given, sigma=sigma, mask=mask)
+    assert found.has("masked")[0].all()
+    assert apart(found, whole, slice(8, None)) < CLOSE
+
+
 def test_the_only_texel_that_can_be_fitted_is_found(tmp_path, given, whole):
     alone = np.full_like(given, np.nan)
     alone[5, 3] = given[5, 3]
