@@ -31,7 +31,7 @@ from fits.maps.inputs import Readings, readings
 from fits.maps.job import Job, Task, part_of, work
 from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
-from fits.maps.resuming import begun, require_folder
+from fits.maps.resuming import begun, require_folder, throw_away
 from fits.maps.smoothing import Smoothness
 from fits.maps.store import clean, create, left
 from fits.names import Objective
@@ -173,6 +173,7 @@ def _fitted(
     root = begun(path, identity, force)
     prepared = _prepared(root, found, stack, noise, rest, settings, progress)
     if root is None:
+        throw_away(path)  # not before it is known that there can be another
         root = _created(path, prepared, found, identity, settings, stack)
     if GROUP not in root:
         with named(path):

@@ -3,6 +3,7 @@
 import glob
 import os
 import shutil
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,7 +23,8 @@ def require_folder(path: Path) -> None:
 
 
 def begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | None:
-    """The store that is there, if it is of the same fit, and nobody else writes it; None: there is none, or no more.
+    """The store that is there, if it is of the same fit, and nobody else writes it; None: there is none, or one to
+    `throw_away`.
 
     What killed writers left is taken away, and what all chunks have in common if it is damaged: it is found again.
 
@@ -45,10 +47,21 @@ def begun(path: Path, identity: Mapping[str, str], force: bool) -> zarr.Group | 
     except ValueError:
         if not (force and is_ours(path)):
             raise
-        shutil.rmtree(path)
         return None
     clean(path)
     root = zarr.open_group(path, mode="r+")
     if not is_whole(root):
         shutil.rmtree(path / GROUP, ignore_errors=True)
     return root
+
+
+def throw_away(path: Path) -> None:
+    """Remove the map that is there, if there is one; what is left of it where that is stopped `begun` takes away.
+
+    Raises:
+        OSError: it cannot be moved or removed.
+    """
+    if is_ours(path):
+        old = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PARTIAL}")
+        os.rename(path, old)
+        shutil.rmtree(old)

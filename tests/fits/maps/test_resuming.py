@@ -87,6 +87,18 @@ def test_force_keeps_what_is_of_the_same_fit(out, given, whole):
     assert told == [("map", 4, 4, "")]
 
 
+def test_force_keeps_a_map_until_there_can_be_another(out, given, whole):
+    def interrupt(stage, *_):
+        assert stage == "sample"
+        raise KeyboardInterrupt
+
+    with pytest.raises(ValueError, match="mask: no texel takes part"):
+        fitted(out, given, mask=np.zeros((8, 8), bool), force=True)
+    with pytest.raises(KeyboardInterrupt):
+        fitted(out, given, seed=1, force=True, progress=interrupt)
+    assert_same(fits.open_map(out), whole)
+
+
 def test_what_killed_runs_left_beside_it_is_taken_away(tmp_path, given):
     for name in (".coat.zarr.abcd.partial", ".other.zarr.abcd.partial"):
         (tmp_path / name / "values").mkdir(parents=True)
