@@ -10,7 +10,7 @@ it ended poorly: a second minimum that fits as well is not looked for.
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ from fits.maps.job import Job, Task, part_of, work
 from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
 from fits.maps.resuming import begun, require_folder, throw_away
+from fits.maps.settings import USUAL_CHUNK, Settings
 from fits.maps.smoothing import Smoothness
 from fits.maps.store import clean, create, left
 from fits.names import Objective
@@ -46,48 +47,6 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry
 
 MOST_PARAMETERS = 32
-
-USUAL_CHUNK = 1024
-"""Texels of a chunk; programs of smaller maps are for so many as well, and thus the same."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a map is fitted.
-
-    Args:
-        starts, seed: of each of the first few fits of the sample.
-        sample: texels of it.
-        chunk: texels that are fitted and written together.
-        tabulate: whether an exact transport is replaced by a table over the box of the parameters, made once; None: for
-            maps of 1,000 texels or more, where a table of it holds within a tenth of the noise.
-        posterior: texels whose posteriors are sampled as well, see `FittedMap.posterior`: they tell how far standard
-            errors hold.
-        smooth: holds neighbouring texels together, beside the plain fit and after it, see `FittedMap.smoothed`; another
-            one smooths anew, and fits nothing again.
-
-    Raises:
-        ValueError: a number below what it must be.
-    """
-
-    starts: int = 8
-    seed: int = 0
-    sample: int = 64
-    chunk: int = USUAL_CHUNK
-    tabulate: bool | None = None
-    posterior: int = 0
-    smooth: Smoothness | None = None
-
-    def __post_init__(self) -> None:
-        for name, least in {"starts": 1, "seed": 0, "sample": 1, "chunk": 1, "posterior": 0}.items():
-            if not getattr(self, name) >= least:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        if not isinstance(self.smooth, Smoothness | None):
-            raise ValueError(f"smooth is {self.smooth!r}; it must be a fits.Smoothness, or None")
-
-    def told(self) -> dict[str, Any]:
-        """What the fits of the texels depend on."""
-        return {name: getattr(self, name) for name in ("starts", "seed", "sample", "chunk", "tabulate")}
 
 
 def fit_map(
@@ -143,8 +102,8 @@ def fit_map(
     settings = Settings(starts, seed, sample, chunk, tabulate, posterior, smooth)
     rest = {"transport": transport, "scale": scale, "objective": objective, "instrument": instrument}
     found = readings(values, geometry, sigma=sigma, mask=mask)
-    _require_fitting(settings, found, rest)
-    settings = replace(settings, chunk=min(chunk, max(USUAL_CHUNK, math.prod(found.shape))))
+    _require_fitting(settings, found, noise, rest)
+    settings = replace(settings, chunk=min(settings.chunk, max(USUAL_CHUNK, math.prod(found.shape))))
     path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
     require_folder(path)
     kept = programs_kept() if several else nullcontext()  # workers run the program that has fitted the sample
@@ -193,8 +152,10 @@ def _fitted(
     return open_map(path)
 
 
-def _require_fitting(settings: Settings, found: Readings, rest: Mapping[str, Any]) -> None:
-    """Refuse arguments that mean nothing together."""
+def _require_fitting(settings: Settings, found: Readings, noise: Any, rest: Mapping[str, Any]) -> None:
+    """Refuse arguments that are none, or mean nothing together."""
+    if not isinstance(noise, Noise | None):
+        raise ValueError(f"noise is {noise!r}; it must be a fits.Noise, or None")
     if rest["instrument"] is not None and found.geometry is None:
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
     if settings.posterior and rest["objective"] != "likelihood":

@@ -57,9 +57,7 @@ class Smoothness:
         where = {name: f"Smoothness.scale[{name!r}]" if name else "Smoothness.scale" for name in given}
         plain = {str(name): _checked(where[name], one) for name, one in given.items()}
         object.__setattr__(self, "scale", plain if isinstance(self.scale, Mapping) else plain[""])
-        whole = isinstance(self.rounds, int | np.integer) and not isinstance(self.rounds, bool)
-        if not whole or self.rounds < 1:
-            raise ValueError(f"Smoothness.rounds is {self.rounds!r}; it must be a whole number of at least 1")
+        whole("Smoothness.rounds", self.rounds, 1)
 
     def scales(self, names: Sequence[str]) -> dict[str, float]:
         """Of those of these parameters that are smoothed, by name.
@@ -92,6 +90,13 @@ def _checked(field: str, value: object) -> float:
     if not SMALLEST <= number <= LARGEST:
         raise ValueError(f"{field} is {value!r}; it must be a number from {SMALLEST:g} to {LARGEST:g}")
     return number
+
+
+def whole(field: str, value: object, least: int) -> int:
+    """A whole number of at least so much; ValueError that names the field for anything else."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{field} is {value!r}; it must be a whole number of at least {least}")
+    return int(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -274,7 +274,10 @@ def test_what_cannot_be_is_refused(tmp_path, geometry, values):
     out = tmp_path / "none.zarr"
     for options, words in (
         ({"starts": 0}, "starts is 0"),
-        ({"chunk": 0}, "chunk is 0"),
+        ({"chunk": 0}, "chunk is 0; it must be a whole number of at least 1"),
+        ({"chunk": 1e4}, "chunk is 10000.0; it must be a whole number of at least 1"),
+        ({"starts": "8"}, "starts is '8'; it must be a whole number of at least 1"),
+        ({"noise": 0.02}, "noise is 0.02; it must be a fits.Noise, or None"),
         ({"noise": fits.Noise(relative=0.02, correlated=True)}, "noise.correlated"),
     ):
         with pytest.raises(ValueError, match=words):
