@@ -48,6 +48,9 @@ if TYPE_CHECKING:
 
 MOST_PARAMETERS = 32
 
+NAMED = 8
+"""Chunks that an error names of those that could not be done."""
+
 
 def fit_map(
     stack: Any,
@@ -142,8 +145,8 @@ def _fitted(
     job = _job(path, prepared, found, settings, client is None and processes == 1)
     failures = _run(root, job, found, client, processes, progress)
     if failures:
-        more = f", and {len(failures) - 1} more" if len(failures) > 1 else ""
-        raise ValueError(f"{path}: {failures[0]}{more}; all other chunks are done, and another run does these")
+        more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
+        raise ValueError(f"{path}: {'; '.join(failures[:NAMED])}{more}; all other chunks are done, and another run does these")
     if settings.smooth is not None:
         here = replace(job, source=found) if client is None else job
         smooth_map(open_map(path), here, found, settings.smooth, client, progress)

@@ -220,6 +220,22 @@ def test_a_damaged_chunk_of_readings_costs_itself(tmp_path, whole, geometry, val
         assert np.nanmax(apart) < 2e-3
 
 
+def test_chunks_that_cannot_be_read_are_named(tmp_path, geometry, values):
+    """All four, and not the first alone."""
+    path = tmp_path / "readings.zarr"
+    zarr.create_array(path, shape=values.shape, chunks=(4, 4, 16, 1), dtype="f8")[...] = values
+    damaged = [path / "c" / row / column / "0" / "0" for row in "01" for column in "01"]
+
+    def damage(stage, *_):
+        for one in damaged if stage == "map" else ():
+            one.write_bytes(b"")
+
+    with pytest.raises(ValueError, match="all other chunks are done") as error:
+        fitted(tmp_path / "out.zarr", geometry, path, progress=damage)
+    for block in ("0:4, 0:4", "0:4, 4:8", "4:8, 0:4", "4:8, 4:8"):
+        assert f"chunk [{block}]: {path}: block [{block}] cannot be read" in str(error.value)
+
+
 def test_a_full_disk_leaves_no_half_chunk(tmp_path, monkeypatch, whole, geometry, values, mask):
     write, calls = chunk_files.write, []
 
