@@ -24,12 +24,13 @@ TOGETHER = 2**20  # directions in memory that are checked at a time
 
 @dataclass(frozen=True)
 class Portable:
-    """Where another process finds the readings of a map: paths and names, and directions that all texels share."""
+    """Where another process finds the readings of a map: paths and names; what is small is there itself, directions and
+    deviations (N,) that all texels share, and a mask that is only in memory."""
 
     values: Place
     directions: Mapping[str, Place | Floats]
-    sigma: Place | None
-    mask: Place | None
+    sigma: Place | Floats | None
+    mask: Place | NDArray[np.bool_] | None
 
     def open(self) -> "Readings":
         """The readings, opened again. Errors as in `readings`."""
@@ -118,13 +119,21 @@ class Readings:
 
     @property
     def portable(self) -> Portable | None:
-        """What another process opens them from, cheap to pickle; None if a part of them is only in memory."""
-        own = self.directions.places()
-        lost = [one for one in (self.values, self.sigma, self.mask) if one is not None and one.place is None]
-        if own is None or lost or self.values.place is None:
+        """What another process opens them from, cheap to pickle; None if a large part of them is only in memory.
+
+        Raises:
+            ValueError: a small part that is only in memory cannot be read.
+        """
+        own, sigma, mask = self.directions.places(), self.sigma, self.mask
+        if own is None or self.values.place is None:
+            return None
+        if sigma is not None and sigma.place is None and len(sigma.shape) > 1:
             return None
         return Portable(
-            self.values.place, own, *(None if one is None else one.place for one in (self.sigma, self.mask))
+            self.values.place,
+            own,
+            None if sigma is None else sigma.place or sigma.read(),
+            None if mask is None else mask.place or self.read_mask(()),
         )
 
     def _whole(self, block: Block) -> Block:

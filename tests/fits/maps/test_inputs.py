@@ -84,6 +84,17 @@ def test_each_source_gives_the_same_block(tmp_path: Path, kind: str) -> None:
         assert again.digest() == found.digest()
 
 
+def test_what_is_small_goes_to_other_processes_from_memory(tmp_path: Path) -> None:
+    np.save(tmp_path / "v.npy", VALUES)
+    sigma, mask = SIGMA[0, 0, :, 0], xarray.DataArray(MASK)
+    found = readings(tmp_path / "v.npy", VIEW, sigma=sigma, mask=mask)
+    again = pickle.loads(pickle.dumps(found.portable)).open()
+    assert again.digest() == found.digest()
+    np.testing.assert_array_equal(again.read_mask(BLOCK), MASK[BLOCK])
+    np.testing.assert_array_equal(again.read_sigma(BLOCK), found.read_sigma(BLOCK))
+    assert readings(tmp_path / "v.npy", VIEW, sigma=SIGMA).portable is None
+
+
 def test_blocks_are_copies_and_are_asked_for_by_slices() -> None:
     found = readings(VALUES, VIEW)
     found.read(BLOCK)[...] = 0.0
