@@ -77,7 +77,7 @@ class Moved(NamedTuple):
 def work(job: Job, task: Half) -> Moved:
     """Fit texels given their neighbours."""
     part = part_of(job.readings, task.block) if task.part is None else task.part
-    rows = rows_of(job, part).rows(task.places)
+    rows = rows_of(part, job.least).rows(task.places)
     pulled = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
     found = solve(job.problem, task.units, pulled, job.size, fresh=False)
     filled = np.minimum(np.arange(job.size), rows.number - 1)  # one program for chunks of any size

@@ -112,7 +112,7 @@ def work(job: Job, task: Task) -> dict[str, int]:
 def fit_chunk(job: Job, part: Part) -> dict[str, NDArray[Any]]:
     """The arrays of a store for one chunk, by their names, each of the chunk's shape."""
     shape = part.values.shape[:-2]
-    rows, mask = rows_of(job, part), part.mask.reshape(-1)
+    rows, mask = rows_of(part, job.least), part.mask.reshape(-1)
     enough = rows.readings >= len(job.problem.names)
     fitted = np.flatnonzero(mask & enough)
     results = _empty(job, rows.number)
@@ -126,14 +126,14 @@ def fit_chunk(job: Job, part: Part) -> dict[str, NDArray[Any]]:
     return {name: array.reshape(shape) for name, array in results.items()}
 
 
-def rows_of(job: Job, part: Part) -> Texels:
-    """The texels of a part, one after the other."""
+def rows_of(part: Part, least: float) -> Texels:
+    """The texels of a part, one after the other; least: of the noise's floor, in 1/sr."""
     rank = part.mask.ndim
 
     def flat(array: Any) -> Any:
         return None if array is None else array.reshape(-1, *array.shape[rank:])
 
-    return texels(flat(part.values), flat(part.sigma), job.least, flat(part.wi), flat(part.wo))
+    return texels(flat(part.values), flat(part.sigma), least, flat(part.wi), flat(part.wo))
 
 
 def _among(beside: NDArray[np.int64], fitted: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -13,10 +13,10 @@ from fits.inference.optimise import refit
 from fits.inference.sampling import sample
 from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.inputs import Readings
-from fits.maps.job import Part, completed, part_of
+from fits.maps.job import Part, part_of, rows_of
 from fits.maps.prepared import GOLDEN, Prepared
 from fits.maps.sampled import GROUP, QUANTILES
-from fits.maps.tabulated import Tabulated
+from fits.maps.texels import model_of
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
@@ -30,12 +30,12 @@ def sample_texels(
 ) -> None:
     """Sample the posteriors of `count` texels from all over a finished map, and keep them in its store.
 
-    What is there of as many texels is not done again.
+    What is there of as many texels is not done again. Where none has converged, there are none to sample.
     """
     path = Path(root.store.root)  # type: ignore[attr-defined]
     fitted = open_map(path)
     places = chosen(fitted, count)
-    if GROUP in root and dict(root[GROUP].attrs).get("texels") == len(places):
+    if not len(places) or (GROUP in root and dict(root[GROUP].attrs).get("texels") == len(places)):
         return
     shutil.rmtree(path / GROUP, ignore_errors=True)
     vectors, rows = np.stack([fitted.values[name][tuple(places.T)] for name in fitted.names], axis=1), []
@@ -71,19 +71,9 @@ def _sampled(
 
 
 def problem_at(prepared: Prepared, part: Part) -> Problem:
-    """The problem of one texel, whose readings are a block of its own."""
-    problem = prepared.problem
-    values = part.values.reshape(-1, part.values.shape[-1])
-    used = np.all(np.isfinite(values), axis=-1)
-    sigma = None if part.sigma is None else part.sigma.reshape(values.shape)
-    if sigma is not None:
-        used &= np.all(np.isfinite(sigma), axis=-1)
-        sigma = np.where(used[:, None], sigma, 1.0)
-    own = part.wi is not None
-    wi, wo = (problem.data.wi, problem.data.wo)
-    if part.wi is not None and part.wo is not None:
-        wi, wo = part.wi.reshape(-1, 3), part.wo.reshape(-1, 3)
-    data = Measurements(wi, wo, np.where(used[:, None], values, 0.0), sigma, used, problem.data.channels)
-    alone = replace(problem, data=data)
-    table = problem.model.table if isinstance(problem.model, Tabulated) and used.all() else None
-    return completed(alone, own, table)
+    """The problem of one texel, whose readings are a block of its own; they count as in its fit."""
+    row, problem = rows_of(part, prepared.least).rows(0), prepared.problem
+    wi, wo = (problem.data.wi, problem.data.wo) if row.wi is None else (row.wi, row.wo)
+    sigma = None if part.sigma is None else np.sqrt(row.variance)
+    data = Measurements(wi, wo, row.values, sigma, np.ones(len(wi), bool), problem.data.channels)
+    return replace(problem, data=data).with_model(model_of(problem.model, row))

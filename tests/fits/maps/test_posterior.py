@@ -1,12 +1,19 @@
 """Posteriors of a few texels of a map."""
 
+import shutil
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import zarr
 
 import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
+from fits.maps.job import Part
+from fits.maps.posterior import problem_at, sample_texels
+from fits.maps.store import FLAGS
 
 NOISE = fits.Noise(relative=0.02, floor=1e-4, correlated=False)
 STACK = lj.Stack(
@@ -61,3 +68,32 @@ def test_what_is_no_likelihood_has_no_posterior(tmp_path, map_and_readings):
     _, values, geometry, _ = map_and_readings
     with pytest.raises(ValueError, match="posterior is 2"):
         fits.fit_map(STACK, geometry, values, tmp_path / "l2.zarr", objective="cosine_l2", posterior=2)
+
+
+@pytest.mark.parametrize("sigma", [None, np.full((16, 2), 0.01)], ids=["without sigma", "with sigma"])
+def test_readings_of_a_texel_count_as_in_its_fit(map_and_readings, sigma):
+    """Where one channel of two is dead, the posterior is that of the other alone."""
+    _, values, geometry, _ = map_and_readings
+    vectors, used = np.array([[0.3, 0.6], [0.5, 0.4], [0.9, 0.2]]), np.ones(16, bool)
+    both = np.concatenate([values[1], np.full((16, 1), np.nan)], axis=1)
+
+    def problem(values, sigma):
+        channels = tuple(f"channel{k}" for k in range(values.shape[1]))
+        data = Measurements(geometry.wi, geometry.wo, values, sigma, used, channels)
+        return fits.Problem(STACK, data, transport=lj.SingleScattering(), noise=NOISE)
+
+    prepared = SimpleNamespace(problem=problem(np.ones((16, 2)), sigma), least=NOISE.floor)
+    found = problem_at(prepared, Part(both[None], None if sigma is None else sigma[None], np.ones(1, bool), None, None))
+    alone = problem(values[1], None if sigma is None else sigma[:, :1])
+    several = [[float(one.log_likelihood(vector)) for vector in vectors] for one in (found, alone)]
+    np.testing.assert_allclose(*(np.diff(each) for each in several), rtol=1e-6)
+
+
+def test_a_map_in_which_no_texel_converged_has_no_posterior(map_and_readings, tmp_path):
+    found, *_ = map_and_readings
+    copy = shutil.copytree(found.path, tmp_path / "map.zarr")
+    shutil.rmtree(copy / "posterior")
+    root = zarr.open_group(copy, mode="r+")
+    root["flags"][...] = FLAGS["fitted"]
+    sample_texels(root, None, None, 2, 0, None)
+    assert fits.open_map(copy).posterior is None
