@@ -126,6 +126,8 @@ def _fitted(
     force: bool,
     progress: Progress | None,
 ) -> FittedMap:
+    if noise is not None and not noise.use_sigma:
+        found = replace(found, sigma=None)
     identity = {name: digest(one) for name, one in {"stack": stack, "noise": noise, **rest}.items()}
     identity |= {name: digest(one) for name, one in settings.told().items()}
     identity |= {"readings": found.digest(), "precision": str(np.dtype(jnp.result_type(float)))}

@@ -1,5 +1,7 @@
 """Maps of all shapes and precisions, readings that no texel can have, models that break: each costs itself alone."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,6 +191,12 @@ def test_what_stands_in_masked_texels_is_not_looked_at(tmp_path, given, whole):
     found = fitted(tmp_path / "map.zarr", given, sigma=sigma, mask=mask)
     assert found.has("masked")[0].all()
     assert apart(found, whole, slice(8, None)) < CLOSE
+
+
+def test_noise_that_does_not_use_sigma_is_without_it(tmp_path, given, whole):
+    found = fitted(tmp_path / "map.zarr", given, sigma=given, noise=replace(NOISE, use_sigma=False))
+    for name in NAMES:
+        np.testing.assert_array_equal(found.errors[name], whole.errors[name])
 
 
 def test_the_only_texel_that_can_be_fitted_is_found(tmp_path, given, whole):
