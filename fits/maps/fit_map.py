@@ -33,6 +33,7 @@ from fits.maps.posterior import sample_texels
 from fits.maps.prepared import GROUP, Prepared, load, prepare, prototype, sampled, save
 from fits.maps.resuming import begun, require_folder, throw_away
 from fits.maps.settings import USUAL_CHUNK, Settings
+from fits.maps.sharing import Shared
 from fits.maps.smoothing import Smoothness
 from fits.maps.store import clean, create, left
 from fits.names import Objective
@@ -40,7 +41,7 @@ from fits.problem.instrument import Instrument
 from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
-from fits.problem.problem import with_floor
+from fits.problem.problem import unit, with_floor
 from fits.progress import Progress
 
 if TYPE_CHECKING:
@@ -208,10 +209,6 @@ def _created(
     stack: Any,
 ) -> zarr.Group:
     problem, reduced = prepared.problem, prepared.reduced[np.isfinite(prepared.reduced)]
-    shared = {}
-    if prepared.shared is not None:
-        errors = prepared.shared.errors
-        shared = {name: {"value": value, "error": errors[name]} for name, value in prepared.shared.values.items()}
     about = {
         "version": layerjax.__version__,
         "digests": dict(identity),
@@ -227,7 +224,7 @@ def _created(
             "poor_above": prepared.starts.expected,
         },
         "numerical": {**prepared.words, "error": prepared.numerical_error},
-        "shared": shared,
+        "shared": {} if prepared.shared is None else _told(prepared.shared),
     }
     return create(
         path,
@@ -238,6 +235,13 @@ def _created(
         attributes=about,
         numerical=prepared.numerical_error is not None,
     )
+
+
+def _told(shared: Shared) -> dict[str, dict[str, Any]]:
+    return {
+        name: {"value": value, "error": shared.errors[name], "unit": unit(name), "converged": shared.converged}
+        for name, value in shared.values.items()
+    }
 
 
 def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits._files import plain
 from fits.data.measurements import Measurements, channel_names
 from fits.maps.inputs import Readings
 from fits.maps.job import completed, part_of
@@ -241,7 +242,7 @@ def save(prepared: Prepared, root: "zarr.Group") -> None:
             "highest": None if table is None else table.highest,
             "numerical_error": prepared.numerical_error,
             "words": prepared.words,
-            "shared": None if shared is None else [shared.values, _without_nan(shared.errors), shared.converged],
+            "shared": None if shared is None else [shared.values, plain(shared.errors), shared.converged],
         }
     )
 
@@ -275,7 +276,7 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     problem = Problem(stack, data, noise=replace(given, **levels, correlated=False), **rest)
     shared = None if about["shared"] is None else Shared(*about["shared"])
     if shared is not None:
-        shared = shared._replace(errors={name: np.nan if e is None else e for name, e in shared.errors.items()})
+        shared = shared._replace(errors={name: float(error) for name, error in shared.errors.items()})
         problem = held(problem, shared.values)
     table = None
     if about["highest"] is not None:
@@ -303,7 +304,3 @@ def _transport(transport: Any) -> str | dict[str, Any] | None:
 
 def _plain(level: Any) -> float | None:
     return None if is_free(level) else float(level)
-
-
-def _without_nan(errors: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: None if np.isnan(error) else error for name, error in errors.items()}

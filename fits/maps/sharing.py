@@ -15,6 +15,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.inference.descent import PROMISE, descend
+from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.inference.starts import start_points
 from fits.inference.uncertainty import ON_BOUND
 from fits.maps.pilot import FIRST, distinct, from_all
@@ -35,7 +36,8 @@ CLOSE = 0.01
 
 
 class Shared(NamedTuple):
-    """Shared numbers: values and standard errors by name (NaN at a bound), and whether the joint fit converged."""
+    """Shared numbers: values and standard errors by name (NaN at a bound, infinite where the sample says nothing), and
+    whether the joint fit converged."""
 
     values: dict[str, float]
     errors: dict[str, float]
@@ -165,7 +167,8 @@ def _arrow(
 
 
 def _step(problem: Problem, places: NDArray[np.int64], arrow: _Arrow, at: Floats) -> tuple[Floats, Floats, Floats]:
-    """A Gauss-Newton step and standard errors, in boxes, with the width of these; 0 and NaN for what a bound holds."""
+    """A Gauss-Newton step and standard errors, in boxes, with the width of these: 0 and NaN for what a bound holds, 0
+    and infinite for what the readings do not know."""
     whole = problem.start.copy()
     whole[places] = at
     unit = np.asarray(problem.model.box.to_unit(jnp.asarray(whole)), float)[places]
@@ -174,9 +177,12 @@ def _step(problem: Problem, places: NDArray[np.int64], arrow: _Arrow, at: Floats
     free = np.flatnonzero(~held)
     step, error = np.zeros(len(places)), np.full(len(places), np.nan)
     if free.size:
-        covariance = np.linalg.pinv(arrow.information[np.ix_(free, free)], hermitian=True)
-        step[free] = -covariance @ arrow.gradient[free]
-        error[free] = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        sizes, directions = np.linalg.eigh(arrow.information[np.ix_(free, free)])
+        known = sizes > np.finfo(float).eps * free.size * max(sizes[-1], 0.0)
+        spread = np.where(known, 1.0 / np.sqrt(np.where(known, sizes, 1.0)), LARGEST_ERROR)
+        step[free] = -directions @ (np.where(known, spread**2, 0.0) * (directions.T @ arrow.gradient[free]))
+        widths = np.linalg.norm(directions * spread, axis=1)
+        error[free] = np.where(widths > UNKNOWN_BEYOND, np.inf, widths)
     return step, error, width
 
 

@@ -89,7 +89,7 @@ class Problem(Posed):
     @property
     def units(self) -> dict[str, str]:
         """Unit of each parameter; "1" for plain ratios."""
-        return {name: _unit(name) for name in self.names}
+        return {name: unit(name) for name in self.names}
 
     @property
     def problems(self) -> "dict[str, Problem]":
@@ -320,7 +320,8 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
 
 
-def _unit(name: str) -> str:
+def unit(name: str) -> str:
+    """Of a parameter of this name; "1" for plain ratios."""
     known = UNITS.get(name)
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
     return known or UNITS.get(whole.rpartition(".")[2], "1")

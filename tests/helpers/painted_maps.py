@@ -20,7 +20,7 @@ ATTRIBUTES = {
     "noise": "Noise(relative=0.02)",
     "samples": 64,
     "channels": ["value"],
-    "shared": {"layers[0].f0": {"value": 0.04321, "error": 0.00012}},
+    "shared": {"layers[0].f0": {"value": 0.04321, "error": 0.00012, "unit": "1", "converged": True}},
     "pilot": {"texels": 64, "reduced_chi_square": 1.01, "poor_above": 1.6},
     "settings": {"starts": 8, "seed": 0},
     "numerical": {},

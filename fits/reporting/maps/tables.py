@@ -106,7 +106,7 @@ def shared_table(map: FittedMap) -> Table:
     rows = []
     for name, one in dict(map.attributes.get("shared") or {}).items():
         value, error = with_error(float(one["value"]), float(one.get("error", math.nan)))
-        rows.append((name, value, error, map.units.get(name, "")))
+        rows.append((name, value, error, str(one.get("unit", ""))))
     return Table("", ("parameter", "value", "error", "unit"), tuple(rows))
 
 

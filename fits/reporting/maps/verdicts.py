@@ -6,12 +6,13 @@ from typing import Any
 from fits.maps.fitted_map import FittedMap
 from fits.maps.summary import Summary
 from fits.reporting.maps.tables import share
+from fits.reporting.verdicts import listed
 
 CONVERGED = 0.99
 """Share of the texels with enough readings that must converge."""
 
 SOME = 0.05
-"""Share of the fitted texels that may be at a bound or poor in a map that is fine."""
+"""Share of the fitted texels that may be at a bound, poor or not resolved in a map that is fine."""
 
 ENOUGH = 0.1
 """Numerical error of the model, in standard deviations of the readings, that is small."""
@@ -40,10 +41,10 @@ def in_short(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
     if found.counts["unresolved"]:
         unresolved = share(found.counts["unresolved"], found.fitted)
         words.append(f"In {unresolved} of the fitted texels the readings do not resolve every parameter.")
-    accurate = _numerical(found)
-    words += accurate[0]
-    few = bounded <= SOME * found.fitted and poor <= SOME * found.fitted
-    return words, fine and good and explains and few and accurate[1]
+    shared, accurate = _shared(map), _numerical(found)
+    words += [*shared, *accurate[0]]
+    few = all(found.counts[flag] <= SOME * found.fitted for flag in ("at_bound", "poor", "unresolved"))
+    return words, fine and good and explains and few and not shared and accurate[1]
 
 
 def _extent(found: Summary) -> tuple[list[str], bool]:
@@ -96,6 +97,17 @@ def _poor(found: Summary, map: FittedMap) -> str:
         f"Poor: {share(poor, found.fitted)} of the fitted texels, whose chi-square is {limit}more than noise and the "
         "pilot explain."
     )
+
+
+def _shared(map: FittedMap) -> list[str]:
+    """What is wrong with the numbers that all texels have in common."""
+    shared, words = map.attributes.get("shared") or {}, []
+    if not all(one.get("converged", True) for one in shared.values()):
+        words.append("The joint fit of what texels share has not converged: all else is fitted with values that are off.")
+    unknown = [name for name, one in shared.items() if math.isinf(float(one["error"]))]
+    if unknown:
+        words.append(f"The sample does not know {listed(unknown)}, which texels share.")
+    return words
 
 
 def _numerical(found: Summary) -> tuple[list[str], bool]:

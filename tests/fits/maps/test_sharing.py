@@ -11,7 +11,7 @@ import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
-from fits.maps.sharing import fit_shared
+from fits.maps.sharing import _Arrow, _step, fit_shared
 from fits.maps.texels import texels
 
 TRANSPORT = lj.SingleScattering()
@@ -74,6 +74,16 @@ def test_the_joint_fit_of_a_sample_is_that_of_joint(geometry, values, prior, bou
     np.testing.assert_allclose(shared.errors[name], error, rtol=0.02)
 
 
+def test_errors_of_what_a_sample_does_not_know_are_infinite(geometry, values):
+    stack = coat(*(fits.Free(0.5, 0.1, 0.9, shared=k > 0) for k in range(3)))
+    problem, gradient = problem_of(stack, values[0], geometry), np.array([1.0, 0.0])
+    for information in (np.zeros((2, 2)), np.diag([1e8, 0.0]), np.diag([1e8, -1e-9])):
+        step, error, _ = _step(problem, np.array([1, 2]), _Arrow(0.0, gradient, information), np.array([0.5, 0.5]))
+        known = information[0, 0] > 0.0
+        np.testing.assert_allclose(error, [1e-4 if known else np.inf, np.inf])
+        np.testing.assert_allclose(step, [-1e-8 if known else 0.0, 0.0])
+
+
 def test_a_map_holds_what_its_sample_shares(tmp_path, geometry, values):
     found = fits.fit_map(
         free(), geometry, values, tmp_path / "shared.zarr", noise=NOISE, transport=TRANSPORT, starts=2, chunk=4
@@ -81,6 +91,7 @@ def test_a_map_holds_what_its_sample_shares(tmp_path, geometry, values):
     assert found.names == NAMES
     said = found.attributes["shared"]["layers[0].phase.g"]
     assert abs(said["value"] - G) < 4.0 * said["error"]
+    assert (said["unit"], said["converged"]) == ("1", True)
     for column, name in enumerate(NAMES):
         pulls = (found.values[name] - TRUTH[:, column]) / found.errors[name]
         assert np.all(np.abs(pulls) < 4.5)

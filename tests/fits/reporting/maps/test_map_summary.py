@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.maps.fitted_map import FittedMap
+from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.store import FLAGS
 from fits.maps.summary import summarised
 from fits.reporting.maps import tables, verdicts
@@ -118,6 +118,27 @@ def test_chi_square_far_from_one_is_told(factor: float, sentence: str, tmp_path:
     words, fine = told(tmp_path, found)
     assert sentence in words
     assert not fine
+
+
+@pytest.mark.parametrize(("texels", "expected"), [(30, True), (31, False)])
+def test_a_map_is_fine_if_few_texels_leave_a_parameter_open(texels: int, expected: bool, tmp_path: Path) -> None:
+    """Of 600; that they do is told in either case."""
+    found = numbers(SHAPE)
+    found["flags"].reshape(-1)[:texels] |= FLAGS["unresolved"]
+    words, fine = told(tmp_path, found)
+    assert "of the fitted texels the readings do not resolve every parameter" in words
+    assert fine == expected
+
+
+def test_shared_parameters_that_are_off_or_unknown_are_told(tmp_path: Path) -> None:
+    ior = {"value": 1.5, "error": 0.1, "unit": "1", "converged": False}
+    thickness = {"value": 2.0, "error": np.inf, "unit": "mm", "converged": False}
+    words, fine = told(tmp_path, numbers(SHAPE), shared={"layers[0].ior": ior, "layers[0].thickness_mm": thickness})
+    assert "The joint fit of what texels share has not converged" in words
+    assert "The sample does not know layers[0].thickness_mm, which texels share." in words
+    assert not fine
+    rows = tables.shared_table(open_map(tmp_path / "a.zarr")).rows
+    assert rows == (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
 
 
 def test_a_map_that_is_not_finished_says_so(tmp_path: Path) -> None:
