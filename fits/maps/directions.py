@@ -43,8 +43,8 @@ class Directions:
             return self.common.wi, self.common.wo
         leading = [slice(*one.indices(size)) for one, size in zip(block, self.over, strict=False)]
         shape = (*(one.stop - one.start for one in leading), *self.over[len(leading) :])
-        found = _vectors({name: self._of(name, tuple(leading)) for name in self.sources})
         given = np.ones(shape, bool) if mask is None else mask
+        found = _vectors({name: self._of(name, tuple(leading)) for name in self.sources}, given)
         return _checked("wi", found[0], shape, given, block), _checked("wo", found[1], shape, given, block)
 
     def digest(self) -> str:
@@ -115,8 +115,8 @@ def directions(geometry: Any, beside: Named | None, dims: tuple[str, ...] = ()) 
         raise ValueError(f"geometry: shapes {told} do not fit together, N and the map's axes must be the same")
     common = None
     if not over:
-        wi, wo = _vectors({name: one.read() for name, one in sources.items()})
         whole = np.ones((), bool)
+        wi, wo = _vectors({name: one.read() for name, one in sources.items()}, whole)
         common = Geometry(_checked("wi", wi, (), whole, ()), _checked("wo", wo, (), whole, ()))
     return Directions(sources, samples, next(iter(over), ()), common)
 
@@ -157,14 +157,20 @@ def _source(given: Any, where: str) -> Source:
     return found.one(where.rpartition(" ")[2]) if isinstance(found, Named) else found
 
 
-def _vectors(found: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+def _vectors(found: Mapping[str, Floats], given: np.ndarray) -> tuple[Floats, Floats]:
+    """`wi` and `wo`, not finite where a polar angle of a texel that is not given is none."""
     if "wi" in found:
         return found["wi"], found["wo"]
+    polar = {}
     for name in ("theta_i", "theta_o"):
-        out = (found[name] < 0.0) | (found[name] > 180.0)
-        if out.any():
-            raise ValueError(f"geometry: {name} is {found[name][out][0]:g}, must be in [0, 180] degrees")
-    return direction(found["theta_i"], found["phi_i"]), direction(found["theta_o"], found["phi_o"])
+        theta = found[name]
+        out = (theta < 0.0) | (theta > 180.0)
+        wrong = out & given[..., None]
+        if wrong.any():
+            first = np.broadcast_to(theta, wrong.shape)[wrong][0]
+            raise ValueError(f"geometry: {name} is {first:g}, must be in [0, 180] degrees")
+        polar[name] = np.where(out, np.nan, theta)
+    return direction(polar["theta_i"], found["phi_i"]), direction(polar["theta_o"], found["phi_o"])
 
 
 def _checked(name: str, w: Floats, shape: tuple[int, ...], given: np.ndarray, block: Block) -> Floats:

@@ -68,6 +68,18 @@ def test_directions_of_masked_texels_are_not_looked_at() -> None:
         readings(VALUES, (VIEW.wi, own))
 
 
+def test_angles_of_masked_texels_are_not_looked_at() -> None:
+    """Whatever stands for nothing there, beside angles that all texels share."""
+    own = np.broadcast_to(VIEW.theta_o, (*SHAPE, N)).copy()
+    own[~MASK] = -999.0
+    wi, wo = readings(VALUES, ANGLES | {"theta_o": own}, mask=MASK).read_directions(())
+    np.testing.assert_allclose(wo[MASK], np.broadcast_to(VIEW.wo, (int(MASK.sum()), N, 3)), atol=1e-12)
+    np.testing.assert_array_equal(wo[~MASK], np.broadcast_to([0.0, 0.0, 1.0], (int((~MASK).sum()), N, 3)))
+    np.testing.assert_allclose(wi, np.broadcast_to(VIEW.wi, wi.shape), atol=1e-12)
+    with pytest.raises(ValueError, match=r"theta_o is -999, must be in \[0, 180\] degrees"):
+        readings(VALUES, ANGLES | {"theta_o": own})
+
+
 @pytest.mark.parametrize(
     ("geometry", "message"),
     [
