@@ -35,6 +35,7 @@ def run(
     *,
     processes: int = 1,
     client: Any = None,
+    threads: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
     """Do all tasks; yields the index of each, and what `work` made of it, as they end.
 
@@ -47,6 +48,7 @@ def run(
             so under ``if __name__ == "__main__":``.
         client: a `distributed.Client`, or the address of a scheduler (``"tcp://..."``), in place of processes. Its
             workers have layerjax, and take one task at a time: one thread each (``--nthreads 1``).
+        threads: of this process, where they do it; None: one a core. By a single one it is done by whoever calls.
 
     Yields:
         (index, result). In the place of a result stands a `Failure` where `work` raised ValueError or OSError, or its
@@ -70,4 +72,4 @@ def run(
         return run_processes(work, shared, tasks, processes)
     from fits.engines.threads import run_threads
 
-    return run_threads(work, shared, tasks)
+    return run_threads(work, shared, tasks, threads)

@@ -8,14 +8,17 @@ from typing import Any
 from fits.engines.failures import attempt
 
 
-def run_threads(work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any]) -> Iterator[tuple[int, Any]]:
+def run_threads(
+    work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], threads: int | None = None
+) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`. Whoever leaves the loop waits for the tasks that have begun."""
     from fits.problem.compiled import cores
 
-    left = iter(enumerate(tasks))
-    for index, task in islice(left, 1):  # alone: it compiles the program, which keeps one core busy
+    left, most = iter(enumerate(tasks)), threads or cores()
+    # the first alone: it compiles the program, which keeps one core busy
+    for index, task in islice(left, None if most == 1 else 1):
         yield index, attempt(work, shared, task)
-    pool = ThreadPoolExecutor(cores())
+    pool = ThreadPoolExecutor(most)
     running: dict[Future[Any], int] = {}
 
     def begin(count: int) -> None:
@@ -23,7 +26,7 @@ def run_threads(work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any]) 
             running[pool.submit(attempt, work, shared, task)] = index
 
     try:
-        begin(cores())
+        begin(most)
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 index, result = running.pop(future), future.result()

@@ -92,7 +92,8 @@ def fit_files(
         files: a folder, of which files that hold no measurements are left out, or files and folders.
         stacks: stack files; may be none where a search is asked for.
         out: directory to write, or to go on with.
-        processes, client: see `fits.engines.run`. Workers of a cluster see files and `out` by these paths.
+        processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
+            a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a `Searching` says how.
         format, quantity, bins, strata: see `fits.read`, of all files.
         mask_retro, mask_grazing, only, hold_out: see `fits.data.reading.Reading`.
@@ -139,7 +140,8 @@ def _fit_all(job: Job, plan: "_Plan", processes: int, client: Any, progress: Pro
     done, total = len(plan.rows) - len(plan.tasks), len(plan.rows)
     if progress is not None:
         progress("fits", done, total)
-    for index, outcome in run(fit_one, job, plan.tasks, processes=processes, client=client):
+    # by a single thread: a fit takes all cores, and another that waits for it could not be interrupted
+    for index, outcome in run(fit_one, job, plan.tasks, processes=processes, client=client, threads=1):
         task = plan.tasks[index]
         row = Row(task.path.name, task.stack, failure=outcome.error) if isinstance(outcome, Failure) else outcome
         plan.rows[task.path.name, task.stack] = row

@@ -50,6 +50,11 @@ def test_results_come_as_they_end(engine: dict[str, Any]) -> None:
     assert sorted(found) == [(index, index * index + 5) for index in range(12)]
 
 
+def test_a_single_thread_is_that_of_the_caller() -> None:
+    found = run(lambda shared, task: threading.get_ident(), None, range(4), threads=1)
+    assert list(found) == [(index, threading.get_ident()) for index in range(4)]
+
+
 def test_nothing_to_do_is_done_at_once(engine: dict[str, Any]) -> None:
     assert list(run(tasks.square, 5, [], **engine)) == []
 

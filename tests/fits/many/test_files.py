@@ -69,6 +69,20 @@ def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -
     assert contents(folder) == before
 
 
+def test_ctrl_c_ends_it_with_the_fit_that_is_in_hand(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Path] = []
+
+    def interrupted(directory: Path, *_: object, **__: object) -> None:
+        begun.append(directory)
+        raise KeyboardInterrupt if len(begun) == 2 else ValueError("no fit")
+
+    monkeypatch.setattr(work, "fit_into", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fits.fit_files("scans", STACKS, "out", **FEW)
+    assert len(begun) == 2  # of four
+    assert [row["failure"] for row in json.loads(Path("out/table.json").read_text())["rows"]].count("not done yet") == 3
+
+
 def test_the_table_holds_it_all(folder: Path) -> None:
     found = fits.fit_files("scans", STACKS, "out", **FEW)
     with open("out/table.csv", newline="") as file:
