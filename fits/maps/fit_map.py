@@ -148,8 +148,8 @@ def _fitted(
     job = _job(path, prepared, found, settings, client is None and processes == 1)
     failures = _run(root, job, found, client, processes, progress)
     if failures:
-        more = f"; and {len(failures) - NAMED} more" if len(failures) > NAMED else ""
-        raise ValueError(f"{path}: {'; '.join(failures[:NAMED])}{more}; all other chunks are done, and another run does these")
+        words = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
+        raise ValueError(f"{path}: {'; '.join(words)}; all other chunks are done, and another run does these")
     if settings.smooth is not None:
         here = replace(job, source=found) if client is None else job
         smooth_map(open_map(path), here, found, settings.smooth, client, progress)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fits.maps.chunk_files import Block
 from fits.maps.inputs import Portable, Readings
 from fits.maps.searching import Ends, Starts, neighbours, reduced_chi_square, search
-from fits.maps.solving import Found
+from fits.maps.solving import Found, by_size
 from fits.maps.store import FLAGS, arrays_of, flags_of, write_chunk
 from fits.maps.tabulated import Table, Tabulated, coarser, with_table
 from fits.maps.texels import Texels, texels, with_own_directions
@@ -180,7 +180,9 @@ def numerical_errors(job: Job, found: Found, rows: Texels) -> Floats:
     if isinstance(job.problem.model, Tabulated):
         model = job.problem.model
         rough = job.problem.with_model(with_table(model, coarser(model.table)))
-        predicted, sigma = (np.asarray(part, float) for part in rough.call(_predicted, found.vector, found.predicted))
+        predicted, sigma = by_size(
+            lambda some, _: rough.call(_predicted, found.vector[some], found.predicted[some]), rows.number, job.size
+        )
         own = np.where(rows.used, np.sqrt(rows.variance), 0.0)
         errors += np.max(np.where(rows.used, np.abs(predicted - found.predicted) / np.hypot(sigma, own), 0.0), (1, 2))
     return errors

@@ -4,7 +4,6 @@ All of it is found from a sample of texels before the first chunk, and kept in t
 fits the chunks that are left as the first would have.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 

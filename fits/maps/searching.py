@@ -10,8 +10,8 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
 
-from fits.maps.descending import Known
-from fits.maps.solving import Found, all_known, nearest, solve, solve_near
+from fits.maps.descending import Known, first_mapped
+from fits.maps.solving import Found, all_known, by_size, nearest, padded, solve, solve_near
 from fits.maps.texels import Texels, blank, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -81,7 +81,7 @@ def search(problem: Problem, starts: Starts, texels: Texels, size: int, beside: 
         size: of the program: texels at a time.
         beside: the neighbours of each, (M, ...), by their places; -1 where there is none.
     """
-    order = _likeliest(problem, starts, texels)
+    order = _likeliest(problem, starts, texels, size)
     if starts.known is None:
         found = solve(problem, starts.units[order[:, 0]], texels, size, fresh=False)
     else:
@@ -149,14 +149,20 @@ def _beside(
     vectors = found.vector[beside[rows, choice]]
     if not len(rows):
         return rows, vectors
-    return rows, np.clip(np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(vectors)), float), 0.0, 1.0)
+    units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(padded(vectors))), float)[: len(rows)]
+    return rows, np.clip(units, 0.0, 1.0)
 
 
-def _likeliest(problem: Problem, starts: Starts, texels: Texels) -> Integers:
+def _likeliest(problem: Problem, starts: Starts, texels: Texels, size: int) -> Integers:
     """Starts in the order in which they suit each texel, (M, ...)."""
     if starts.predicted is not None:
-        return nearest(problem, starts.vectors, starts.predicted, texels, OTHERS + 1)
-    return np.argsort(np.asarray(problem.call(_costs, starts.vectors, texels)), axis=1)[:, : OTHERS + 1]
+        return nearest(problem, starts.vectors, starts.predicted, texels, OTHERS + 1, size)
+    costs = by_size(
+        lambda rows, count: problem.call(_costs, starts.vectors, texels.rows(rows), np.asarray(count)),
+        texels.number,
+        size,
+    )
+    return np.argsort(costs, axis=1)[:, : OTHERS + 1]
 
 
 def all_predicted(problem: Problem, vectors: Floats) -> Floats:
@@ -168,14 +174,14 @@ def _all_predicted(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
 
 
-def _costs(model: Model, vectors: Array, texels: Texels) -> Array:
-    """Of every vector (K, P) for every texel, each along its own directions: (M, K)."""
+def _costs(model: Model, vectors: Array, texels: Texels, number: Array) -> Array:
+    """Of every vector (K, P) for the first `number` of the texels, each along its own directions: (M, K)."""
 
     def one(row: Texels) -> Array:
         own = model_of(model, row)
         return jax.lax.map(lambda vector: own.cost_at(vector, own.predict(vector)), vectors)
 
-    return jax.lax.map(one, texels)
+    return first_mapped(one, texels, number)
 
 
 def neighbours(shape: tuple[int, ...]) -> Integers:

@@ -1,5 +1,6 @@
 """Fits of many texels in one compiled program: a start for each, descents, and what the data say where these end."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -105,6 +106,26 @@ def padded(array: Floats) -> Floats:
     return np.concatenate([array, np.repeat(array[-1:], -len(array) % TOGETHER, axis=0)])
 
 
+def filled(count: int, size: int) -> NDArray[np.int64]:
+    """Places of so many rows, the last of them again and again: as many as a program for `size` of them takes."""
+    return np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)
+
+
+def by_size(call: Callable[[NDArray[np.int64], int], Any], count: int, size: int) -> Any:
+    """What `call` makes of `count` rows, arrays (count, ...), by one program whatever their number.
+
+    Args:
+        call: given places of rows, as many each time, and how many of them are to be looked at.
+        size: of the program: rows at a time.
+    """
+    parts = []
+    for first in range(0, count, size):
+        some = min(size, count - first)
+        found = call(first + filled(some, size), some)
+        parts.append(jax.tree.map(lambda part, some=some: np.asarray(part)[:some], found))
+    return jax.tree.map(lambda *each: np.concatenate(each), *parts)
+
+
 def _all_solved(
     problem: Problem,
     units: Floats,
@@ -135,7 +156,7 @@ def _called(
 ) -> tuple[Found, Known]:
     """Fits of some of the texels, at most `size`, and what is known at the ends of the first `TOGETHER` of them."""
     count = len(some)
-    places = some[np.minimum(np.arange(-(-size // BESIDE) * BESIDE), count - 1)]
+    places = some[filled(count, size)]
     starts, begun = (units, which[places]) if known is not None else (units[places], np.arange(len(places)))
     given = (starts, known, begun, texels.rows(places), *map(np.asarray, (count, fresh, look)))
     found, seen = problem.call(_solved, *given)
@@ -203,9 +224,13 @@ def _errors(model: Model, end: End, root: Array, scatter: Array) -> tuple[Array,
     return jnp.where(held, jnp.nan, errors), held, unresolved
 
 
-def nearest(problem: Problem, vectors: Floats, predicted: Floats, texels: Texels, most: int) -> NDArray[np.int64]:
+def nearest(
+    problem: Problem, vectors: Floats, predicted: Floats, texels: Texels, most: int, size: int
+) -> NDArray[np.int64]:
     """Which of K vectors (K, P), with what they predict (K, N, C), suit each texel best: (M, most), best first."""
-    misfit = np.asarray(problem.call(_misfit, padded(vectors), padded(predicted), texels))[:, : len(vectors)]
+    given = padded(vectors), padded(predicted)
+    misfit = by_size(lambda rows, _: problem.call(_misfit, *given, texels.rows(rows)), texels.number, size)
+    misfit = misfit[:, : len(vectors)]
     most = min(most, len(vectors))
     best = np.sort(np.argpartition(misfit, most - 1, axis=1)[:, :most], axis=1)
     order = np.argsort(np.take_along_axis(misfit, best, axis=1), axis=1, kind="stable")

@@ -115,7 +115,7 @@ def rows_of(job: Job, task: Texelwise) -> Texels:
 def first_starts(job: Job, rows: Texels) -> Floats:
     """Where `fits.fit_map` begins, in the unit box."""
     assert job.starts.predicted is not None
-    chosen = nearest(job.problem, job.starts.vectors, job.starts.predicted, rows, 1)[:, 0]
+    chosen = nearest(job.problem, job.starts.vectors, job.starts.predicted, rows, 1, job.size)[:, 0]
     return np.clip(job.starts.units[chosen], INSIDE, 1.0 - INSIDE)
 
 

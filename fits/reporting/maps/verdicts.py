@@ -30,7 +30,7 @@ def in_short(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
     words.append(f"{share(found.counts['converged'], found.fitted)} of the fitted texels converged.")
     explained, explains = _explained(found, map)
     words += explained
-    bounded, poor = found.counts["at_bound"], found.counts["poor"]
+    bounded = found.counts["at_bound"]
     if bounded:
         most = sorted(((count, name) for name, count in found.at_bound.items() if count), reverse=True)[:3]
         which = f" ({', '.join(f'{name} in {share(count, found.fitted)}' for count, name in most)})" if most else ""
@@ -103,7 +103,7 @@ def _shared(map: FittedMap) -> list[str]:
     """What is wrong with the numbers that all texels have in common."""
     shared, words = map.attributes.get("shared") or {}, []
     if not all(one.get("converged", True) for one in shared.values()):
-        words.append("The joint fit of what texels share has not converged: all else is fitted with values that are off.")
+        words.append("The joint fit of what texels share has not converged: all else is fitted with wrong values.")
     unknown = [name for name, one in shared.items() if math.isinf(float(one["error"]))]
     if unknown:
         words.append(f"The sample does not know {listed(unknown)}, which texels share.")

@@ -9,8 +9,10 @@ import fits
 import layerjax as lj
 from fits.inference.descent import PROMISE, descend
 from fits.maps import descending
+from fits.maps.searching import search, starts_at
 from fits.maps.solving import _solved, all_known, solve
 from fits.maps.texels import blank, texels, with_own_directions
+from fits.problem.compiled import _run
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, TRANSPORT, coat
@@ -122,3 +124,19 @@ def test_own_directions_begin_with_nothing_known(geometry, readings):
     wi, wo = (np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo))
     own = solve(with_own_directions(problem), np.full((TEXELS, 2), 0.5), texels(readings, None, 1e-4, wi, wo), SIZE)
     np.testing.assert_allclose(own.cost, common.cost, rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["common directions", "own directions"])
+def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, readings, own):
+    problem = problem_of(geometry, FIXED)
+    problem = with_own_directions(problem) if own else problem
+    sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if own else []
+    rows, vectors = texels(readings, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
+    starts = starts_at(problem, vectors, np.zeros((0, 2)), own, SIZE)
+    whole = search(problem, starts, rows, SIZE)
+    before = _run._cache_size()
+    for count in (1, 6, SIZE, SIZE + 1):
+        some = search(problem, starts, rows.rows(np.arange(count)), SIZE)
+        np.testing.assert_array_equal(some.start, whole.start[:count])
+        np.testing.assert_allclose(some.found.cost, whole.found.cost[:count], rtol=1e-9)
+    assert _run._cache_size() == before
