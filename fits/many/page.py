@@ -120,21 +120,26 @@ def page(rows: Sequence[Row], left_out: Sequence[str], pictures: bool, drawn: Co
 
 def parameters_table(rows: Sequence[Row]) -> tables.Table:
     """Values and errors of fits of one stack."""
-    units = {one.name: one.unit for row in rows for one in row.parameters}
-    heads = [f"{name} ({unit})" if unit not in ("", "1") else name for name, unit in units.items()]
+    heads = _with_units(rows)
     cells = []
     for row in rows:
         own = {one.name: one for one in row.parameters}
-        cells.append((row.file, *(_value(own[name]) if name in own else "" for name in units)))
+        cells.append((row.file, *(_value(own[name]) if name in own else "" for name in heads)))
     note = "Value ± standard error; an error says nothing of a parameter at a bound."
-    return tables.Table("", ("file", *heads), tuple(cells), note)
+    return tables.Table("", ("file", *heads.values()), tuple(cells), note)
+
+
+def _with_units(rows: Sequence[Row]) -> dict[str, str]:
+    """What to call each parameter of these fits, by its name."""
+    units = {one.name: one.unit for row in rows for one in row.parameters}
+    return {name: name if unit in ("", "1") else f"{name} ({unit})" for name, unit in units.items()}
 
 
 def parameters_picture(rows: Sequence[Row]) -> "Figure":
     """Reduced chi-square and every parameter against the file, with standard errors; orange: at a bound."""
     from matplotlib.figure import Figure
 
-    names = list(dict.fromkeys(one.name for row in rows for one in row.parameters))
+    names = _with_units(rows)
     places = np.arange(len(rows))
     panels = 1 + len(names)
     high = -(-panels // WIDE)
@@ -150,10 +155,12 @@ def parameters_picture(rows: Sequence[Row]) -> "Figure":
                     error = one.error if np.isfinite(one.error) else 0.0
                     colour = CYCLE[1] if one.at_bound else CYCLE[0]
                     axes.errorbar(place, one.value, yerr=error, fmt=".", color=colour, elinewidth=0.8, markersize=4)
-            axes.set_title(name)
+            axes.set_title(names[name])
         every = max(1, -(-len(rows) // NAMED))
         for axes in grid:
             axes.set_xticks(places[::every], [row.file for row in rows][::every], rotation=90, fontsize=5)
+        for axes in grid[max(panels - WIDE, 0) : panels]:  # the lowest of their columns
+            axes.tick_params(labelbottom=True)
         for axes in grid[panels:]:
             axes.set_axis_off()
     return figure

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from fits.many.page import overview, page, parameters_picture, told
+from fits.many.page import WIDE, overview, page, parameters_picture, told
 from fits.many.rows import Parameter, Row, best_of, standings, stored_row
 from fits.reporting.plots.data import as_png
 
@@ -98,3 +98,13 @@ def test_long_tables_are_shortened_and_pictures_drawn() -> None:
     table = overview(ROWS * 20, most=10)
     assert len(table.rows) == 11
     assert as_png(parameters_picture(ROWS)).startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6])
+def test_every_column_of_panels_ends_with_the_names_of_files(count: int) -> None:
+    parameters = tuple(Parameter(f"layers[{k}].thickness_mm", 0.5, 0.01, "mm", False) for k in range(count))
+    figure = parameters_picture([row("coat", file=f"{k}.csv", parameters=parameters) for k in range(2)])
+    panels = figure.axes[: 1 + count]
+    assert [axes.get_title(loc="left") for axes in panels[1:]] == [f"{one.name} (mm)" for one in parameters]
+    for axes in panels[-WIDE:]:
+        assert [label.get_text() for label in axes.get_xticklabels() if label.get_visible()] == ["0.csv", "1.csv"]
