@@ -1,6 +1,8 @@
 """Fits of totals in result directories, reports and on the command line."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -110,6 +112,24 @@ def test_many_channels_have_a_range(tmp_path: Path) -> None:
     panel = totals_picture(totals).axes[0]
     assert len(panel.get_xticks()) == 10
     assert panel.get_xticklabels()[0].get_text() == "400 nm"
+
+
+def test_an_angle_has_one_colour_in_all_panels_and_is_in_the_legend() -> None:
+    """Reflectance at 8 and 60 degrees, transmittance at 60 and 0."""
+    every = fits.Totals.of([8.0, 60.0, 0.0], reflectance=np.full((3, 2), 0.4), transmittance=np.full((3, 2), 0.3))
+    kept = [0, 1, 4, 5]
+    arrays = {name: getattr(every, name)[kept] for name in ("wi", "wo", "values", "sigma", "mask")}
+    some = replace(every, **arrays, kinds=tuple(every.kinds[row] for row in kept))
+    picture = totals_picture(some, SimpleNamespace(predicted=some.values))
+    words = {text.get_text() for text in picture.legends[0].get_texts()}
+    assert words == {f"{what} at {angle}°" for what in ("read", "fit") for angle in (0, 8, 60)}
+    colours: dict[str, set[str]] = {}
+    for axes in picture.axes:
+        for line, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            if label.startswith("fit"):
+                colours.setdefault(label, set()).add(line.get_color())
+    assert all(len(one) == 1 for one in colours.values())
+    assert len(set.union(*colours.values())) == 3
 
 
 def test_a_stack_of_one_channel_beside_data_of_three(tmp_path: Path) -> None:
