@@ -8,7 +8,7 @@ import numpy as np
 
 from fits.maps.fitted_map import FittedMap
 from fits.maps.store import FLAGS
-from fits.maps.summary import Quartiles, Summary, summarised
+from fits.maps.summary import Quartiles, Summary
 from fits.reporting.tables import Table, with_error
 
 WORST = 12
@@ -26,12 +26,6 @@ WORDS = {
     "unresolved": "a parameter is not resolved",
 }
 """What is said of each flag."""
-
-
-def summary(map: FittedMap) -> tuple[Table, Table]:
-    """How many texels have which flag, and the quartiles of what was fitted."""
-    found = summarised(map)
-    return count_table(found), quartile_table(found, map)
 
 
 def count_table(found: Summary) -> Table:
@@ -139,7 +133,8 @@ def smoothing_words(map: FittedMap) -> str:
         return ""
     asked, (start, *_, end) = said["smoothness"], said["objective"]
     scales = {f"{one:g}" for one in asked["scale"].values()}
-    each = ", ".join(f"{name} {one:g}" for name, one in asked["scale"].items()) if len(scales) > 1 else scales.pop()
+    alike = len(scales) == 1 and asked["scale"].keys() == set(map.names)
+    each = scales.pop() if alike else ", ".join(f"{name} {one:g}" for name, one in asked["scale"].items())
     kind = asked["kind"].replace("_", " ")
     words = f"Smoothed beside the plain fit by block alternation ({kind}, of the bounds: {each}): {said['rounds']} "
     words += f"rounds took {start - end:.4g} off minus the log-posterior. In the last one texels moved by at most "

@@ -138,6 +138,13 @@ def test_it_is_said_how_far_smoothing_has_come(settled: bool, left: float | str,
     assert ("about 0.25 more are left to go" in words) is (left == 0.25)
 
 
+@pytest.mark.parametrize(("names", "words"), [(NAMES, "0.05"), (NAMES[2:], f"{NAMES[2]} 0.05")], ids=["all", "one"])
+def test_parameters_are_named_where_not_all_are_smoothed(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
+    asked = {"kind": "gaussian", "scale": dict.fromkeys(names, 0.05), "rounds": 3}
+    found = smoothing_words(smoothed(tmp_path / "a.zarr", settled=True, smoothness=asked))
+    assert f"(gaussian, of the bounds: {words}):" in found
+
+
 def test_only_a_map_by_itself_is_reported(tmp_path: Path) -> None:
     map = painted(tmp_path / "a.zarr")
     with pytest.raises(ValueError, match="reported by itself"):

@@ -65,7 +65,8 @@ def test_counts_and_quartiles_are_those_of_the_arrays(map: FittedMap, painted: F
 
 
 def test_tables_say_them(map: FittedMap, painted: Found) -> None:
-    counts, quartiles = tables.summary(map)
+    found = summarised(map)
+    counts, quartiles = tables.count_table(found), tables.quartile_table(found, map)
     rows = {row[0]: row[1:] for row in counts.rows}
     assert rows["of the map"] == ("600", "")
     assert rows["fitted"] == ("541", "90.2 %")
