@@ -71,13 +71,12 @@ def sample(
             posterior near the optimum.
         OSError: the disk is full, say. What was sampled is kept.
     """
-    problem = fit.problem
     _require_possible(fit, path)
-    count = len(problem.names)
+    count = len(fit.problem.names)
     walkers = require_settings(
         count, sampler=sampler, walkers=walkers, surrogate=surrogate, ess=ess, max_steps=max_steps
     )
-    identity = identity_of(problem, walkers, seed, sampler)
+    identity = identity_of(fit.problem, walkers, seed, sampler)
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
         moved = Nuts(fit, chain, seed) if sampler == "nuts" else Ensemble(fit, chain, seed)

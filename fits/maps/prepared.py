@@ -275,7 +275,9 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     problem = Problem(stack, data, noise=replace(given, **levels, correlated=False), **rest)
     shared = None if about["shared"] is None else Shared(*about["shared"])
     if shared is not None:
-        shared = shared._replace(errors={name: float(error) for name, error in shared.errors.items()})
+        # None: of one at a bound, in stores of former versions
+        errors = {name: np.nan if error is None else float(error) for name, error in shared.errors.items()}
+        shared = shared._replace(errors=errors)
         problem = held(problem, shared.values)
     table = None
     if about["highest"] is not None:
