@@ -9,7 +9,6 @@ import math
 from functools import cache, partial
 from typing import Any, Literal, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -25,15 +24,7 @@ from layerjax.channels import pick
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture
 from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
-from layerjax.stack import (
-    Interface,
-    Medium,
-    Stack,
-    media_of,
-    optical_depths,
-    require_numbers,
-    simplify,
-)
+from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.known_directions import (
     MOST_COSINES,
@@ -297,14 +288,7 @@ def _mapped(
     """A simplified map of stacks in the precision of the directions, its transport, and how these lie over it."""
     at = maps.layout(shape, *directions)
     chosen, simplified = chosen_for(stack, transport, known)
-    layers = (_without_upright_axis(layer) for layer in simplified.layers)
-    simplified = eqx.tree_at(lambda s: s.layers, simplified, tuple(layers))
     return in_precision(simplified, directions[0].dtype), chosen, at
-
-
-def _without_upright_axis(layer: Interface | Medium) -> Interface | Medium:
-    """Texels are traced: an axis that is known to be the normal must be so by structure, or it counts as tilted."""
-    return eqx.tree_at(lambda m: m.phase, layer, layer.phase.simplified()) if isinstance(layer, Medium) else layer
 
 
 def _evaluate_map(

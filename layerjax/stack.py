@@ -172,6 +172,7 @@ def simplify(stack: Stack) -> Stack:
 
     Turbid media become media. Media of thickness 0 go, and interfaces whose index is that of what lies above them (all
     light passes straight); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
+    Axes of media that are the normal go: what is symmetric about it is so by structure.
     Traced values are kept as they are, so derivatives with respect to them are exact.
     """
     return simplify_and_name(stack)[0]
@@ -191,7 +192,7 @@ def simplify_and_name(stack: Stack) -> tuple[Stack, tuple[str, ...]]:
         if isinstance(layer, Medium):
             if _is_everywhere(layer.thickness, 0.0):
                 continue
-            layer = _with_known(layer)
+            layer = eqx.tree_at(lambda medium: medium.phase, _with_known(layer), layer.phase.simplified())
             if is_known(layer.f0, 1.0):
                 layer = eqx.tree_at(lambda medium: medium.f0, layer, None)
         layers.append(layer)

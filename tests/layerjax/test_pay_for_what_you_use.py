@@ -110,3 +110,8 @@ def test_traced_values_are_kept():
 
     assert value(0.0) == 0.0
     assert jax.grad(value)(0.0) > 0.0
+
+
+def test_an_axis_that_is_the_normal_costs_nothing():
+    upright = program(lj.Stack([medium(phase=lj.SGGX("surface", 0.3, (0.0, 0.0, 2.0)))]))
+    assert upright == program(lj.Stack([medium()]))

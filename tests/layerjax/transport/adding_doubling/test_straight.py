@@ -84,6 +84,17 @@ def test_is_reciprocal_and_turns_upside_down():
     np.testing.assert_allclose(forth, ratio * back, rtol=1e-9)
 
 
+def test_is_the_same_with_an_axis_that_is_the_normal():
+    """Light that passes straight counts once however the flakes between say that they lie flat."""
+
+    def values(axis):
+        flakes = lj.Medium(0.5, [0.0, 0.6], lj.SGGX("surface", 0.4, axis))
+        stack = lj.Stack([lj.Interface(1.5, 0.05), flakes, lj.Interface(1.2, 0.1)])
+        return lj.evaluate(stack, WI, WO, lj.AddingDoubling(nodes=2, modes=1))
+
+    np.testing.assert_allclose(values((0.0, 0.0, 1.0)), values(None), rtol=1e-9)
+
+
 def test_is_continuous_at_equal_indices():
     """An interface without effect refracts to one direction alone: nothing is lost or counted twice there.
 
