@@ -276,7 +276,7 @@ class Walk:
         # whether the event is over: on a rough surface it goes on from facet to facet
         over = None if event.leaves is None else event.leaves | ~jnp.asarray(arrival.at_surface)
         if self.orders == "first" and path.order is not None:
-            done = path.order >= 1
+            done = path.order >= (1 if self.goal is not None else 2)  # without a goal it has to fly out yet
             ends = ends | (done if over is None else done & over)
         if path.inverse_density is not None and event.next_density is not None:
             inverse = self._inverse_density(after, arrival, event.next_density)

@@ -53,6 +53,14 @@ def test_first_order(stack, pairs):
         assert_mean(repeated(stack, wi, wo, orders="first")[0], lj.evaluate(stack, wi, wo, lj.SingleScattering()))
 
 
+def test_energies_of_the_first_order():
+    stack = lj.Stack([haze(0.3, 0.8, 0.9)])
+    found = lj.albedo(stack, WI, lj.RandomWalk(paths=1 << 14, orders="first"), key=KEY)
+    for share, expected in zip(found, lj.albedo(stack, WI, lj.SingleScattering()), strict=True):
+        np.testing.assert_allclose(share, expected, atol=4 * np.sqrt(0.25 / (1 << 14)))  # what a path brings is 0 to 1
+        assert expected > 0.05
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("base", [lj.Lambertian(0.6), lj.Conductor(0.2, 3.9, 0.05)])
 def test_orders_add_up(base):
