@@ -19,7 +19,7 @@ from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, require_numbers, simplify
-from layerjax.transport.random_walk.lanes import Record, follow, quotas, standard_error, upright
+from layerjax.transport.random_walk.lanes import Record, added, follow, quotas, standard_error, upright
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -129,10 +129,10 @@ def _measure(
         w = upright(w, valid)
         spread = jnp.full(lanes, w[0]), jnp.full(lanes, w[1]), jnp.full(lanes, w[2])
         walk = Walk(scene, spread, None, microfacets, count_orders=True)
-        empty = jnp.zeros((bins, 2 * channels), dtype), jnp.zeros((2 * (orders + 1), 2 * channels), dtype)
+        empty = [(jnp.zeros((rows, 2 * channels), dtype),) * 2 for rows in (bins, 2 * (orders + 1))]
         lane = index.astype(jnp.uint32) * jnp.uint32(lanes) + jnp.arange(lanes, dtype=jnp.uint32)
         remaining = jnp.where(valid, owed, 0)
-        cells, slots = follow(walk, record, empty, lane, remaining, words, dtype)
+        (cells, _), (slots, _) = follow(walk, record, tuple(empty), lane, remaining, words, dtype)
         shaped = cells.reshape(2, polar, azimuth, channels, 2), slots.reshape(2, orders + 1, channels, 2)
         # the side of the light comes first
         near_cells, near_slots = (jnp.where(w[2] > 0, x, x[::-1]) for x in shaped)
@@ -172,6 +172,14 @@ def _recorder(polar: int, azimuth: int, orders: int) -> Record:
         # what is not counted falls outside, and is dropped; so does light without an event, among the directions
         cell = jnp.where(counted & (order > 0), (side * polar + ring) * azimuth + sector, bins)
         slot = jnp.where(counted, side * (orders + 1) + order, 2 * (orders + 1))
-        return by_direction.at[cell].add(rows, mode="drop"), by_order.at[slot].add(rows, mode="drop")
+
+        def counted_in(running: tuple[Array, Array], place: Array) -> tuple[Array, Array]:
+            sums, excess = running
+            # where there are more places than paths at a time, each is met too seldom for its sum to lose anything
+            if sums.shape[0] > owes.size:
+                return sums.at[place].add(rows, mode="drop"), excess
+            return added(running, jnp.zeros_like(sums).at[place].add(rows, mode="drop"))
+
+        return counted_in(by_direction, cell), counted_in(by_order, slot)
 
     return record

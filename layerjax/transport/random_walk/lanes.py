@@ -117,6 +117,17 @@ def follow(
     return jax.lax.while_loop(lambda carry: jnp.any(carry[2] > 0), step, start)[-1]
 
 
+def added(running: tuple[Array, Array], more: Array) -> tuple[Array, Array]:
+    """A running sum with more added, and what rounding has put too much into it (Kahan 1965), first (0, 0).
+
+    Millions of terms are no more than a rounding off, where a plain sum in single precision stops growing.
+    """
+    total, excess = running
+    more = more - excess
+    after = total + more
+    return after, (after - total) - more
+
+
 def _sums(
     walk: Walk,
     tally: Tally,
@@ -132,10 +143,11 @@ def _sums(
         path, sums, squares = result
         path = tuple(a + b for a, b in zip(path, tally(step), strict=True))
         done = step.ends & owes
-        sums = tuple(s + jnp.where(done, p, 0.0) for s, p in zip(sums, path, strict=True))
-        squares = tuple(s + jnp.where(done, p * p, 0.0) for s, p in zip(squares, path, strict=True))
+        sums = tuple(added(s, jnp.where(done, p, 0.0)) for s, p in zip(sums, path, strict=True))
+        squares = tuple(added(s, jnp.where(done, p * p, 0.0)) for s, p in zip(squares, path, strict=True))
         return tuple(jnp.where(step.ends, 0.0, p) for p in path), sums, squares
 
-    zero = (jnp.zeros(lane.shape, dtype),) * outputs
-    _, sums, squares = follow(walk, record, (zero, zero, zero), lane, remaining, words, dtype)
-    return sums, squares
+    zero = jnp.zeros(lane.shape, dtype)
+    paths, none = (zero,) * outputs, ((zero, zero),) * outputs
+    _, sums, squares = follow(walk, record, (paths, none, none), lane, remaining, words, dtype)
+    return tuple(s for s, _ in sums), tuple(s for s, _ in squares)

@@ -206,6 +206,14 @@ def test_a_naive_stop_is_biased_and_this_one_is_not():
     assert z(naive) < -4
 
 
+def test_sums_in_single_precision_do_not_drift():
+    """Every path brings the same: the mean of many is that to rounding, whose error in a plain sum is 1e-5."""
+    with jax.enable_x64(False):
+        walk = lj.RandomWalk(paths=1 << 14, lanes=1)
+        found, _ = lj.albedo(lj.Stack([], lj.Lambertian(0.3)), WI.astype(jnp.float32), walk, key=KEY)
+    np.testing.assert_allclose(found, np.float32(0.3), rtol=1e-6)
+
+
 def test_keys():
     stack = lj.Stack([lj.Interface(1.4, 0.3), haze(0.2, 1.0, 0.8)], lj.Lambertian(0.5))
     walk = lj.RandomWalk(paths=100)
