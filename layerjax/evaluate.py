@@ -61,6 +61,7 @@ def evaluate(
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
         known: what `known_directions` says of wi and wo, where these are traced. Concrete ones are looked at here:
             along few distinct cosines `AddingDoubling` follows light exactly, and costs less. Maps look for themselves.
+            The cosines are taken from it, so that derivatives by them are not complete: leave it out for these.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in

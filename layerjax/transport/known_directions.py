@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon
+from layerjax._numerics import at_most, horizon
 
 MOST_COSINES = 256
 """More distinct cosines on a side are not worth knowing."""
@@ -75,7 +75,7 @@ def known_above(*directions: Any) -> bool:
 def own_cosines(wi: Array, wo: Array, all_above: bool) -> KnownDirections:
     """Directions (n, 3) each, known or traced, as if each had a cosine of its own: of few pairs that is as good."""
     z = jnp.concatenate([wi[:, 2], wo[:, 2]])
-    size = jnp.where(jnp.abs(z) > horizon(z.dtype), jnp.minimum(jnp.abs(z), 1.0), STAND_IN)
+    size = jnp.where(jnp.abs(z) > horizon(z.dtype), at_most(jnp.abs(z), 1.0), STAND_IN)
     place = jnp.arange(z.size) + jnp.where(z > 0, 0, z.size)
     above, below = (jnp.where(side, size, STAND_IN) for side in (z > 0, z <= 0))
     return KnownDirections(above, below, place[: z.size // 2], place[z.size // 2 :], all_above)

@@ -28,7 +28,7 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
     Args:
         function: depends on traced values through its arguments alone.
         parameters: a tree; what is no array stays as it is.
-        constants: a tree of arrays that are not differentiated.
+        constants: an array of any size, or None; a derivative by it (of a direction, say) runs through the function.
         dtype: of the parameters.
     """
     leaves, structure = jax.tree.flatten(parameters)
@@ -68,7 +68,16 @@ def _of_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, const
 
 def _jvp(function: Callable[[Scalars, Any], Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
     scalars, constants = primals
-    changing = [k for k, tangent in enumerate(tangents[0]) if not isinstance(tangent, SymbolicZero)]
+    value, slope = _by_scalars(function, scalars, constants, tangents[0])
+    if tangents[1] is None or isinstance(tangents[1], SymbolicZero):
+        return value, slope
+    more = jax.jvp(partial(function, scalars), (constants,), (tangents[1],))[1]
+    return value, jax.tree.map(jnp.add, slope, more)
+
+
+def _by_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, constants: Any, tangents: Any) -> Any:
+    """The value, and its derivative along tangents of the scalars."""
+    changing = [k for k, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
     if not changing:
         value = function(scalars, constants)
         return value, jax.tree.map(jnp.zeros_like, value)
@@ -83,7 +92,7 @@ def _jvp(function: Callable[[Scalars, Any], Any], primals: Any, tangents: Any) -
         return jax.jvp(changed, (jnp.zeros_like(unit),), (unit,))
 
     value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(changing), dtype=scalars[0].dtype))
-    rates = [tangents[0][k] for k in changing]
+    rates = [tangents[k] for k in changing]
 
     def combined(slopes: Array) -> Array:
         return sum((rate * slope for rate, slope in zip(rates[1:], slopes[1:], strict=True)), rates[0] * slopes[0])

@@ -8,6 +8,7 @@ import pytest
 
 import layerjax as lj
 from layerjax import HenyeyGreenstein, Interface, Medium, Stack
+from layerjax.transport.adding_doubling.elements import element
 
 SMALL = lj.AddingDoubling(nodes=5, modes=4, ordinates=(4, 4))
 
@@ -57,6 +58,20 @@ def test_derivatives_of_many_stacks_side_by_side(mode):
     x = jnp.asarray([0.3, 0.4])
     together = jax.jit(mode(lambda x: jnp.sum(jax.vmap(value)(x))))(x)
     np.testing.assert_allclose(together, [jax.jit(mode(value))(one) for one in x], rtol=1e-9)
+
+
+def test_elements_are_differentiated_by_directions_too():
+    """By the numbers that they are made of and by what they are asked for, forward and backward."""
+
+    def value(x, asked):
+        return jnp.sum(element(lambda numbers, at: numbers * jnp.sin(at), x, asked, jnp.float64))
+
+    x, asked = jnp.asarray(2.0), jnp.asarray([0.3, 0.5])
+    expected = jnp.sum(jnp.sin(asked)), x * jnp.cos(asked)
+    for mode in (jax.grad, jax.jacfwd):
+        for found, slope in zip(mode(value, (0, 1))(x, asked), expected, strict=True):
+            np.testing.assert_allclose(found, slope, rtol=1e-12)
+        np.testing.assert_allclose(mode(value, 1)(x, asked), expected[1], rtol=1e-12)
 
 
 @pytest.mark.slow

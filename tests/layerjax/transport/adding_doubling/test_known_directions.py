@@ -114,6 +114,26 @@ def test_many_directions_are_not_looked_at():
     assert jax.jit(lambda w: jnp.asarray(lj.known_directions(w, w) is None))(wi)
 
 
+@pytest.mark.slow
+def test_derivatives_by_the_directions_of_a_map():
+    """Those of light that is scattered more than once as well: against differences."""
+    wi, wo = lj.direction([0.3, 0.9], 0.1), lj.direction([0.7, 0.2], 1.0)
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(wi):
+        stack = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(jnp.asarray([[0.5], [0.6]])))
+        return lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=4, modes=3)).sum()
+
+    slopes = total(wi)[1]
+    for at in np.ndindex(2, 3):
+        step = jnp.zeros_like(wi).at[at].set(1e-5)
+        difference = (total(wi + step)[0] - total(wi - step)[0]) / 2e-5
+        np.testing.assert_allclose(slopes[at], difference, rtol=1e-6, atol=1e-9)
+    for edge in (0.0, np.pi / 2 - 1e-6, np.pi / 2):
+        assert np.isfinite(total(lj.direction([0.3, edge], 0.1))[1]).all()
+
+
 def vary(x):
     medium = lj.Medium(x[2], x[3], lj.HenyeyGreenstein(x[4]))
     return lj.Stack([lj.Interface(x[0], x[1]), medium], lj.Lambertian(x[5]))
