@@ -48,7 +48,10 @@ class Plan(eqx.Module):
 
 def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) -> Plan:
     """The plan for a simplified stack."""
-    steps = tuple(doublings(layer.thickness) for layer in stack.layers if isinstance(layer, Medium))
+    doubles = _dtype(stack) != jnp.float64  # else nothing goes by the number of steps, and one program does for all
+    steps = tuple(
+        doublings(layer.thickness) if doubles else None for layer in stack.layers if isinstance(layer, Medium)
+    )
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
         return Plan(nodes, azimuths // 2 + 1, azimuths, steps, _ranks(stack), microfacets)
@@ -62,7 +65,7 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
     light passes it, ends) with an interface.
     """
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
+    dtype = _dtype(stack)
     indices = tuple(jnp.asarray(n, dtype) for n in (1.0, *(layer.ior for layer in interfaces)))
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
     faces = _interfaces(stack, plan, indices, asked)
@@ -86,6 +89,10 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     return grid, whole, without_straight(stack, [found for found, _ in solved], whole)
+
+
+def _dtype(stack: Stack) -> Any:
+    return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
 def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None) -> list[Layer]:

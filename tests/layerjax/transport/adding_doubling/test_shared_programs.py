@@ -1,4 +1,4 @@
-"""Interfaces that share a program are what they are with one each."""
+"""What shares a program: interfaces are what they are with one each, and thicknesses of double precision do."""
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,13 @@ def operators(numbers):
     layers = [lj.Interface(numbers[k], numbers[3 + k]) for k in range(3)]
     stack = lj.Stack(layers, lj.Lambertian(0.5))
     return solve.solve(stack, solve.make_plan(stack, Resolution(2, 1, (2, 4)), "single"))[1]
+
+
+@pytest.mark.parametrize(("dtype", "shared"), [(jnp.float64, True), (jnp.float32, False)])
+def test_thicknesses_share_a_program_unless_they_are_doubled_up(dtype, shared):
+    stacks = [jax.tree.map(lambda x: jnp.asarray(x, dtype), lj.Stack([lj.Medium(tau)])) for tau in (1.0, 10.0)]
+    thin, thick = (solve.make_plan(stack, Resolution(2, 1, (2, 4)), "single") for stack in stacks)
+    assert (thin == thick) is shared
 
 
 def slopes(numbers):
