@@ -35,10 +35,6 @@ class PhaseFunction(Shown):
     uses_half_vector: ClassVar[bool] = False
     """Whether `kernel` is faster if it is given the half vector."""
 
-    peaks_forward: ClassVar[bool] = True
-    """What becomes of a peak too narrow for a grid of directions: what the grid misses of it goes straight on, as of
-    narrow forward lobes; or else (False) the kernel is scaled to its energy, as of mirrors."""
-
     @abc.abstractmethod
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         """p(wi, wo), 1/sr, which is also the density of `sample`."""
@@ -68,6 +64,12 @@ class PhaseFunction(Shown):
         Unless overridden, one for lobes that are not narrow.
         """
         return sphere_rule(wi, nodes)
+
+    @property
+    def peaks_forward(self) -> bool | Array:
+        """What becomes of a peak too narrow for a grid of directions: what the grid misses of it goes straight on, as
+        of narrow forward lobes; or else (False) the kernel is scaled to its energy, as of mirrors."""
+        return True
 
     @property
     def width(self) -> Parameter:

@@ -46,6 +46,10 @@ class HenyeyGreenstein(PhaseFunction):
         return henyey_greenstein_rule(wi, self.g, nodes)
 
     @property
+    def peaks_forward(self) -> Array:
+        return self.g >= 0.0
+
+    @property
     def width(self) -> Parameter:
         return _width(self.g, -1.0)
 

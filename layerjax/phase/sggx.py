@@ -30,7 +30,6 @@ class SGGX(PhaseFunction):
     """
 
     uses_half_vector: ClassVar[bool] = True
-    peaks_forward: ClassVar[bool] = False
 
     kind: Kind = eqx.field(static=True)
     alpha: Parameter = parameter("SGGX.alpha")
@@ -56,6 +55,10 @@ class SGGX(PhaseFunction):
 
     def rule(self, wi: Vector, nodes: int) -> Rule:
         return flake_rule(wi, *radii(self.kind, self.alpha), self._axis(), nodes)
+
+    @property
+    def peaks_forward(self) -> bool:
+        return False
 
     @property
     def width(self) -> Parameter:

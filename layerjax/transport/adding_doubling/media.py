@@ -110,21 +110,22 @@ def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector
 def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
     """The kernel with a collision scattering exactly sigma.
 
-    That of mirrors is scaled. What is left goes straight on, as does all that a forward peak has too little or too much
-    of: there it changes nothing.
+    That of mirrors is scaled, and one with a peak backward. What is left goes straight on, as does all that a forward
+    peak has too little or too much of: there it changes nothing.
     """
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
     area = kernel.area * jnp.ones_like(weight)
-    if phase.peaks_forward:
-        scale, missing = jnp.ones_like(weight), area - weight @ (reflect + transmit)
-    else:
-        scale, missing = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
+    scale, missing = jnp.ones_like(weight), area - weight @ (reflect + transmit)
+    onward = phase.peaks_forward
+    if onward is not True:
+        scaled, left = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
+        scale, missing = jnp.where(onward, scale, scaled), jnp.where(onward, missing, left)
     forward = straight_on(missing, weight)
-    back, onward = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
+    back, through = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
 
     def balanced(pair: Pair) -> Pair:
-        return pair[0] * back, pair[1] * onward + forward  # towards exact forward Schlick's term is 1
+        return pair[0] * back, pair[1] * through + forward  # towards exact forward Schlick's term is 1
 
     schlick = None if kernel.schlick is None else balanced(kernel.schlick)
     return Kernel(balanced(kernel.plain), schlick, kernel.area, kernel.cosine, kernel.solid, kernel.azimuths)

@@ -171,6 +171,13 @@ def test_along_the_normal_there_is_one_value():
     assert abs(values[0] - estimate[0]) < 4 * error[0] + 0.01 * estimate[0]
 
 
+def test_light_sent_straight_back_is_a_matter_of_two_streams():
+    """A lossless slab that turns it back reflects tau / (1 + tau), however wide the nodes are apart."""
+    slab = Stack([Medium(0.1, 1.0, HenyeyGreenstein(-0.999))])
+    reflected, _ = lj.albedo(slab, lj.direction(0.0, 0.0), lj.AddingDoubling(nodes=6, modes=1))
+    np.testing.assert_allclose(reflected, 0.1 / 1.1, rtol=5e-3)
+
+
 def test_only_stacks_with_an_axis_pay_for_ordinates():
     transport = lj.AddingDoubling(nodes=6, modes=4, ordinates=(4, 4))
     assert lj.prepare(STACKS["haze"], transport).state.tables.azimuths is None
