@@ -49,7 +49,7 @@ class _Spectrum(NamedTuple):
 
 @jax.custom_jvp
 def slab(p: Array, q: Array, half: Array) -> tuple[Array, Array]:
-    """R and T, (..., n, n), of a slab.
+    """R and T, (..., n, n), of a slab. To be differentiated once: second derivatives may be NaN.
 
     Args:
         p, q: sum and difference of A and B, (..., n, n): symmetric, p positive definite, q at least semidefinite.

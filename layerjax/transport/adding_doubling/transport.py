@@ -68,6 +68,8 @@ class AddingDoubling(DeterministicTransport):
     beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the
     same error or less.
 
+    To be differentiated once, forward or backward: second derivatives may be NaN.
+
     Args:
         nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as
             give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`):
