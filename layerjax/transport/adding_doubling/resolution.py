@@ -65,6 +65,12 @@ class Resolution(NamedTuple):
             (max(2, 3 * cosines // 4), max(4, 3 * azimuths // 8 * 2)),
         )
 
+    def another(self) -> "Resolution":
+        """The coarser one; of what cannot be coarser, the finer."""
+        coarse, fine = self.coarser(), self.finer()
+        upright = fine if coarse[:2] == self[:2] else coarse
+        return upright._replace(ordinates=(fine if coarse.ordinates == self.ordinates else coarse).ordinates)
+
     def finer(self) -> "Resolution":
         """About four thirds of it: small steps, as the work grows with a power above the second."""
         cosines, azimuths = self.ordinates

@@ -171,6 +171,9 @@ class AddingDoubling(DeterministicTransport):
         """This transport at about four thirds of the resolution."""
         return self._at(self._given().finer())
 
+    def compared(self) -> "AddingDoubling":
+        return self._at(self._given().another())
+
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = []
         if self.orders != "multiple":
