@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
+from layerjax._numerics import safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
@@ -251,11 +252,14 @@ class AddingDoubling(DeterministicTransport):
             options = self._at(rung)
             state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
             values = options.measured(state, wi, wo, "all", channel_count(stack), None)[0]
+            # what is known in closed form does not change, and where it is a narrow peak it must not set the scale
+            solved, rest = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, straight=None)
+            found = solved.measured(rest, wi, wo, "all", channel_count(stack), None)[0]
             if before is not None:
-                change = float(jnp.max(jnp.abs(values - before) / (jnp.abs(values) + 0.1 * jnp.mean(values))))
+                change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(found))))
                 if change <= self.tolerance:
                     return options
-            before = values
+            before = found
         raise ValueError(
             f"AddingDoubling.tolerance: {self.tolerance:g} is not reached: "
             f"the last two resolutions differ by {change:.1g}"

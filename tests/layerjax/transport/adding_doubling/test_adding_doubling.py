@@ -9,6 +9,7 @@ import pytest
 
 import layerjax as lj
 from layerjax import HenyeyGreenstein, Interface, Lambertian, Medium, Stack
+from layerjax.transport.adding_doubling.resolution import Resolution
 from tests.helpers.places import STORED
 
 PUBLISHED = STORED / "published_slab_values.csv"
@@ -203,6 +204,31 @@ def test_tolerance_picks_the_resolution(tolerance):
     assert np.max(np.abs(values - truth) / (truth + 0.1 * truth.mean())) <= tolerance
     with pytest.raises(ValueError, match=r"AddingDoubling.tolerance.*outside jit"):
         jax.jit(lambda t: lj.evaluate(Stack([Medium(t)]), wi, wo, lj.AddingDoubling(tolerance=tolerance)))(1.0)
+
+
+@pytest.mark.parametrize(("nodes", "modes"), [(2, 1), (3, 1)])
+def test_errors_are_told_by_another_resolution(nodes, modes):
+    """The coarser one, or where there is none, the finer."""
+    given = lj.AddingDoubling(nodes=nodes, modes=modes, ordinates=(2, 4))
+    other = given.compared()
+    assert (other.nodes, other.modes) == ((3, 2) if nodes == 2 else (2, 1))
+    assert other.ordinates == (4, 8)
+
+
+def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
+    """Next to a peak that is known in closed form any error of the rest is small: that counts by itself."""
+    monkeypatch.setattr(
+        "layerjax.transport.adding_doubling.transport.rungs",
+        lambda stack: [Resolution(2, 1, (2, 4)), Resolution(3, 2, (2, 4))],
+    )
+    stack = Stack([Medium(1e-3, 0.9, HenyeyGreenstein(0.99))])
+    with pytest.raises(ValueError, match=r"0\.01 is not reached"):
+        lj.choose_transport(stack, lj.AddingDoubling(tolerance=0.01))
+
+
+def test_a_stack_that_reflects_nothing_reaches_any_tolerance():
+    black = Stack([Medium(1.0, 0.0)], lj.Lambertian(0.0))
+    assert lj.choose_transport(black, lj.AddingDoubling(tolerance=1e-6)).nodes == 8
 
 
 @pytest.mark.slow
