@@ -43,7 +43,7 @@ def _panel(axes: Axes, totals: Totals, rows: np.ndarray, predicted: np.ndarray, 
     channels = len(totals.channels)
     if channels == 1:
         order = rows[np.argsort(totals.theta_i[rows], kind="stable")]
-        lines = [(totals.theta_i[order], order, np.zeros(len(order), int), None)]
+        lines = [(totals.theta_i[order], order, np.zeros(len(order), int), "")]
         axes.set_xlabel("angle of incidence, degrees")
     else:
         places = np.arange(channels)
@@ -51,8 +51,8 @@ def _panel(axes: Axes, totals: Totals, rows: np.ndarray, predicted: np.ndarray, 
         shown = places[:: -(-channels // MOST_NAMES)]
         axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
     for x, row, channel, angle in lines:
-        colour = CYCLE[0 if angle is None else angles.index(angle) % len(CYCLE)]
-        label = "" if angle is None or len(angles) == 1 else f" at {angle}"
+        colour = CYCLE[angles.index(angle) % len(CYCLE) if angle else 0]
+        label = f" at {angle}" if angle and len(angles) > 1 else ""
         errors = None if totals.sigma is None else totals.sigma[row, channel]
         read = totals.values[row, channel]
         axes.errorbar(x, read, errors, fmt="o", color=INK, markersize=3, capsize=2, label=f"read{label}")

@@ -144,7 +144,7 @@ def test_what_was_found_is_printed(
     assert rows["base.albedo"][1:8] == ["1.75", "3.5", "5.25", "1.25", "2", "2.75", "1"]
     chi_square = next(line.split() for line in lines if line.strip().startswith("chi2/dof"))
     assert [word for word in chi_square if word[0].isdigit()][:3] == ["101.8", "103.5", "105.2"]
-    assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012"]
+    assert rows["layers[0].f0"] == ["layers[0].f0", "0.04321", "0.00012", "1"]
     assert "layerjax report coat.zarr" in output.out
     assert "texels 5/10" in output.err
 
