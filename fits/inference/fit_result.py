@@ -78,7 +78,8 @@ class Fit:
         alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
             that rule (see `Noise`); else None.
         alone_parts: of a `Joint`, the same by the names of measurements.
-        within: of one measurement of a `Joint`, the fit of all of them, and its name there.
+        part_of_joint: of one measurement of a `Joint`, its name there, kept where it is saved.
+        within: of the same, the fit of all of them, which is not.
     """
 
     problem: Problem
@@ -101,7 +102,8 @@ class Fit:
     resolution: str | None = None
     alone: Alone | None = None
     alone_parts: Mapping[str, Alone] = field(default_factory=dict)
-    within: "tuple[Fit, str] | None" = None
+    part_of_joint: str | None = None
+    within: "Fit | None" = None
 
     def __repr__(self) -> str:
         values = ", ".join(
@@ -142,7 +144,8 @@ class Fit:
             minima=tuple(map(minimum, self.minima)),
             alternatives=tuple(map(minimum, self.alternatives)),
             alone=self.alone_parts.get(name),
-            within=(self, name),
+            part_of_joint=name,
+            within=self,
         )
         vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
         return found
@@ -163,10 +166,10 @@ class Fit:
         Raises:
             ValueError: it is one.
         """
-        if self.within is not None:
+        if self.part_of_joint is not None:
             raise ValueError(
-                f"{what}: {self.within[1]!r} is a part of a joint fit, and without the others it says something else; "
-                "fit it by itself, or take the whole fit"
+                f"{what}: {self.part_of_joint!r} is a part of a joint fit, and without the others it says something "
+                "else; fit it by itself, or take the whole fit"
             )
 
     @property

@@ -121,10 +121,9 @@ def _vectors(
     of: Fit | Posterior, draws: int, generator: np.random.Generator, like: "Mixture | None" = None
 ) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the shape of their weights."""
-    if isinstance(of, Fit) and of.within is not None:  # what other measurements say of its parameters counts too
-        whole, name = of.within
-        vectors, shape = _vectors(whole, draws, generator)
-        return vectors[:, list(whole.problem.places(name))], shape
+    if isinstance(of, Fit) and of.within is not None and of.part_of_joint is not None:
+        vectors, shape = _vectors(of.within, draws, generator)  # what others say of its parameters counts too
+        return vectors[:, list(of.within.problem.places(of.part_of_joint))], shape
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))

@@ -109,6 +109,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "resolution": fit.resolution,
         "numerical_error": fit.numerical_error,
         "alone": None if fit.alone is None else asdict(fit.alone),
+        "part_of_joint": fit.part_of_joint,
         "source": asdict(problem.data.source),
         "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
@@ -197,6 +198,7 @@ def load_fit(directory: str | Path) -> "Fit":
             alternatives=tuple(minima[index] for index in content["alternatives"]),
             # not in results of layerjax 0.1.0
             without_influence=tuple(content.get("without_influence", ())),
+            part_of_joint=content.get("part_of_joint"),
             settings=content.get("settings", {}),
             ended=content.get("starts_ended", {}),
             numerical_error=None if error is None else stored_number(error),

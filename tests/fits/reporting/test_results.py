@@ -12,6 +12,7 @@ import pytest
 import layerjax as lj
 from fits.inference.fit_result import Fit, Minimum
 from fits.inference.identifiability import Combination
+from fits.inference.sampling import sample
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
@@ -172,6 +173,12 @@ def test_a_damaged_result_is_named(coat_fit: Fit, tmp_path: Path, name: str, con
         load_fit(directory)
     assert "result" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_one_of_several_measurements_is_not_sampled_by_itself_where_it_was_saved(coat_fit: Fit, tmp_path: Path) -> None:
+    save_fit(replace(coat_fit, part_of_joint="plane"), tmp_path / "fit")
+    with pytest.raises(ValueError, match="sample: 'plane' is a part of a joint fit"):
+        sample(load_fit(tmp_path / "fit"))
 
 
 def test_there_is_no_posterior_before_sampling(coat_fit: Fit, tmp_path: Path) -> None:
