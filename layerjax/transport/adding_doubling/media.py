@@ -116,11 +116,18 @@ def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
     area = kernel.area * jnp.ones_like(weight)
-    scale, missing = jnp.ones_like(weight), area - weight @ (reflect + transmit)
+
+    def as_it_is() -> Pair:
+        return jnp.ones_like(weight), area - weight @ (reflect + transmit)
+
+    def scaled() -> Pair:
+        return balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
+
     onward = phase.peaks_forward
-    if onward is not True:
-        scaled, left = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
-        scale, missing = jnp.where(onward, scale, scaled), jnp.where(onward, missing, left)
+    if isinstance(onward, bool):
+        scale, missing = as_it_is() if onward else scaled()
+    else:  # a branch, not a choice of results: most lobes point forward
+        scale, missing = jax.lax.cond(onward, as_it_is, scaled)
     forward = straight_on(missing, weight)
     back, through = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
 

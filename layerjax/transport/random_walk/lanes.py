@@ -120,9 +120,12 @@ def follow(
 def added(running: tuple[Array, Array], more: Array) -> tuple[Array, Array]:
     """A running sum with more added, and what rounding has put too much into it (Kahan 1965), first (0, 0).
 
-    Millions of terms are no more than a rounding off, where a plain sum in single precision stops growing.
+    Millions of terms are no more than a rounding off, where a plain sum in single precision stops growing. One in
+    double precision, which is plain, does not.
     """
     total, excess = running
+    if total.dtype == jnp.float64:
+        return total + more, excess
     more = more - excess
     after = total + more
     return after, (after - total) - more
