@@ -7,7 +7,6 @@ is written in one go as its start ends; a broken last line is as good as none.
 import hashlib
 import json
 import os
-import re
 import zlib
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +21,7 @@ import layerjax
 from fits._files import locked, named, write_whole
 from fits.inference.descent import here
 from fits.problem.posed import Posed
+from fits.problem.values import portable_repr
 
 Solver = Literal["least_squares", "bounded"]
 Floats = NDArray[np.float64]
@@ -100,9 +100,8 @@ def _checked(line: bytes) -> dict[str, Any] | None:
 def _identity(problem: Posed, points: Floats, solver: Solver) -> str:
     """A fingerprint of everything that the ends of the starts depend on."""
     arrays, static = problem.split_model
-    told = repr((layerjax.__version__, solver, problem.names, static.tree))
-    # functions are shown with their places in memory, which no other process has
-    digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", told).encode())
+    told = portable_repr((layerjax.__version__, solver, problem.names, static.tree))
+    digest = hashlib.sha256(told.encode())
     # a transport of the user's own may have changed its body under the same name
     for array in (*jax.tree.leaves(arrays), points, here(problem, points[0]).predicted):
         digest.update(repr((np.shape(array), str(np.asarray(array).dtype))).encode())

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import re
 from collections.abc import Mapping
 from types import CodeType
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 
 from fits.maps.sources import UNREADABLE
 from fits.problem.parameters import is_free
+from fits.problem.values import portable_repr
 
 
 def digest(tree: Any) -> str:
@@ -30,7 +30,7 @@ def _digest(tree: Any, within: tuple[Any, ...]) -> str:
             found.update(repr((array.shape, str(array.dtype))).encode())
             found.update(np.ascontiguousarray(array).tobytes())
         else:
-            found.update((_of_function(leaf, within) if callable(leaf) else _shown(leaf)).encode())
+            found.update((_of_function(leaf, within) if callable(leaf) else portable_repr(leaf)).encode())
     return found.hexdigest()
 
 
@@ -62,7 +62,7 @@ def _of_function(function: Any, within: tuple[Any, ...]) -> str:
     within = (*within, function)
     if isinstance(function, functools.partial):
         return _digest(["partial", function.func, function.args, function.keywords], within)
-    name = f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', _shown(function))}"
+    name = f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', portable_repr(function))}"
     if hasattr(function, "__code__"):
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
         held = [cells, function.__defaults__, function.__kwdefaults__, getattr(function, "__self__", None)]
@@ -79,8 +79,3 @@ def _of_code(code: CodeType) -> str:
         for one in code.co_consts
     ]
     return repr((code.co_code, code.co_names, constants))
-
-
-def _shown(thing: Any) -> str:
-    """As it shows itself, but not where in memory it is."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(thing))

@@ -80,9 +80,9 @@ def test_differences_that_timings_cannot_tell_are_no_figures() -> None:
     """Few values cost 1 ms, that is 100 ns of each of 10,000."""
     row = Row("a", "coated_metals", "m", "s", 1, 1e-3, 1e-3, None, 0.0, 1e-3, None, 1, False)
     found = [dataclasses.replace(row, nanoseconds_per_value=each) for each in (0.0, 50.0, 70.0)]
-    assert error_tables.each(found, called=True) == "50.0"
-    assert error_tables.each([*found, found[0]], called=True) == "-"
-    assert error_tables.each([*found, found[0]], called=False) == "25.0"
+    assert error_tables.time_of_a_value(found, called=True) == "50.0"
+    assert error_tables.time_of_a_value([*found, found[0]], called=True) == "-"
+    assert error_tables.time_of_a_value([*found, found[0]], called=False) == "25.0"
 
 
 def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:

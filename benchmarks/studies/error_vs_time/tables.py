@@ -132,7 +132,7 @@ def limited_percent(row: Row, limits: Mapping[str, float]) -> str:
     return ("<= " if row.truth_limits else "") + percent(floored(row, limits))
 
 
-def each(found: Sequence[Row], called: bool) -> str:
+def time_of_a_value(found: Sequence[Row], called: bool) -> str:
     """The median of nanoseconds a value; a dash for differences that half of the stacks do not tell."""
     told = sum(row.nanoseconds_per_value >= TOLD * once(row) for row in found)
     return figure(_median(row.nanoseconds_per_value for row in found)) if not called or 2 * told > len(found) else "-"
@@ -163,7 +163,7 @@ def _summary(models: Sequence[Model], judged: Sequence[Judged], rows: Sequence[R
                     limited + percent(_median(floored(row, error_limits) for row in found)),
                     _largest((row.worst, by_name[row.stack].worst_uncertainty) for row in found),
                     _largest((row.albedo, by_name[row.stack].albedo_uncertainty) for row in found),
-                    each(found, model in called),
+                    time_of_a_value(found, model in called),
                     figure(1e3 * _median(row.prepare_seconds for row in found)),
                     figure(_median(map(amortised, found))),
                     _compile([row.compile_seconds for row in found]),
