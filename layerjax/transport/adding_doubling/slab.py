@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.custom_batching import sequential_vmap
 
+from layerjax._batching import room
 from layerjax._numerics import at_least, horner
 from layerjax.transport.adding_doubling.inverse import inverse
 
@@ -90,21 +91,25 @@ def _spectrum(p: Array, q: Array, half: Array) -> _Spectrum:
 
 
 def _decomposed(p: Array, q: Array) -> tuple[Array, Array, Array]:
-    """L, lambda^2 and V for every matrix, one after the other.
+    """L, lambda^2 and V for every matrix: on a processor one after the other, on a GPU all at once.
 
     Batched LAPACK kernels of jaxlib share the threads that XLA runs on, and two at a time may wait for each other for
-    ever (seen with jaxlib 0.10.2 on two cores).
+    ever (seen with jaxlib 0.10.2 on two cores). A GPU takes a millisecond to decompose a matrix, or thousands of them.
     """
+    if room() > 1:
+        return _decomposed_together(p, q)
     batch = jnp.broadcast_shapes(p.shape, q.shape)
     flat = [jnp.broadcast_to(part, batch).reshape(-1, *batch[-2:]) for part in (p, q)]
     found = jax.vmap(_decomposed_alone)(*flat)
     return tuple(part.reshape(*batch[:-2], *part.shape[1:]) for part in found)
 
 
-@sequential_vmap
-def _decomposed_alone(p: Array, q: Array) -> tuple[Array, Array, Array]:
+def _decomposed_together(p: Array, q: Array) -> tuple[Array, Array, Array]:
     lower = jnp.linalg.cholesky(p)
-    return lower, *jnp.linalg.eigh(lower.T @ q @ lower)
+    return lower, *jnp.linalg.eigh(_transposed(lower) @ q @ lower)
+
+
+_decomposed_alone = sequential_vmap(_decomposed_together)
 
 
 def _differences(a: Array, b: Array) -> tuple[Array, Array, Array]:

@@ -122,6 +122,24 @@ def test_gradients_are_finite_at_the_ends():
             assert np.isfinite(slope).all()
 
 
+def test_decomposed_together_as_on_a_gpu(monkeypatch):
+    """Slabs of several media side by side, and their derivatives by all: to the rounding of eigenvalues."""
+    modes = [equations(albedo, g, 1) for albedo, g in MEDIA]
+    p, q = (jnp.stack([jnp.asarray(both[k][0]) for both in modes]) for k in range(2))
+    primals, tangents = (p, q, jnp.linspace(0.0, 2.0, len(MEDIA))), (0.1 * p, 0.2 * q, jnp.ones(len(MEDIA)))
+
+    def program():
+        return jax.vmap(lambda primals, tangents: jax.jvp(slab, primals, tangents))
+
+    one_by_one = jax.jit(program())(primals, tangents)
+    assert "custom_vmap" in str(jax.make_jaxpr(slab)(*primals))
+    monkeypatch.setattr("layerjax.transport.adding_doubling.slab.room", lambda: 2)
+    assert "custom_vmap" not in str(jax.make_jaxpr(lambda *given: slab(*given))(*primals))
+    together = jax.jit(program())(primals, tangents)
+    for found, expected in zip(jax.tree.leaves(together), jax.tree.leaves(one_by_one), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 FIBERS = lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8))
 
 
