@@ -2,23 +2,30 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 
 import layerjax as lj
-from benchmarks.studies.accelerator import Task, study
-from benchmarks.studies.textured.materials import MATERIALS
+from benchmarks.studies.accelerator import study
+from benchmarks.studies.accelerator.tasks import Task
 
 
-def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
-    (cheap,) = (one for one in MATERIALS if one.name == "interface over metal, 2007")
-    _, paths = study(directory=tmp_path, tasks=[Task(cheap, 16)], precisions=["float64"], rounds=1)
+def test_a_tiny_run_writes_whole_files_and_keeps_other_rows(tmp_path: Path) -> None:
+    lines: list[str] = []
+    value = Task("interface over metal, 2007", 16)
+    unknown = replace(value, material="of no name")
+    study(report=lines.append, directory=tmp_path, tasks=[value, unknown], rounds=1)
+    _, paths = study(report=lines.append, directory=tmp_path, tasks=[replace(value, kind="gradient")], rounds=1)
     assert sorted(paths) == sorted(tmp_path.iterdir())
-    (row,) = json.loads((tmp_path / "accelerator.json").read_text())["rows"]
-    assert row["apart"] < 1e-12  # the same arithmetic, on any two devices
-    assert min(row["value"], row["gradient"]) > 0
+    rows = json.loads((tmp_path / "accelerator.json").read_text())["rows"]
+    assert [row["kind"] for row in rows] == ["value", "gradient"]
+    assert any("failed" in line for line in lines)
+    for row in rows:
+        assert row["apart"] < 1e-12  # the same arithmetic, on any two devices
+        assert min(row["microseconds"], row["microseconds_on_processor"], row["compile_seconds"]) > 0
 
 
 def test_products_of_the_solver_are_not_rounded_to_what_a_gpu_would_like() -> None:
