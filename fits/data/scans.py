@@ -25,14 +25,40 @@ class Incidence:
 
 
 def incidences(data: Pairs) -> list[Incidence]:
-    """The distinct incident directions, by polar angle then azimuth; rows within `SAME_ANGLE` count as the same."""
-    # Angles come back from unit vectors: rounding first keeps a value that sits between two bins in one of them.
-    theta, phi = np.round(data.theta_i, 6), np.round(data.phi_i, 6) % 360.0
-    phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, phi)
-    keys = np.stack([np.round(theta / SAME_ANGLE), np.round(phi / SAME_ANGLE) % round(360 / SAME_ANGLE)], axis=-1)
-    unique, which = np.unique(keys, axis=0, return_inverse=True)
-    groups = [np.flatnonzero(which.ravel() == index) for index in range(len(unique))]
-    return [Incidence(_tidy(theta[rows]), _tidy(phi[rows]), rows) for rows in groups]
+    """The distinct incident directions, by polar angle then azimuth.
+
+    What lies within `SAME_ANGLE` counts as the same, wherever it lies: an instrument does not come back to an angle to
+    the last digit. So near the normal azimuths are not told apart.
+    """
+    theta = data.theta_i
+    phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
+    found = []
+    for rows in groups(theta):
+        upright = theta[rows].max() < SAME_ANGLE
+        parts = [np.arange(len(rows))] if upright else groups(phi[rows], turn=360.0)
+        own = [Incidence(_mean(theta[rows[part]]), _mean(phi[rows[part]], 360.0), rows[part]) for part in parts]
+        found.extend(sorted(own, key=lambda one: one.phi))
+    return found
+
+
+def groups(angles: np.ndarray, turn: float | None = None) -> list[np.ndarray]:
+    """Rows of angles (N,) that are one, groups that each reach less than `SAME_ANGLE` from their smallest, in order.
+
+    turn: where angles begin again; then the first group lies behind the widest gap that there is.
+    """
+    if not len(angles):
+        return []
+    angles = np.round(angles, 6)  # they come back from unit vectors
+    if turn is not None:
+        values = np.unique(angles % turn)
+        behind = (np.argmax(np.diff(values, append=values[0] + turn)) + 1) % len(values)
+        angles = np.round((angles - values[behind]) % turn, 6)
+    order = np.argsort(angles, kind="stable")
+    ordered, ends, start = angles[order], [], 0
+    while start < len(ordered):
+        start = int(np.searchsorted(ordered, ordered[start] + SAME_ANGLE - 1e-7))
+        ends.append(start)
+    return [np.sort(part) for part in np.split(order, ends[:-1])]
 
 
 def relative_azimuth(data: Pairs) -> np.ndarray:
@@ -77,5 +103,9 @@ def scans(data: Pairs) -> list[np.ndarray]:
     return ordered
 
 
-def _tidy(angles: np.ndarray) -> float:
-    return round(float(np.mean(angles)), 2)
+def _mean(angles: np.ndarray, turn: float | None = None) -> float:
+    """To 0.01 degrees, of angles that lie close to each other; between 0 and a turn, where they begin again there."""
+    if turn is None:
+        return round(float(np.mean(angles)), 2)
+    apart = (angles - angles[0] + 0.5 * turn) % turn - 0.5 * turn
+    return round(float(angles[0] + np.mean(apart)) % turn, 2) % turn

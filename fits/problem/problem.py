@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import layerjax as lj
 from fits.data.measurements import Measurements
-from fits.data.scans import SAME_ANGLE, incidences
+from fits.data.scans import groups
 from fits.data.totals import Totals
 from fits.names import Objective
 from fits.problem.compiled import Static, run
@@ -291,9 +291,8 @@ def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
 
 def polar_angles(data: Measurements) -> Floats:
     """Of the light, (K,), those of the used samples, in degrees; within `SAME_ANGLE` they are one, at all azimuths."""
-    theta = np.array([one.theta for one in incidences(data.used())])
-    bins, which = np.unique(np.round(theta / SAME_ANGLE), return_inverse=True)
-    return np.array([np.mean(theta[which == place]) for place in range(len(bins))])
+    theta = data.used().theta_i
+    return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
 
 def _side(wi: Floats, wo: Floats) -> Side:

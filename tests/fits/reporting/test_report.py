@@ -55,6 +55,16 @@ def test_incidences_are_told_apart_by_both_angles() -> None:
     assert found == [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]
 
 
+def test_incidences_are_not_told_apart_by_what_an_instrument_jitters() -> None:
+    theta = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0]
+    phi = [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
+    data = measurements(theta, phi, [5] * 8, [0] * 8)
+    found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
+    assert [rows for _, _, rows in found] == [[4, 5], [0, 1, 2], [3], [6], [7]]
+    np.testing.assert_allclose([theta for theta, _, _ in found], [0.15, 30.27, 30.74, 50.0, 50.0], atol=0.005)
+    np.testing.assert_allclose([phi for _, phi, _ in found[1:]], [0.0, 0.0, 90.0, 90.6], atol=0.005)
+
+
 def series(correlation: float, count: int, seed: int) -> np.ndarray:
     """A stationary autoregressive series of unit variance."""
     draws = np.random.default_rng(seed).standard_normal(count)
