@@ -19,8 +19,10 @@ READING = ("format", "quantity", "bins", "all", "strata")
 def refuse_alone(arguments: argparse.Namespace, names: tuple[str, ...], needed: str) -> None:
     """ValueError for the first of these options that is given, where the one that they belong to is not."""
     for name in names:
-        if getattr(arguments, name) not in (None, ()):
-            raise ValueError(f"--{name.replace('_', '-')} is given without --{needed}")
+        given = getattr(arguments, name)
+        if given not in (None, ()):
+            switched_off = "no-" if given is False else ""
+            raise ValueError(f"--{switched_off}{name.replace('_', '-')} is given without --{needed}")
 
 
 def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:

@@ -53,6 +53,8 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
         (["nowhere", "--stacks", "bare.toml"], "nowhere: no such file or folder"),
         (["scans", "--stacks", "nowhere.toml"], "nowhere.toml: no such file"),
         (["scans"], "no stack is given, nor a search asked for"),
+        (["scans", "--search", "--objective", "cube_root"], "objective is 'cube_root' and no stack is given"),
+        (["scans", "--search", "--solver", "bounded"], "solver is 'bounded' and no stack is given"),
         (["scans/broken.csv", "--stacks", "bare.toml"], "'twenty'"),
         (["scans", "scans", "--stacks", "bare.toml"], "results go by the file's name"),
         (["scans", "--stacks", "bare.toml", "--only", "everything"], "'everything' is no selection"),
