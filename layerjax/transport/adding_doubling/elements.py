@@ -51,13 +51,30 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
     return _of_scalars(of_scalars, scalars, constants)
 
 
+def _by_itself(function: Callable[[Array], Any], scalars: Scalars, given: Array) -> Any:
+    """function(given), formed once: XLA would form what it finds again for every element of whatever uses it.
+
+    Barriers are gone by the time that XLA fuses on a processor; what branches give is not fused with anything.
+    """
+    shapes = jax.eval_shape(function, given)
+
+    def nothing(_: Array) -> Any:
+        return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
+
+    return jax.lax.cond(_are_numbers(scalars), function, nothing, given)
+
+
+def _are_numbers(scalars: Scalars) -> Array:
+    return reduce(jnp.logical_and, (scalar == scalar for scalar in scalars), jnp.asarray(True))
+
+
 def _tied(found: Any, scalars: Scalars) -> Any:
     """What was found, all of it a function of the scalars in form, at no cost.
 
     Under `vmap` an output of a custom derivative that does not depend on them would have no batch as a value and one
     as soon as it is differentiated, and programs that are batched before that are then given the wrong shape.
     """
-    is_number = reduce(jnp.logical_and, (scalar == scalar for scalar in scalars), jnp.asarray(True))
+    is_number = _are_numbers(scalars)
     return jax.tree.map(lambda leaf: jnp.where(is_number, leaf, leaf), found)
 
 
@@ -91,7 +108,9 @@ def _by_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, const
 
         return jax.jvp(changed, (jnp.zeros_like(unit),), (unit,))
 
-    value, slopes = jax.vmap(along, out_axes=(None, 0))(jnp.eye(len(changing), dtype=scalars[0].dtype))
+    value, slopes = _by_itself(
+        jax.vmap(along, out_axes=(None, 0)), scalars, jnp.eye(len(changing), dtype=scalars[0].dtype)
+    )
     rates = [tangents[k] for k in changing]
 
     def combined(slopes: Array) -> Array:

@@ -83,11 +83,13 @@ def balance(
         parts = [(weight * out(scale)) @ kernel for kernel, out in kernels]
         return scale * sum(parts[1:], parts[0])
 
-    scale = jnp.ones_like(energy)
     exists = (energy > 0) & (weight > 0)
-    for _ in range(BALANCING):
+
+    def better(scale: Array, _: None) -> tuple[Array, None]:
         ratio = safe_div(energy, at_least(scattered(scale), 1e-3 * energy))
-        scale = jnp.where(exists, scale * jnp.sqrt(jnp.where(exists, ratio, 1.0)), 1.0)
+        return jnp.where(exists, scale * jnp.sqrt(jnp.where(exists, ratio, 1.0)), 1.0), None
+
+    scale, _ = jax.lax.scan(better, jnp.ones_like(energy), None, length=BALANCING)
     return scale, jnp.where(exists, energy - scattered(scale), 0.0)
 
 
