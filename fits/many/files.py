@@ -97,8 +97,7 @@ def fit_files(
         search: look for the stack behind each file as well; a `Searching` says how.
         format, quantity, bins, strata: see `fits.read`, of all files.
         mask_retro, mask_grazing, only, hold_out: see `fits.data.reading.Reading`.
-        objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: in place of that of the
-            files.
+        objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
         progress: called with ("fits", done, all, file and stack).
@@ -115,13 +114,20 @@ def fit_files(
     searching = Searching(seed=seed) if search is True else search or None
     out = Path(out)
     job = Job(out.absolute(), given, searching, reading, objective, starts, seed, solver, force, reports)
-    if not job.names():
-        raise ValueError("no stack is given, nor a search asked for; there must be one of them")
-    if not given and (objective is not None or solver != "least_squares"):
-        name, value = ("solver", solver) if objective is None else ("objective", objective)
-        raise ValueError(f"{name} is {value!r} and no stack is given; searches compare likelihoods, by least squares")
+    _require_use(job)
     with _held(out):
         return _carried_out(job, _Plan.of(job, out, found, here=client is None), left_out, processes, client, progress)
+
+
+def _require_use(job: Job) -> None:
+    """ValueError where there is nothing to fit, or what is said of fits is said of none."""
+    if not job.names():
+        raise ValueError("no stack is given, nor a search asked for; there must be one of them")
+    for name, usual in (("objective", None), ("solver", "least_squares")):
+        if not job.stacks and getattr(job, name) != usual:
+            raise ValueError(
+                f"{name} is {getattr(job, name)!r} and no stack is given; a search fits likelihoods, by least squares"
+            )
 
 
 def _carried_out(
