@@ -1,10 +1,9 @@
 """A process for every program: they compile side by side, and are measured one after the other.
 
-To trace the larger programs takes Python a minute, which threads of one process would take one after the other.
+Threads of one process would trace them one after the other, under Python's lock.
 """
 
 import multiprocessing
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -27,12 +26,11 @@ LONG = 1.0
 
 @dataclass(frozen=True)
 class Measured:
-    """Seconds of a run and to compile, on the device and on the processor, and how far what they find is apart."""
+    """Seconds of a run on the device and on the processor, to compile for the device, and how far results are apart."""
 
     seconds: float
     seconds_on_processor: float
     compile_seconds: float
-    compile_seconds_on_processor: float
     apart: float
 
 
@@ -84,15 +82,14 @@ def _work(pipe: Connection, task: Task, rounds: int) -> None:
         _run(place, work, given, rounds) for place, (work, given, _) in zip(places, compiled, strict=True)
     )
     apart = max(map(_apart, here, there))
-    pipe.send(Measured(time_here, time_there, compiled[0][2], compiled[1][2], apart))
+    pipe.send(Measured(time_here, time_there, compiled[0][2], apart))
 
 
 def _compiled(task: Task, place: jax.Device) -> tuple[Callable[..., Any], tuple[Any, ...], float]:
     with jax.default_device(place):
         given = arguments(task)
-        began = time.perf_counter()
-        work = jax.jit(program(task)).lower(*given).compile()
-        return work, given, time.perf_counter() - began
+        work, seconds = timing.compiled(program(task), given)
+        return work, given, seconds
 
 
 def _run(

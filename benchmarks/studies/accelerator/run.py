@@ -13,6 +13,7 @@ from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from benchmarks.studies.accelerator.processes import FLOOR, LONG, Measured, measured
 from benchmarks.studies.accelerator.tasks import READINGS, TASKS, Task
+from fits.problem.compiled import cores
 
 NAME = "accelerator"
 
@@ -94,7 +95,7 @@ def study(
 
     if quick:
         tasks = [replace(task, items=max(1, task.items // 100)) for task in tasks]
-    together = together or len(os.sched_getaffinity(0))
+    together = together or cores()
     for first in range(0, len(tasks), together):
         measured(tasks[first : first + together], rounds, report, found)
     return written()
