@@ -49,6 +49,11 @@ def test_a_citation_of_no_known_paper_is_refused():
         list(papers.citations_in(Path("layerjax/channels.py"), '"""Sums (Eq. 3)."""'))
 
 
+def test_homes_of_papers_are_there():
+    lacking = [home for paper in papers.PAPERS for home in paper.homes if not any((ROOT / "layerjax").glob(home))]
+    assert not lacking
+
+
 @pytest.mark.parametrize("page", ["docs/errata.md", "docs/papers.md", "CONTRIBUTING.md"])
 def test_places_in_the_source_exist(page):
     lacking = [place for place in places((ROOT / page).read_text()) if not exists(*place)]

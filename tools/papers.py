@@ -92,7 +92,7 @@ PAPERS = (
         "Heitz",
         2016,
         "Heitz, Hanika, d'Eon & Dachsbacher 2016, *Multiple-Scattering Microfacet BSDFs with the Smith Model*",
-        ("microsurface/*", "transport/random_walk/*", "precompute/microsurface*", "precompute/shares*"),
+        ("microsurface/*", "transport/random_walk/*", "precompute/microsurface*"),
         'Interfaces and conductors with `microfacets="multiple"`.',
     ),
 )

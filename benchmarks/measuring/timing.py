@@ -2,12 +2,16 @@
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 Work = Callable[[], object]
+Result = TypeVar("Result")
+
+LONG = 1.0
+"""Seconds after which work is not repeated by `first_and_again`."""
 
 
 def interleaved(ways: Mapping[str, Work], rounds: int) -> dict[str, np.ndarray]:
@@ -30,6 +34,16 @@ def once(work: Work) -> float:
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
+
+
+def first_and_again(work: Callable[[], Result], rounds: int) -> tuple[Result, float, float]:
+    """What the work gives, seconds of its first run, and the median of later ones (one, if it takes `LONG`)."""
+    found: list[Result] = []
+    first = once(lambda: found.append(work()))
+    again = [once(work)]
+    while len(again) < rounds and sum(again) < LONG:
+        again.append(once(work))
+    return found[0], first, float(np.median(again))
 
 
 def compiled(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[Any, float]:

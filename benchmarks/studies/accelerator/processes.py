@@ -20,9 +20,6 @@ from benchmarks.studies.accelerator.tasks import Task, arguments, program
 FLOOR = 1e-3
 """Share of the largest value below which differences are relative to that share."""
 
-LONG = 1.0
-"""Seconds of a run that is not repeated."""
-
 
 @dataclass(frozen=True)
 class Measured:
@@ -97,12 +94,8 @@ def _run(
 ) -> tuple[list[np.ndarray], float]:
     """What a program finds, and the median time of the runs after the first."""
     with jax.default_device(place):
-        run = timing.waiting(work, given)
-        found = [np.asarray(leaf) for leaf in jax.tree.leaves(run())]
-        seconds = [timing.once(run)]
-        while len(seconds) < rounds and sum(seconds) < LONG:
-            seconds.append(timing.once(run))
-    return found, float(np.median(seconds))
+        found, _, seconds = timing.first_and_again(timing.waiting(work, given), rounds)
+        return [np.asarray(leaf) for leaf in jax.tree.leaves(found)], seconds
 
 
 def _apart(here: np.ndarray, there: np.ndarray) -> float:

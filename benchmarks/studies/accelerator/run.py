@@ -9,9 +9,9 @@ from typing import Any
 
 import jax
 
-from benchmarks.measuring import environment
+from benchmarks.measuring import environment, timing
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
-from benchmarks.studies.accelerator.processes import FLOOR, LONG, Measured, measured
+from benchmarks.studies.accelerator.processes import FLOOR, Measured, measured
 from benchmarks.studies.accelerator.tasks import READINGS, TASKS, Task
 from fits.problem.compiled import cores
 
@@ -78,7 +78,7 @@ def study(
             environment=environment_lines(surroundings),
             device=device,
             rounds=rounds,
-            long=LONG,
+            long=timing.LONG,
             readings=READINGS,
             floor=FLOOR,
             rows=table(HEADER, [_cells(row) for row in rows.values()]),

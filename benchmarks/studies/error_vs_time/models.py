@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,8 +17,6 @@ from benchmarks.measuring.accuracy import relative_l2, scale, worst
 from benchmarks.studies.error_vs_time.truth import Truth, albedos, key_of
 from benchmarks.suite.cases import Case, Directions
 from layerjax.stack import simplify, simplify_and_name
-
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -190,8 +188,8 @@ def _prepared(case: Case, model: Model, label: str, transport: lj.Transport, siz
     def evaluate() -> jax.Array:
         return jax.block_until_ready(lj.evaluate(prepared, wi, wo, key=key))
 
-    prepared, preparing, prepare_seconds = _first_and_again(prepare, size.rounds)
-    values, evaluating, seconds = _first_and_again(evaluate, size.rounds)
+    prepared, preparing, prepare_seconds = timing.first_and_again(prepare, size.rounds)
+    values, evaluating, seconds = timing.first_and_again(evaluate, size.rounds)
     compiling = max(preparing - prepare_seconds, 0.0) + max(evaluating - seconds, 0.0)
     compile_seconds, counted = programs.of(
         _structure(case.stack, label, model.name, len(turns)), compiling, lambda: _operations(prepared, wi, wo, key)
@@ -218,8 +216,8 @@ def _called(case: Case, model: Model, label: str, transport: lj.Transport, size:
     def call(wi: NDArray[np.float64], wo: NDArray[np.float64]) -> jax.Array:
         return jax.block_until_ready(lj.evaluate(case.stack, wi, wo, transport))
 
-    values, calling, few = _first_and_again(lambda: call(directions.wi, directions.wo), size.rounds)
-    _, _, many = _first_and_again(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
+    values, calling, few = timing.first_and_again(lambda: call(directions.wi, directions.wo), size.rounds)
+    _, _, many = timing.first_and_again(lambda: call(directions.wi[turns], directions.wo[turns]), size.rounds)
     arrays, others = eqx.partition(case.stack, eqx.is_array_like)
     compile_seconds, counted = programs.of(
         _structure(case.stack, label, model.name, len(indices)),
@@ -271,16 +269,6 @@ def row(case: Case, run: Run, truth: Truth, limit: float) -> Row:
         operations=run.operations,
         truth_limits=l2 is not None and l2 <= limit,
     )
-
-
-def _first_and_again(work: Callable[[], Result], rounds: int) -> tuple[Result, float, float]:
-    """What the work gives, seconds of its first run, and the median of later ones (one, if it takes a second)."""
-    found: list[Result] = []
-    first = timing.once(lambda: found.append(work()))
-    again = [timing.once(work)]
-    while len(again) < rounds and sum(again) < 1.0:
-        again.append(timing.once(work))
-    return found[0], first, float(np.median(again))
 
 
 def _operations(prepared: lj.Prepared, wi: jax.Array, wo: jax.Array, key: jax.Array | None) -> int:

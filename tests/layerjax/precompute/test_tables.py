@@ -11,6 +11,7 @@ from layerjax import tables
 from layerjax.microsurface.directional_albedo import first_event, first_mirror
 from layerjax.microsurface.multiple_bounces import conductor_basis, interface_bases
 from layerjax.precompute import NAMES, microsurface
+from layerjax.precompute import __main__ as command
 from layerjax.tables import load
 
 FOLDER = Path(tables.__file__).parent
@@ -22,6 +23,35 @@ def test_tables_are_small_and_have_makers():
     assert all(callable(import_module(f"layerjax.precompute.{name}").make) for name in NAMES)
     assert sum(path.stat().st_size for path in shipped) < 4e6
     assert (FOLDER / "microsurface.npz").stat().st_size < 2e5
+
+
+def test_a_table_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = command.write(tmp_path / "new", "energies", {"values": np.arange(3.0)})
+
+    def full(file, **table):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space"):
+        command.write(path.parent, "energies", {"values": np.arange(4.0)})
+    assert list(path.parent.iterdir()) == [path]
+    assert np.load(path)["values"].tolist() == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["energies", "--coarse"], "--coarse needs --out"),
+        (["energies", "--out", "x", "--work", "y"], "--work is of spongecake alone, not of energies"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(options, told, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["precompute", *options])
+    with pytest.raises(SystemExit) as refused:
+        command.main()
+    assert refused.value.code == 2
+    assert told in capsys.readouterr().err
 
 
 @pytest.mark.slow
