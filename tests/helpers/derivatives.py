@@ -67,6 +67,9 @@ UNBOUNDED = {
 """Ends at which no difference converges: derivatives are finite there, and the same in both modes."""
 
 
+NOTHING = 1e-20
+"""Values, 1/sr, that are as good as 0: what is left of a base under an optical depth of 1e4 is rounding."""
+
 JUMP, SHORT = 1e-6, 1e-5
 """By how much of themselves values may jump at equal indices, where tables end; seen with steps that are not short."""
 
@@ -217,7 +220,7 @@ def agrees(derivative, value, vector, point):
     sides = point.sides if point.kinked or len(point.sides) == 1 else (0,)
     # where values and slopes are 0, such as at an index of 1, what they are away from there
     away = np.max([np.abs(at(side * 1e-2 * point.length)) for side in point.sides], axis=0)
-    scale = np.abs(middle).max() + np.abs(derivative).max() + away
+    scale = np.abs(middle).max() + np.abs(derivative).max() + away + NOTHING
     for step in steps:
         slopes, errors = [], []
         for side in sides:

@@ -47,13 +47,23 @@ TIED = {("two coats on paint", "layers[1].alpha", 1.0)}
 """Where ends of integrals coincide, and which of them moves depends on rounding: modes agree less well."""
 
 JITTERY = {
-    ("Statistical", "two coats on paint"),
+    ("Statistical", "varnish"),
+    ("Statistical", "dyed varnish"),
     ("Statistical", "hazy varnish"),
+    ("Statistical", "two coats on paint"),
+    ("Statistical", "hazy coat on metal"),
+    ("Statistical", "plate"),
+    ("Statistical", "clear plate"),
     ("Statistical, forward", "hazy varnish"),
     ("Statistical, forward", "plate"),
 }
-"""At equal indices caps of facets coincide: values jitter there by 3e-4 under two coats and 2e-5 under haze, or step by
-2e-5 times the root of what the indices differ by, and no difference converges to the derivative."""
+"""At equal indices caps of facets coincide, and tables go by a cube root: values jitter there by 3e-3 of the brightest
+under a dyed varnish, by 3e-4 under two coats and 5e-5 elsewhere, or step by 2e-5 times the root of what the indices
+differ by, and no difference converges to the derivative. How far values may leap there is tested in its stead."""
+
+JITTER, NEAR = 5e-3, 1e-6
+"""What energies of `Statistical` may be off by, as a share of the brightest value; and a step of the index that is so
+small that all that values change by in it is a leap."""
 
 QUICK = {
     ("SingleScattering", "haze over metal"),
@@ -79,10 +89,7 @@ RANDOMLY = ("AddingDoubling",)
 def carried():
     for name, transport in TRANSPORTS.items():
         for kind in SOME.get(name, STACKS):
-            stack = STACKS[kind]
-            try:
-                transport.check(*simplify_and_name(stack))
-            except ValueError:
+            if not is_carried(transport, STACKS[kind]):
                 continue
             slow = () if (name, kind) in QUICK else pytest.mark.slow
             yield pytest.param(name, kind, marks=slow, id=f"{name}: {kind}")
@@ -158,6 +165,25 @@ def wrong_in_single(slopes, vector, point, drawn, compared):
         yield f"in single precision off by {off:.2g} of {size:.2g}"
 
 
+def leaps(slopes, vector, point):
+    """Where values leap about an index that equals another."""
+    here = np.asarray(slopes.values(vector))
+    for side in point.sides:
+        there = np.asarray(slopes.values(vector.at[point.place].add(side * NEAR)))
+        leap = np.abs(there - here).max() / np.abs(here).max()
+        if leap > JITTER:
+            yield f"values leap by {leap:.2g} of the brightest"
+
+
+def is_carried(transport, stack):
+    """Whether a stack is not refused, known as it is: `Statistical` takes steps of the index up to 4."""
+    try:
+        transport.check(*simplify_and_name(stack))
+    except ValueError:
+        return False
+    return True
+
+
 def unit(vector, point):
     return jnp.zeros_like(vector).at[point.place].set(1.0)
 
@@ -172,12 +198,14 @@ def test_derivatives(name, kind):
     comparable = not (faces and name.startswith(ILL_CONDITIONED))
     widths = [field.place for field in fields_of(stack, fixed) if field.path.endswith("alpha")]
     points = [(start.at[point.place].set(point.value), point) for point in points_of(stack, fixed)]
+    points = [(vector, point) for vector, point in points if is_carried(TRANSPORTS[name], build(vector))]
     drawn = list(random_points(stack, fixed)) if name in RANDOMLY else []
     wrong = []
     for number, (vector, point) in enumerate(points + drawn):
         same = 1e-3 if (kind, point.name, point.value) in TIED else 1e-6
-        smooth = not point.unbounded and not (point.kinked and (name, kind) in JITTERY)
-        found = list(wrong_in_double(slopes, vector, point, same, smooth))
+        jittery = point.kinked and (name, kind) in JITTERY
+        found = list(wrong_in_double(slopes, vector, point, same, not (point.unbounded or jittery)))
+        found += leaps(slopes, vector, point) if jittery else []
         # the programs of single precision take as long to compile
         if (name, kind) != ("AddingDoubling", "haze over paint") and "not finite" not in found:
             is_drawn = number >= len(points)
