@@ -99,16 +99,20 @@ def parameter(
 
 
 def floating(name: str, value: Any) -> jax.Array:
-    """The value as an array of the default floating type, or of its own if it is a floating JAX array."""
+    """The value as an array of the default floating type, or of its own if it is a floating JAX array.
+
+    A plain number stays one under ``jit``, where it would be traced like all else: what is known of it still counts.
+    """
     if isinstance(value, str | bytes | bool | None):
         raise ValueError(f"{name}: {value!r} is not a number")
     try:
-        array = jnp.asarray(value)
-        if not jnp.issubdtype(array.dtype, jnp.floating):
-            if not jnp.issubdtype(array.dtype, jnp.integer):
-                raise TypeError
-            array = array.astype(jnp.result_type(float))
-        return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
+        with jax.ensure_compile_time_eval():
+            array = jnp.asarray(value)
+            if not jnp.issubdtype(array.dtype, jnp.floating):
+                if not jnp.issubdtype(array.dtype, jnp.integer):
+                    raise TypeError
+                array = array.astype(jnp.result_type(float))
+            return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name}: {value!r:.60} is not a number or an array of real numbers") from None
 

@@ -35,9 +35,10 @@ def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
 
     `theta` and `phi` broadcast; the result has shape ``broadcast(theta, phi) + (3,)``. theta > pi/2 points below.
     """
-    theta, phi = jnp.broadcast_arrays(floating("theta", theta), floating("phi", phi))
-    sin_theta = jnp.sin(theta)
-    return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
+    with jax.ensure_compile_time_eval():  # known angles give known directions, under jit too
+        theta, phi = jnp.broadcast_arrays(floating("theta", theta), floating("phi", phi))
+        sin_theta = jnp.sin(theta)
+        return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:

@@ -23,6 +23,7 @@ from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture
+from layerjax.numerical_error import neighbours, numerical_error
 from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
@@ -99,10 +100,11 @@ def evaluate_with_error(
     """BSDF as `evaluate` gives it, and an estimate of its error, of the same shape.
 
     For `RandomWalk` (which needs a `key`) that is the standard error of each value; for a transport of finite
-    resolution the distance to its value at the next coarser one, for which the stack itself must be given.
+    resolution the distance to its values at the next coarser and finer one, for which the stack itself must be
+    given: no less, relative to the value, than at neighbouring pairs of directions, and with what was cut off below 0.
 
     Raises:
-        ValueError: the transport has neither, or a prepared stack is given to one that needs a second resolution.
+        ValueError: the transport has neither, or a prepared stack is given to one that needs other resolutions.
     """
     _check_side(side)
     wi, wo = read_directions(wi=wi, wo=wo)
@@ -110,13 +112,14 @@ def evaluate_with_error(
         require_single(stack, "evaluate_with_error")
     if isinstance(stack, Mixture):
         return _mixed_with_error(stack, wi, wo, transport, side, key)
-    known = cache(partial(known_directions, wi, wo))
+    around = neighbours(wi, wo)
+    known = cache(partial(known_directions, *around))
     prepared = prepared_at(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
-    other = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
+    others = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
+    if others is not None:
+        return numerical_error(prepared, in_precision(others, wi.dtype), *around, side)
     values, errors = _evaluate(prepared, wi, wo, side, key)
-    if other is not None:
-        errors = jnp.abs(values - evaluate(other, wi, wo, side=side))
     assert errors is not None
     return values, errors
 
@@ -316,14 +319,12 @@ def _check_side(side: Side) -> None:
         raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
-def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> Prepared | None:
-    """The stack prepared for the transport that errors are told by; None, if it knows them itself."""
-    other = transport.compared()
-    if other is None:
+def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> list[Prepared] | None:
+    """The stack prepared for the transports that errors are told by; None, if it knows them itself."""
+    others = transport.compared()
+    if others is None:
         return None
     if isinstance(stack, Prepared):
         name = type(transport).__name__
-        raise ValueError(
-            f"stack: {name} estimates its error at a second resolution and needs the Stack, not a Prepared"
-        )
-    return prepare_at(stack, other, known)
+        raise ValueError(f"stack: {name} estimates its error at other resolutions and needs the Stack, not a Prepared")
+    return [prepare_at(stack, other, known) for other in others]

@@ -79,7 +79,7 @@ class Material:
         self.colours = 1 if "_mono" in mi.variant() else 3
         if stack.channels not in (1, self.colours):
             raise ValueError(f"mitsuba: the stack has {stack.channels} channels, {mi.variant()} takes {self.colours}")
-        self.transport = choose_transport(stack, transport)
+        self.transport = choose_transport(stack, transport=transport)
         self.numbers = {name: _array(name, leaf) for name, leaf in leaves_with_names(stack)}
         self.is_random = self.transport.random
         self._take(stack)

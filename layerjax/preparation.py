@@ -7,15 +7,17 @@ from typing import Any, Literal, overload
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
+from layerjax.directions import read_directions
 from layerjax.mixture import Mixture, stacks_of
 from layerjax.stack import Stack, require_numbers, simplify_and_name
 from layerjax.transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
 from layerjax.transport.automatic import automatic
-from layerjax.transport.known_directions import Known, KnownDirections
+from layerjax.transport.known_directions import Known, KnownDirections, known_directions
 
 
 class Prepared(eqx.Module):
@@ -49,19 +51,34 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
 
 
 def choose_transport(
-    stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto", *, known: KnownDirections | None = None
+    stack: Stack | Mixture,
+    wi: ArrayLike | None = None,
+    wo: ArrayLike | None = None,
+    transport: Transport | Literal["auto"] = "auto",
 ) -> Transport:
     """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
+
+    Called outside of ``jit`` and given inside, it buys speed: there numbers are not known, and lobes count as narrow.
+
+        transport = lj.choose_transport(stack, wi, wo)
+        fast = jax.jit(lambda stack: lj.evaluate(stack, wi, wo, transport))
 
     Args:
         stack: the layered material. What is traced in it counts as not known. Of a mixture `evaluate` chooses for each
             part; here that which carries all of them, as fine as the part needs that needs most.
+        wi, wo: directions of `evaluate`, as there. Left out: they are many, or not known.
         transport: see `prepare`.
-        known: what `known_directions` says of the directions of `evaluate`; None: they are many, or not known.
 
     Raises:
         ValueError: as `prepare`.
     """
+    if wi is None or wo is None:
+        return transport_for(stack, transport, None)
+    return transport_for(stack, transport, known_directions(*read_directions(wi=wi, wo=wo)))
+
+
+def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
+    """`choose_transport` for directions of which this is known; None: they are many, or not known."""
     found = [chosen_for(part, transport, lambda: known)[0] for part in stacks_of(stack)]
     solvers = [one for one in found if isinstance(one, AddingDoubling)]
     return _finest(solvers) if solvers else found[0]

@@ -5,7 +5,9 @@ from the data. At the optimum it is compared with finer ones, by values alone, u
 One that is given is compared with a finer one, and stays.
 """
 
+import warnings
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +18,8 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.problem import Problem
 from layerjax.mixture import stacks_of
-from layerjax.transport.adding_doubling.resolution import FINEST, LADDER, ORDINATES_LADDER, is_tilted
+from layerjax.preparation import transport_for
+from layerjax.transport.adding_doubling.resolution import is_tilted
 
 ENOUGH = 0.1
 """Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
@@ -24,7 +27,7 @@ ENOUGH = 0.1
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
 """The finest resolution of starts: what is finer costs more than it tells far away from the data."""
 
-FINEST_NODES, FINEST_MODES, FINEST_COSINES = FINEST[0], LADDER[-1][1], ORDINATES_LADDER[-1][0]
+FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16
 """What is chosen at most."""
 
 LEAST_SCATTER = 0.01
@@ -116,17 +119,24 @@ def resolutions(problem: Problem) -> Resolutions | None:
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
         layers = [layer for part in stacks_of(stack) for layer in part.layers]
-        return lj.choose_transport(stack, transport, known=directions), any(map(is_tilted, layers))
+        return _chosen(stack, transport, directions), any(map(is_tilted, layers))
 
     start = jnp.asarray(problem.start)
     kind, tilted = eqx.filter_eval_shape(traced, start)
     if not isinstance(kind, lj.AddingDoubling) or kind.orders == "first":
         return None
     given = replace(kind, nodes=None, modes=None, ordinates=None) if isinstance(transport, str) else transport
-    chosen = lj.choose_transport(model.build(start).stack, given, known=directions)
+    chosen = _chosen(model.build(start).stack, given, directions)
     assert isinstance(given, lj.AddingDoubling)
     assert isinstance(chosen, lj.AddingDoubling)
     return Resolutions(given, chosen, tilted)
+
+
+def _chosen(stack: Any, transport: Any, directions: Any) -> lj.Transport:
+    """A fit tells the error that is left by itself."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lj.ResolutionWarning)
+        return transport_for(stack, transport, directions)
 
 
 def at_start(problem: Problem) -> Problem:

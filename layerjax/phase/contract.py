@@ -83,7 +83,7 @@ class PhaseFunction(Shown):
     def onward_width(self) -> Parameter:
         """About the angle, in radians and up to 1, within which a peak that goes straight on falls off.
 
-        It counts where one looks through the medium, beside `width`; 1 where it is not known while tracing.
+        It counts where one looks through the medium, beside `width`.
         """
         return 1.0
 

@@ -1,14 +1,17 @@
 """The phase function of Henyey & Greenstein (1941): haze, pigment and tissue."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._known import known_values
 from layerjax._parameters import Parameter, parameter
 from layerjax.directions import Vector, add, combine, dot
 from layerjax.phase.contract import PhaseFunction, deflected
 from layerjax.quadrature import Rule, henyey_greenstein_inverse, henyey_greenstein_rule
+
+ASSUMED_PEAK = 0.9
+"""|g| of a peak on either side, where nothing is known while tracing."""
 
 
 class HenyeyGreenstein(PhaseFunction):
@@ -64,7 +67,6 @@ class HenyeyGreenstein(PhaseFunction):
 
 def _width(g: Parameter, side: float) -> Parameter:
     """Of the peak on the side that the sign tells: where p has fallen to about a third."""
-    if isinstance(g, jax.core.Tracer):
-        return 1.0
-    peaked = np.maximum(side * np.asarray(g), 1e-9)
+    values = known_values(g)
+    peaked = np.maximum(ASSUMED_PEAK if values is None else side * values, 1e-9)
     return np.minimum((1.0 - peaked) / np.sqrt(peaked), 1.0)

@@ -88,14 +88,18 @@ class Transport(eqx.Module):
         """The key; None, if it draws nothing. If one is missing, a ValueError for the public function of that name."""
 
     @abc.abstractmethod
-    def compared(self) -> "Transport | None":
-        """The transport that errors are told by; None, if `measured` knows them. If there is neither, a ValueError."""
+    def compared(self) -> "Sequence[Transport] | None":
+        """Transports that errors are told by; None, if `measured` knows them. If there is neither, a ValueError."""
 
     @abc.abstractmethod
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, Array | None]:
         """Values ``(..., C)`` of the BSDF in 1/sr, without the cosine, and their errors; None: it knows of none."""
+
+    def doubt(self, state: Any, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
+        """Error of values ``(..., C)`` in which all resolutions may agree, as where they are cut off below 0."""
+        return 0.0
 
     @abc.abstractmethod
     def drawn(self, state: Any, wi: Array, channels: int, key: Array) -> tuple[Array, Array, Array]:
@@ -140,12 +144,12 @@ class DeterministicTransport(Transport):
     def needed(self, key: Array | None, function: str) -> None:
         return None
 
-    def compared(self) -> Transport:
+    def compared(self) -> "Sequence[Transport]":
         coarser = self.coarser()
         if coarser is None:
             name = type(self).__name__
             raise ValueError(f"transport: {name} has no resolution to vary and no standard error: evaluate_with_error")
-        return coarser
+        return [coarser]
 
     def measured(
         self, state: Any, wi: Array, wo: Array, side: Side, channels: int, key: Array | None

@@ -89,7 +89,7 @@ def program(task: Task) -> Callable[..., Any]:
     key = jax.random.key(1) if transport.random else None
     if not transport.random:
         concrete = build({name: values[0] for name, values in _maps(task, 1).items()})
-        transport = lj.choose_transport(concrete, transport)  # before its numbers are traced
+        transport = lj.choose_transport(concrete, transport=transport)  # before its numbers are traced
 
     def values(maps: dict[str, Array], wi: Array, wo: Array) -> Array:
         return lj.evaluate(build(maps), wi, wo, transport, side="reflection", key=key)

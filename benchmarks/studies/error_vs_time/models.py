@@ -224,7 +224,10 @@ def _called(case: Case, model: Model, label: str, transport: lj.Transport, size:
         calling - few,
         lambda: operations.total(
             lambda arrays: lj.evaluate(
-                eqx.combine(arrays, others), directions.wi, directions.wo, lj.choose_transport(case.stack, transport)
+                eqx.combine(arrays, others),
+                directions.wi,
+                directions.wo,
+                lj.choose_transport(case.stack, transport=transport),
             ),
             arrays,
         ),

@@ -210,7 +210,7 @@ def reference(stack: lj.Stack, directions: Directions, transport: lj.Transport) 
     """The truth for a stack, with the error estimate of two resolutions."""
     values, uncertainty = lj.evaluate_with_error(stack, directions.wi, directions.wo, transport)
     albedo = albedos(stack, directions, transport)
-    coarser = lj.choose_transport(stack, transport).coarser()
+    coarser = lj.choose_transport(stack, transport=transport).coarser()
     other = albedo if coarser is None else albedos(stack, directions, coarser)
     return Truth(np.asarray(values), np.asarray(uncertainty), albedo, float(np.max(np.abs(albedo - other))))
 

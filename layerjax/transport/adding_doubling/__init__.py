@@ -7,3 +7,4 @@ In goes any stack; out come BSDF values to the accuracy of the grid, without noi
 """
 
 from layerjax.transport.adding_doubling.transport import AddingDoubling as AddingDoubling
+from layerjax.transport.adding_doubling.transport import ResolutionWarning as ResolutionWarning

@@ -4,26 +4,33 @@ Light that an interface lets in, a medium scatters and a base reflects is smooth
 scatters widely. What nodes and modes must resolve are narrow lobes behind the first interface, each by itself: nodes go
 with one over the width of the narrowest in elevation, modes in azimuth, which is steeper the more the light inside is
 inclined (a lower index lets it in closer to grazing).
+
+What is traced has no numbers to go by. Under `grad` and `vmap` alone they are still read (`known_values`), so that
+these solve what a plain call solves. Under ``jit`` a lobe counts as `ASSUMED_WIDTH` wide: right for what is wider, at
+the cost of what is as narrow. `choose_transport` outside of ``jit`` knows better.
 """
 
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
+from layerjax._known import known_values
 from layerjax.stack import Interface, Medium, Stack, TurbidMedium, is_known
 from layerjax.surfaces import Conductor
 
-LADDER = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96))
+LADDER = ((6, 8), (8, 12), (12, 16), (16, 24), (24, 32), (32, 48), (48, 64), (64, 96), (96, 128), (128, 192))
 """Resolutions (nodes, modes) that are chosen from, and that a tolerance climbs."""
 
-ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28))
+ORDINATES_LADDER = ((6, 8), (8, 12), (10, 16), (12, 20), (14, 24), (16, 28), (20, 36), (24, 44))
 """Ordinates (cosines, azimuths) that are chosen from, and that a tolerance climbs."""
 
-FINEST = (48, 64)
-"""What is chosen without a tolerance, at most: more takes minutes and gigabytes."""
+MOST_NUMBERS, MOST_OF_ORDINATES = 6e6, 2.2e6
+"""In an operator of what is chosen without a tolerance, at most: more takes minutes and gigabytes."""
+
+SHORT = 1.25
+"""By this much less than what is expected to be needed is told to the user."""
 
 FOLLOWED, READ = LADDER[0], LADDER[2]
 """At least: where light is followed along known directions, and where values are read off tables."""
@@ -36,7 +43,7 @@ alpha 0.3, 12 nodes and 32 modes, 9e-4; index 1.5, alpha 0.3, 8 and 16, 7e-4, an
 1.8, alpha 0.15, 12 and 24, 1e-3. With a third less of either they are 3 to 20 times larger.
 """
 
-ASSUMED_WIDTH, ASSUMED_INDEX = 0.15, 1.5
+ASSUMED_WIDTH, ASSUMED_INDEX = 0.05, 1.5
 """Of lobes, and around them, where nothing is known while tracing."""
 
 NODES_AS_UNDER = 1.5
@@ -65,12 +72,6 @@ class Resolution(NamedTuple):
             (max(2, 3 * cosines // 4), max(4, 3 * azimuths // 8 * 2)),
         )
 
-    def another(self) -> "Resolution":
-        """The coarser one; of what cannot be coarser, the finer."""
-        coarse, fine = self.coarser(), self.finer()
-        upright = fine if coarse[:2] == self[:2] else coarse
-        return upright._replace(ordinates=(fine if coarse.ordinates == self.ordinates else coarse).ordinates)
-
     def finer(self) -> "Resolution":
         """About four thirds of it: small steps, as the work grows with a power above the second."""
         cosines, azimuths = self.ordinates
@@ -83,29 +84,56 @@ def modes_for(nodes: int) -> int:
 
 
 def chosen(stack: Stack, followed: bool) -> Resolution:
-    """The coarsest resolution that is expected to give errors of 1e-3, up to `FINEST`.
+    """The coarsest resolution that is expected to give errors of 1e-3, as far as it fits into memory.
 
     Args:
         stack: a simplified stack; where it is traced, `ASSUMED_WIDTH` and `ASSUMED_INDEX` are taken.
         followed: whether light is followed along the directions asked for, so that nothing is read off tables.
     """
+    needed, panels = _needed(stack, followed), _panels(stack)
+    rungs = [
+        next((k for k, rung in enumerate(LADDER) if most <= rung[part]), len(LADDER) - 1)
+        for part, most in enumerate(needed)
+    ]
+    while max(rungs) and LADDER[rungs[1]][1] * (LADDER[rungs[0]][0] * panels) ** 2 > MOST_NUMBERS:
+        rungs[rungs[1] > rungs[0]] -= 1
+    place = next((k for k, rung in enumerate(ORDINATES_LADDER) if rung[0] >= needed[0]), len(ORDINATES_LADDER) - 1)
+    while place and (math.prod(ORDINATES_LADDER[place]) * panels) ** 2 > MOST_OF_ORDINATES:
+        place -= 1
+    return Resolution(LADDER[rungs[0]][0], LADDER[rungs[1]][1], ORDINATES_LADDER[place])
+
+
+def shortage(stack: Stack, followed: bool) -> str | None:
+    """What is chosen and what would be needed, in words, where that is clearly more; None where it is not."""
+    (nodes, modes), found = _needed(stack, followed), chosen(stack, followed)
+    if any(map(is_tilted, stack.layers)):
+        if nodes <= SHORT * found.ordinates[0]:
+            return None
+        return f"{found.ordinates[0]} x {found.ordinates[1]} ordinates, where about {nodes:.0f} cosines are needed"
+    if nodes <= SHORT * found.nodes and modes <= SHORT * found.modes:
+        return None
+    return f"{found.nodes} nodes and {found.modes} modes, where about {nodes:.0f} and {modes:.0f} are needed"
+
+
+def _needed(stack: Stack, followed: bool) -> tuple[float, float]:
+    """Nodes and modes."""
     nodes, modes = map(float, FOLLOWED if followed else READ)
     for width, index in (*_lobes(stack), *_refracted(stack)):
         if width >= 1.0:  # broad: smooth at any resolution
             continue
         nodes = max(nodes, NODES / (width * _inclined(index or NODES_AS_UNDER)))
         modes = max(modes, MODES / (width * _inclined(index or 1.0) * (index or 1.0)))
-    ordinates = next((rung for rung in ORDINATES_LADDER if rung[0] >= nodes), ORDINATES_LADDER[-1])
-    return Resolution(_at_least(nodes, 0), _at_least(modes, 1), ordinates)
+    return nodes, modes
+
+
+def _panels(stack: Stack) -> int:
+    """Of the grid, at most."""
+    return 1 + sum(isinstance(layer, Interface) for layer in stack.layers)
 
 
 def _inclined(index: float) -> float:
     """Cosine of the most inclined light that counts where the index is this one."""
     return max(LEAST_COSINE, math.sqrt(max(0.0, 1.0 - 1.0 / index**2)))
-
-
-def _at_least(needed: float, part: int) -> int:
-    return next((rung[part] for rung in LADDER if needed <= rung[part] < FINEST[part]), FINEST[part])
 
 
 def _lobes(stack: Stack) -> Iterator[tuple[float, float | None]]:
@@ -126,7 +154,7 @@ def _lobes(stack: Stack) -> Iterator[tuple[float, float | None]]:
 
 
 def _refracted(stack: Stack) -> Iterator[tuple[float, float | None]]:
-    """The same of what passes one interface to the next; nothing of those that are traced.
+    """The same of what passes one interface to the next.
 
     Light through interfaces is as narrow as facets deflect it. Through two of them alone it is known in closed form; on
     the grid a slab of alpha 0.14 and index 1.5 is off by 7e-2 at 24 nodes, by 1e-3 at 48.
@@ -134,20 +162,22 @@ def _refracted(stack: Stack) -> Iterator[tuple[float, float | None]]:
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     if stack.base is not None or len(faces) < 2 or (len(faces) == 2 and not any(map(is_tilted, stack.layers))):
         return
-    indices = [1.0, *(_least(face.ior, math.nan) for face in faces)]
+    indices = [1.0, *(_least(face.ior, ASSUMED_INDEX) for face in faces)]
+    known = [True, *(known_values(face.ior) is not None for face in faces)]
     for place, face in enumerate(faces):
-        alpha = _least(face.alpha, math.nan)
         for here, there in ((place, place + 1), (place + 1, place)):
-            if 0 < here < len(faces):  # between two of them
-                width = alpha * abs(1.0 - indices[there] / indices[here])
-                if width > 0.0:  # none is deflected at equal indices, and nothing is known of a traced one
-                    yield width, max(1.0, indices[here])
+            if not 0 < here < len(faces):  # between two of them
+                continue
+            width = _least(face.alpha, ASSUMED_WIDTH) * abs(1.0 - indices[there] / indices[here])
+            if not (known[here] and known[there]):
+                yield ASSUMED_WIDTH, max(1.0, indices[here])
+            elif width > 0.0:  # none is deflected at equal indices
+                yield width, max(1.0, indices[here])
 
 
 def _least(value: Any, assumed: float) -> float:
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
-        return assumed
-    return max(float(np.min(np.asarray(value))), 1e-4)
+    values = known_values(value)
+    return assumed if values is None else max(float(np.min(values)), 1e-4)
 
 
 def rungs(stack: Stack) -> Iterator[Resolution]:

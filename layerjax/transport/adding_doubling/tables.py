@@ -148,8 +148,8 @@ def _energy(flux: Operator, share: Channels | None, end: _End) -> Array:
     return safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))) @ lift.T
 
 
-def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
-    """BSDF of the paths with more than one event, never below 0."""
+def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side, sign: float = 1.0) -> Channels:
+    """BSDF of the paths with more than one event, never below 0; of sign -1 how far below it would be."""
     zero = jnp.zeros_like(wi[2] * wo[2])
     if tables.values is None or (tables.opaque and side == "transmission"):
         return (zero,)
@@ -179,7 +179,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         axes.append(_azimuth_points(into, out, tables.steps))
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
     found = look_up(tables.values, start, axes)
-    return tuple(factor * not_negative(value) for value in found)
+    return tuple(factor * not_negative(sign * value) for value in found)
 
 
 def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:

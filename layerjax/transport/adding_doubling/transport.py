@@ -8,6 +8,7 @@ rest is read off tables, or, where directions are known and the stack lets them,
 """
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, ClassVar, Literal, get_args
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._batching import in_chunks
 from layerjax._devices import exact_products
 from layerjax._numerics import safe_div
 from layerjax._shapes import channel_count, map_shape
@@ -28,7 +30,15 @@ from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
-from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, modes_for, rungs
+from layerjax.transport.adding_doubling.resolution import (
+    ORDINATES_LADDER,
+    Resolution,
+    chosen,
+    is_tilted,
+    modes_for,
+    rungs,
+    shortage,
+)
 from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
@@ -43,8 +53,15 @@ MOST = 1024
 """Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
 
 
+FACETS_ERROR = 6e-5
+"""Relative, of sums over the facets of interfaces at any resolution: up to three times that was seen."""
+
 PROBED = 8
 """Known cosines along which a tolerance is checked, at most."""
+
+
+class ResolutionWarning(UserWarning):
+    """A stack is solved less finely than an error of 1e-3 needs, as it would not fit into memory."""
 
 
 class Solved(eqx.Module):
@@ -73,8 +90,9 @@ class AddingDoubling(DeterministicTransport):
 
     Args:
         nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as
-            give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`):
-            roughnesses that are concrete count, of traced ones lobes of 0.15 are expected.
+            give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`).
+            Under `jit` no roughness is known, and lobes of 0.05 are expected: `choose_transport` outside of it knows
+            better, and what it returns costs less inside. A `ResolutionWarning` says where memory allows fewer.
         modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal. None: as many as
             suit the nodes.
         ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. None:
@@ -135,6 +153,14 @@ class AddingDoubling(DeterministicTransport):
                     "give nodes and modes"
                 )
             return self._climbed(stack, directions)
+        short = shortage(stack, directions is not None) if self._leaves_open(stack) else None
+        if short is not None:
+            warnings.warn(
+                f"AddingDoubling: the lobes of this stack are too narrow for an error of 1e-3: {short}; "
+                "evaluate_with_error tells the error, and nodes and modes can be given",
+                ResolutionWarning,
+                stacklevel=2,
+            )
         return self._at(self._resolution(stack, directions is not None))
 
     def prepare(self, stack: Stack) -> Solved:
@@ -164,6 +190,21 @@ class AddingDoubling(DeterministicTransport):
         values = total(parts, jnp.zeros_like(i[2] * o[2]))
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
+    def doubt(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
+        between, tables = state.between, state.tables
+        least = FACETS_ERROR if state.first.layered else 0.0
+
+        def found(wi: Vector, wo: Vector) -> Channels:
+            if between is not None:
+                signs = [read_between(between, wi, wo, side, sign) for sign in (1.0, -1.0)]
+            elif tables is not None:
+                signs = [read_rest(tables, wi, wo, side, sign) for sign in (1.0, -1.0)]
+            else:
+                return (jnp.zeros_like(wi[2] * wo[2]),) * channels
+            return tuple(least * pick(signs[0], c) + pick(signs[1], c) for c in range(channels))
+
+        return in_chunks(found, wi, wo)
+
     def coarser(self) -> "AddingDoubling":
         """This transport at about two thirds of the resolution, for an estimate of the error."""
         return self._at(self._given().coarser())
@@ -172,8 +213,8 @@ class AddingDoubling(DeterministicTransport):
         """This transport at about four thirds of the resolution."""
         return self._at(self._given().finer())
 
-    def compared(self) -> "AddingDoubling":
-        return self._at(self._given().another())
+    def compared(self) -> tuple["AddingDoubling", ...]:
+        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._given()))
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         parts: list[Channels] = []
@@ -228,6 +269,11 @@ class AddingDoubling(DeterministicTransport):
         nodes = by_stack.nodes if self.nodes is None else self.nodes
         modes = by_stack.modes if self.nodes is None else modes_for(self.nodes)
         return Resolution(nodes, self.modes or modes, self.ordinates or by_stack.ordinates)
+
+    def _leaves_open(self, stack: Stack) -> bool:
+        if any(map(is_tilted, stack.layers)):
+            return self.ordinates is None
+        return self.nodes is None
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
         return make_plan(stack, self._resolution(stack, known is not None), self.microfacets)

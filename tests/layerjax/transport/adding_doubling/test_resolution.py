@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADDER, Resolution, chosen, rungs
+from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, rungs
 
 FACE, PAINT = lj.Interface(1.5, 0.05), lj.Lambertian(0.5)
 HAZE = lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.9))
@@ -26,7 +26,7 @@ def flakes(alpha):
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 0.12)), True, 20),
         (lj.Stack([FACE, flakes(0.1)], PAINT), True, 24),
         (lj.Stack([FACE, lj.Medium(1.0, 0.0, lj.SGGX("surface", 0.1))], PAINT), True, 6),
-        (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, FINEST[0]),
+        (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, 96),
         (lj.Stack([lj.Interface(1.1, 0.05)], lj.Conductor(0.4, 3.0, 0.5)), True, 12),
         (lj.Stack([lj.Interface(1.1, 0.05), lj.Medium(1.0, 0.9)], PAINT), True, 6),
         (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 12),
@@ -63,10 +63,10 @@ def test_what_is_chosen_is_told_and_what_is_given_stays():
     told = lj.choose_transport(stack)
     assert (told.nodes, told.modes) == (12, 16)
     assert lj.prepare(stack).transport == told
-    assert lj.choose_transport(stack, lj.AddingDoubling(nodes=10)).modes == 15
-    assert lj.choose_transport(stack, lj.AddingDoubling(modes=10)).modes == 10
+    assert lj.choose_transport(stack, transport=lj.AddingDoubling(nodes=10)).modes == 15
+    assert lj.choose_transport(stack, transport=lj.AddingDoubling(modes=10)).modes == 10
     wi, wo = lj.direction([0.2, 0.3], 0.0), lj.direction(0.4, 1.0)
-    assert lj.choose_transport(stack, known=lj.known_directions(wi, wo)).nodes == 6
+    assert lj.choose_transport(stack, wi, wo).nodes == 6
     with pytest.raises(ValueError, match=r"AddingDoubling.nodes: none are given; choose_transport"):
         lj.AddingDoubling().finer()
 

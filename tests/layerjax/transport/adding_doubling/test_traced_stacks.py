@@ -1,0 +1,152 @@
+"""The default gives the same under `jit`, `grad` and `vmap` as without, and its slopes are right."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax._known import known_values
+from layerjax.phase import HenyeyGreenstein
+
+WI = lj.direction(np.radians(20.0), 0.0)
+WO = lj.direction(np.radians([3.0, 25.0, 50.0, 60.0, 75.0]), np.pi)
+TOLERANCE = 1e-3
+"""What is aimed at; relative to values and a tenth of their mean."""
+
+
+def uniform(low, high):
+    return lambda random: random.uniform(low, high)
+
+
+def logarithmic(low, high):
+    return lambda random: np.exp(random.uniform(np.log(low), np.log(high)))
+
+
+INDEX, ROUGH, DEPTH, ALBEDO, G = (
+    uniform(1.2, 1.9), logarithmic(0.05, 0.8), logarithmic(0.1, 8.0), uniform(0.3, 1.0), uniform(-0.5, 0.9),
+)  # fmt: skip
+INNER, METAL, PAINT = logarithmic(0.12, 0.8), (uniform(0.2, 2.0), uniform(1.5, 5.0)), uniform(0.1, 0.95)
+
+STRUCTURES = {
+    "coated metal": (
+        (INDEX, ROUGH, *METAL, INNER),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1])], lj.Conductor(p[2], p[3], p[4])),
+    ),
+    "varnish": ((INDEX, ROUGH, PAINT), lambda p: lj.Stack([lj.Interface(p[0], p[1])], lj.Lambertian(p[2]))),
+    "hazy coat": (
+        (INDEX, ROUGH, DEPTH, ALBEDO, G, PAINT),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], HenyeyGreenstein(p[4]))], lj.Lambertian(p[5])
+        ),
+    ),
+    "flakes in a coat": (
+        (INDEX, ROUGH, DEPTH, ALBEDO, INNER, PAINT),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], lj.SGGX("surface", p[4]))], lj.Lambertian(p[5])
+        ),
+    ),
+    "flakes": (
+        (DEPTH, ALBEDO, logarithmic(0.2, 0.8), PAINT),
+        lambda p: lj.Stack([lj.Medium(p[0], p[1], lj.SGGX("surface", p[2]))], lj.Lambertian(p[3])),
+    ),
+    "haze on metal": (
+        (DEPTH, ALBEDO, G, *METAL, INNER),
+        lambda p: lj.Stack([lj.Medium(p[0], p[1], HenyeyGreenstein(p[2]))], lj.Conductor(p[3], p[4], p[5])),
+    ),
+    "slab": (
+        (INDEX, logarithmic(0.2, 0.8), DEPTH, ALBEDO, G, logarithmic(0.2, 0.8)),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], HenyeyGreenstein(p[4])), lj.Interface(1.0, p[5])]
+        ),
+    ),
+}
+"""Name: how each number is drawn, and the stack of them."""
+
+
+def drawn(kind, seed):
+    random = np.random.default_rng([seed, len(kind)])
+    return jnp.asarray([draw(random) for draw in STRUCTURES[kind][0]])
+
+
+def assert_near(found, value, tolerance):
+    value = np.asarray(value)
+    assert np.max(np.abs(np.asarray(found) - value) / (value + 0.1 * value.mean())) < tolerance
+
+
+def test_a_coated_metal_under_jit():
+    """Values of a walk, with three of its standard errors at most."""
+
+    def stack(alpha):
+        return lj.Stack([lj.Interface(1.5, 0.05)], lj.Conductor(0.2, 3.5, alpha))
+
+    def values(alpha):
+        return lj.evaluate(stack(alpha), WI, WO)[:, 0]
+
+    alpha = jnp.asarray(0.05)
+    walked = np.array([0.661, 7.086, 0.1806, 0.0898, 0.0541])
+    plain, jitted = values(alpha), jax.jit(values)(alpha)
+    np.testing.assert_allclose(plain, walked, rtol=0.01)
+    assert_near(jitted, plain, TOLERANCE)
+    slope = jax.jit(jax.jacfwd(values))(alpha)
+    np.testing.assert_allclose(slope, [11.2, -140.0, 4.8, 2.7, 1.5], rtol=0.03, atol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", STRUCTURES)
+def test_transformations_keep_values(kind):
+    """Two hundred stacks: jitted, under `grad` and `vmap`."""
+    build = STRUCTURES[kind][1]
+
+    def values(numbers):
+        return lj.evaluate(build(numbers), WI, WO)[:, 0]
+
+    jitted = jax.jit(values)
+    for seed in range(29):
+        numbers = drawn(kind, seed)
+        plain = values(numbers)
+        assert_near(jitted(numbers), plain, 2.0 * TOLERANCE)
+        if seed < 4:
+            differentiated, slopes = jax.jvp(values, (numbers,), (jnp.ones_like(numbers),))
+            assert_near(differentiated, plain, 1e-9)
+            fine = lj.choose_transport(build(numbers), WI, WO).finer().finer()
+            exact = jax.jvp(
+                lambda numbers, fine=fine: lj.evaluate(build(numbers), WI, WO, fine)[:, 0],
+                (numbers,), (jnp.ones_like(numbers),),
+            )[1]  # fmt: skip
+            assert np.max(np.abs(slopes - exact) / (plain + 0.1 * plain.mean())) < 0.01
+    some = jnp.stack([drawn(kind, seed) for seed in range(2)])
+    for row, numbers in zip(jax.vmap(values)(some), some, strict=True):
+        assert_near(row, values(numbers), 2.0 * TOLERANCE)
+
+
+def test_what_is_known_under_transformations():
+    seen = []
+
+    def look(number):
+        seen.append(known_values(lj.Interface(1.5, number).alpha))
+        seen.append(known_values(lj.Interface(number, 0.25).alpha))
+        return number
+
+    jax.grad(look)(0.5)
+    jax.jacfwd(look)(0.5)
+    jax.vmap(look)(jnp.asarray([0.5, 0.75]))
+    jax.jit(look)(0.5)
+    jax.jit(jax.grad(look))(0.5)
+    numbers = [None if one is None else one.tolist() for one in seen]
+    assert numbers == [0.5, 0.25, 0.5, 0.25, [0.5, 0.75], 0.25, None, 0.25, None, 0.25]
+
+
+def test_directions_written_into_a_program_stay_known():
+    seen = []
+    jax.jit(lambda one: seen.append(known_values(lj.direction(0.5, 0.0))) or one)(1.0)
+    assert seen[0] is not None
+
+
+def test_too_narrow_a_lobe_is_told():
+    narrow = lj.Stack([lj.Interface(1.5, 0.01)], lj.Conductor(0.2, 3.5, 1e-3))
+    with pytest.warns(
+        lj.ResolutionWarning, match=r"too narrow for an error of 1e-3: .* nodes and .* modes, where about"
+    ):
+        lj.choose_transport(narrow, WI, WO)
+    assert lj.choose_transport(narrow, WI, WO, lj.AddingDoubling(nodes=6)).nodes == 6
