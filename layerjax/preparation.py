@@ -8,9 +8,11 @@ from typing import Any, Literal, overload
 import equinox as eqx
 import jax.numpy as jnp
 
+from layerjax import transport as transports
+from layerjax._checks import in_short
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
-from layerjax.mixture import Mixture, stacks_of
+from layerjax.mixture import Mixture, require_material, stacks_of
 from layerjax.stack import Stack, require_numbers, simplify_and_name
 from layerjax.transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
@@ -43,25 +45,29 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
+    require_material(stack)
     if isinstance(stack, Mixture):
         return stack.each(lambda part: part if isinstance(part, Prepared) else prepare(part, transport))
     return prepare_at(stack, transport, lambda: None)
 
 
-def choose_transport(
-    stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto", *, known: KnownDirections | None = None
-) -> Transport:
+def choose_transport(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Transport:
     """The transport that `evaluate` uses, with its resolution: what `"auto"` and `AddingDoubling` leave to the stack.
 
     Args:
         stack: the layered material. What is traced in it counts as not known. Of a mixture `evaluate` chooses for each
             part; here that which carries all of them, as fine as the part needs that needs most.
         transport: see `prepare`.
-        known: what `known_directions` says of the directions of `evaluate`; None: they are many, or not known.
 
     Raises:
         ValueError: as `prepare`.
     """
+    return transport_for(stack, transport, None)
+
+
+def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
+    """`choose_transport` for directions of which this is known; None: they are many, or not known."""
+    require_material(stack)
     found = [chosen_for(part, transport, lambda: known)[0] for part in stacks_of(stack)]
     solvers = [one for one in found if isinstance(one, AddingDoubling)]
     return _finest(solvers) if solvers else found[0]
@@ -86,11 +92,17 @@ def chosen_for(stack: Stack, transport: Any, known: Known) -> tuple[Transport, S
     """The transport with nothing left open, and the simplified stack."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
-    chosen = automatic(stack, simplified) if transport == "auto" else transport
+    chosen = automatic(stack, simplified) if isinstance(transport, str) and transport == "auto" else transport
     if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
+        raise ValueError(f'transport: {in_short(transport)} is not a Transport or "auto"{_meant(transport)}')
     chosen.check(simplified, names)
     return chosen.chosen_for(simplified, known), simplified
+
+
+def _meant(transport: object) -> str:
+    """The call that makes the transport which a class or a word names."""
+    named = getattr(transports, transport, None) if isinstance(transport, str) else transport
+    return f"; {named.__name__}() is one" if isinstance(named, type) and issubclass(named, Transport) else ""
 
 
 def _finest(found: Sequence[AddingDoubling]) -> AddingDoubling:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.problem.problem import Problem
 from layerjax.mixture import stacks_of
+from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import FINEST, LADDER, ORDINATES_LADDER, is_tilted
 
 ENOUGH = 0.1
@@ -116,14 +117,14 @@ def resolutions(problem: Problem) -> Resolutions | None:
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
         layers = [layer for part in stacks_of(stack) for layer in part.layers]
-        return lj.choose_transport(stack, transport, known=directions), any(map(is_tilted, layers))
+        return transport_for(stack, transport, directions), any(map(is_tilted, layers))
 
     start = jnp.asarray(problem.start)
     kind, tilted = eqx.filter_eval_shape(traced, start)
     if not isinstance(kind, lj.AddingDoubling) or kind.orders == "first":
         return None
     given = replace(kind, nodes=None, modes=None, ordinates=None) if isinstance(transport, str) else transport
-    chosen = lj.choose_transport(model.build(start).stack, given, known=directions)
+    chosen = transport_for(model.build(start).stack, given, directions)
     assert isinstance(given, lj.AddingDoubling)
     assert isinstance(chosen, lj.AddingDoubling)
     return Resolutions(given, chosen, tilted)

@@ -103,7 +103,8 @@ def fit_files(
         progress: called with ("fits", done, all, file and stack).
 
     Raises:
-        ValueError: no file can be read; no such file; names that are there twice; a result of another stack or of other
+        FileNotFoundError: no such file.
+        ValueError: no file can be read; names that are there twice; a result of another stack or of other
             settings, unless `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     reading = Reading(format, quantity, bins, strata, mask_retro, mask_grazing, tuple(only), tuple(hold_out))

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 import layerjax as lj
+from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import FINEST, ORDINATES_LADDER, Resolution, chosen, rungs
+from layerjax.transport.known_directions import known_directions
 
 FACE, PAINT = lj.Interface(1.5, 0.05), lj.Lambertian(0.5)
 HAZE = lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(0.9))
@@ -66,7 +68,7 @@ def test_what_is_chosen_is_told_and_what_is_given_stays():
     assert lj.choose_transport(stack, lj.AddingDoubling(nodes=10)).modes == 15
     assert lj.choose_transport(stack, lj.AddingDoubling(modes=10)).modes == 10
     wi, wo = lj.direction([0.2, 0.3], 0.0), lj.direction(0.4, 1.0)
-    assert lj.choose_transport(stack, known=lj.known_directions(wi, wo)).nodes == 6
+    assert transport_for(stack, "auto", known_directions(wi, wo)).nodes == 6
     with pytest.raises(ValueError, match=r"AddingDoubling.nodes: none are given; choose_transport"):
         lj.AddingDoubling().finer()
 
