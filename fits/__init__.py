@@ -5,7 +5,7 @@ Names are imported when they are first used: `import fits` loads neither arviz, 
 
 from typing import TYPE_CHECKING
 
-from fits._lazy import names_from
+from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.data.formats import read as read
@@ -134,3 +134,4 @@ _HOMES = {
 
 __all__ = list(_HOMES)
 __getattr__ = names_from(__name__, _HOMES)
+__dir__ = directory_of(__name__, _HOMES)

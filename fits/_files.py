@@ -1,5 +1,6 @@
 """Writing files whole or not at all, by one process at a time, and so that damage to them is seen."""
 
+import errno
 import json
 import math
 import os
@@ -19,11 +20,18 @@ os.umask(_UMASK)
 
 
 def require_file(path: Path) -> None:
-    """ValueError for what is no file: files are read more than once, which pipes are not."""
+    """FileNotFoundError if it is not there, ValueError if it is no file: pipes cannot be read more than once."""
+    require_there(path)
     if path.is_dir():
         raise ValueError(f"{path}: is a directory, must be a file")
     if not path.is_file():
-        raise ValueError(f"{path}: {'is a pipe or a device, must be a file' if path.exists() else 'no such file'}")
+        raise ValueError(f"{path}: is a pipe or a device, must be a file")
+
+
+def require_there(path: str | Path, what: str = "no such file") -> None:
+    """FileNotFoundError, which names it, if nothing is there."""
+    if not os.path.exists(path):
+        raise FileNotFoundError(errno.ENOENT, what, str(path))
 
 
 def write_text(path: str | Path, text: str, force: bool = False) -> None:

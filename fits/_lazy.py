@@ -1,6 +1,7 @@
 """Names of a package that are imported when they are first used, so that importing the package costs nothing."""
 
 import importlib
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,6 +15,11 @@ def names_from(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
         return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
 
     return found
+
+
+def directory_of(package: str, homes: Mapping[str, str]) -> Callable[[], list[str]]:
+    """The `__dir__` of a package: those names as well, so that they complete before they are imported."""
+    return lambda: sorted({*vars(sys.modules[package]), *homes})
 
 
 def shown_by(function: str, of: Any) -> Any:

@@ -34,8 +34,6 @@ from layerjax.transport import Statistical as Statistical
 from layerjax.transport import Transport as Transport
 from layerjax.transport import WeidlichWilkie as WeidlichWilkie
 from layerjax.transport.adding_doubling import ResolutionWarning as ResolutionWarning
-from layerjax.transport.known_directions import KnownDirections as KnownDirections
-from layerjax.transport.known_directions import known_directions as known_directions
 from layerjax.transport.random_walk.goniophotometer import Goniogram as Goniogram
 from layerjax.transport.random_walk.goniophotometer import goniophotometer as goniophotometer
 

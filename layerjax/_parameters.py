@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from layerjax._checks import in_short
+
 RANGES: dict[str, tuple[float, float]] = {
     "Interface.ior": (0.25, 4.0),
     "Interface.alpha": (1e-4, 1.0),
@@ -114,13 +116,20 @@ def floating(name: str, value: Any) -> jax.Array:
                 array = array.astype(jnp.result_type(float))
             return jax.lax.convert_element_type(array, array.dtype)  # drops the weak type: one program for all numbers
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{name}: {value!r:.60} is not a number or an array of real numbers") from None
+        raise ValueError(f"{name}: {in_short(value)} is not a number or an array of real numbers") from None
+
+
+def takes_several(name: str) -> bool:
+    """Whether a field of a single stack takes more than one number; a plain field of one's own counts channels."""
+    return name in PER_CHANNEL or name in VECTORS or name not in RANGES
 
 
 def _shaped(name: str, value: Any) -> jax.Array:
     array = floating(name, value)
     if array.ndim and 0 in array.shape:
         raise ValueError(f"{name}: shape {array.shape} given, which holds no number")
+    if isinstance(value, list | tuple) and not takes_several(name):
+        raise ValueError(f"{name}: {in_short(value)} given, must be one number; of a map of stacks it is an array")
     return array
 
 

@@ -9,6 +9,7 @@ A map of shape S, ``(N,)`` or ``(H, W)``, is a stack some of whose numbers diffe
 
 Axes of S may be 1 where all along them share a number. So a number a channel with a single axis always counts channels:
 ``Medium(thickness=(N,))`` alone is a stack of N channels, and where (N,) is the shape of the map as well it is refused.
+So is (N, N) where no other number tells texels from channels.
 """
 
 import dataclasses
@@ -121,6 +122,7 @@ def map_shape(stack: Any) -> Shape:
     except ValueError:
         shapes = ", ".join(f"{number.name} has {number.shape[:axes]}" for number in mapped)
         raise ValueError(f"Stack: parameters disagree on the shape of the map: {shapes}") from None
+    _refuse_square(found, mapped)
     for number in found:
         if number.by_channel and axes == 1 and not number.of_map and number.own and number.shape == shape != (1,):
             raise ValueError(
@@ -128,6 +130,20 @@ def map_shape(stack: Any) -> Shape:
                 f"{_wanted(number, axes)}, or (1, C) for channels that all texels share"
             )
     return shape
+
+
+def _refuse_square(found: list[Number], mapped: list[Number]) -> None:
+    """Refuse a map of as many texels as channels where no other number tells which of its axes are which."""
+    number = mapped[0]
+    if len(number.shape) != 2 or len({*number.shape}) != 1 or number.shape == (1, 1):
+        return
+    others = [other for other in found if other.by_channel or other.of_map]
+    if all(other.shape in (number.shape, (), (1,)) for other in others):
+        raise ValueError(
+            f"Stack.{number.name}: shape {number.shape} given, and nothing else says whether these are texels or "
+            "channels: (H, W, 1) is a number a texel of a map of H x W; for N texels of C channels give one number as "
+            "(1, C)"
+        )
 
 
 def _wanted(number: Number, axes: int) -> str:

@@ -1,20 +1,36 @@
 """Materials as words: the call that makes one, with the numbers that were typed, and a short form for pictures."""
 
 import dataclasses
+import inspect
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from layerjax._parameters import takes_several
+
 MOST_SHOWN = 8
 """Numbers that are named one by one; of more, shape and range are shown."""
 
 
+CALLED_HERE = {"roughness": "alpha", "eta": "ior", "n": "ior", "kappa": "k", "depth": "thickness", "tau": "thickness"}
+"""Arguments by what they are called elsewhere."""
+
+
 class Shown(eqx.Module):
-    """A module that is shown as the call that makes it."""
+    """A module that is shown as the call that makes it, and whose arguments are named where one is unknown."""
+
+    def __new__(cls, *_: Any, **given: Any) -> Self:
+        known = [] if not given else [*inspect.signature(cls.__init__).parameters][1:]
+        for name in given:
+            if name not in known:
+                meant = CALLED_HERE.get(name)
+                hint = f" ({meant}?)" if meant in known else ""
+                raise TypeError(f"{cls.__name__}: unknown argument {name!r}{hint}; it takes {', '.join(known)}")
+        return super().__new__(cls)
 
     def __repr__(self) -> str:
         return as_call(self)
@@ -30,6 +46,8 @@ def as_call(owner: Any) -> str:
     for field in dataclasses.fields(owner):
         if field.repr and hasattr(owner, field.name):  # one that a constructor has refused may lack fields
             word = in_words(getattr(owner, field.name))
+            if word.startswith("[") and not takes_several(f"{type(owner).__name__}.{field.name}"):
+                word = f"array({word})"  # of a map: lists are for channels
             if word != _default(field):
                 words.append(f"{field.name}={word}")
     return f"{type(owner).__name__}({', '.join(words)})"

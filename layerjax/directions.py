@@ -20,25 +20,54 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from layerjax._checks import require_choice
 from layerjax._numerics import horizon, safe_sqrt
 from layerjax._parameters import floating
 
 Vector = tuple[Array, Array, Array]
 Factor = Array | float
 
+POLAR_SLACK = 1e-5
+"""By which a polar angle may pass half a turn: rounding in single precision, of degrees as well."""
+
 UNIT_SLACK = 2e-3
 """What the squared length of a direction may differ from 1: directions come rounded from files."""
 
 
-def direction(theta: ArrayLike, phi: ArrayLike) -> Array:
+def direction(theta: ArrayLike, phi: ArrayLike, *, degrees: bool = False) -> Array:
     """Unit vector with polar angle `theta` from +z and azimuth `phi` from +x, in radians.
 
-    `theta` and `phi` broadcast; the result has shape ``broadcast(theta, phi) + (3,)``. theta > pi/2 points below.
+    Args:
+        theta: polar angle; beyond pi/2 it points below.
+        phi: azimuth, which broadcasts against theta.
+        degrees: both are in degrees.
+
+    Returns:
+        Shape ``broadcast(theta, phi) + (3,)``.
+
+    Raises:
+        ValueError: a polar angle that is known lies outside [-pi, pi], as one in degrees would.
     """
+    require_choice("degrees", degrees, (True, False))
+    _require_polar(theta, degrees)
     with jax.ensure_compile_time_eval():  # known angles give known directions, under jit too
-        theta, phi = jnp.broadcast_arrays(floating("theta", theta), floating("phi", phi))
+        polar, azimuth = floating("theta", theta), floating("phi", phi)
+        if degrees:
+            polar, azimuth = jnp.deg2rad(polar), jnp.deg2rad(azimuth)
+        theta, phi = jnp.broadcast_arrays(polar, azimuth)
         sin_theta = jnp.sin(theta)
         return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
+
+
+def _require_polar(theta: ArrayLike, degrees: bool) -> None:
+    """Refuse polar angles beyond half a turn, which are degrees given for radians."""
+    if any(isinstance(one, jax.core.Tracer) for one in jax.tree.leaves(theta)):
+        return
+    size = np.max(np.abs(np.asarray(theta, float)), initial=0.0)
+    if degrees and size > 180.0 + POLAR_SLACK:
+        raise ValueError(f"theta: {size:g} degrees is outside [-180, 180]")
+    if not degrees and size > np.pi + POLAR_SLACK:
+        raise ValueError(f"theta: {size:g} is outside [-pi, pi]; of angles in degrees say direction(..., degrees=True)")
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:

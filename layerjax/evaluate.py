@@ -16,13 +16,14 @@ from jax.typing import ArrayLike
 
 from layerjax import maps
 from layerjax._batching import in_chunks
+from layerjax._checks import require_choice, require_count, require_key
 from layerjax._devices import compiled
 from layerjax._numerics import horizon, safe_div
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, horizontal, read_directions, split
-from layerjax.mixture import Mixture
+from layerjax.mixture import Mixture, require_material
 from layerjax.numerical_error import neighbours, numerical_error
 from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
@@ -45,7 +46,6 @@ def evaluate(
     *,
     side: Side = "all",
     key: Array | None = None,
-    known: KnownDirections | None = None,
 ) -> Array:
     """BSDF in 1/sr, without the cosine.
 
@@ -60,9 +60,6 @@ def evaluate(
         side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
             one below. Other pairs give 0, and what only they need is left out of the program.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
-        known: what `known_directions` says of wi and wo, where these are traced. Concrete ones are looked at here:
-            along few distinct cosines `AddingDoubling` follows light exactly, and costs less. Maps look for themselves.
-            The cosines are taken from it, so that derivatives by them are not complete: leave it out for these.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
@@ -70,7 +67,26 @@ def evaluate(
         every texel is what its stack alone gives, in chunks that stay in the cache; what `"auto"` and `AddingDoubling`
         leave open is chosen once, for the texel that asks for most.
     """
-    _check_side(side)
+    return evaluate_known(stack, wi, wo, transport, side=side, key=key)
+
+
+def evaluate_known(
+    stack: Any,
+    wi: ArrayLike,
+    wo: ArrayLike,
+    transport: Any = "auto",
+    *,
+    side: Side = "all",
+    key: Array | None = None,
+    known: KnownDirections | None = None,
+) -> Array:
+    """`evaluate` where the directions may be traced, and what they are is known all the same.
+
+    Not public: `known` must be what `known_directions` says of just these directions, which cannot be checked where
+    they are traced; of others the values would be wrong. The cosines are taken from it, so that derivatives by them are
+    not complete. Concrete directions are looked at here, and maps look for themselves.
+    """
+    require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
     if known is not None and (known.of_wi.shape, known.of_wo.shape) != (wi.shape[:-1], wo.shape[:-1]):
         raise ValueError(
@@ -79,7 +95,7 @@ def evaluate(
         )
     if isinstance(stack, Mixture):
         return _of_parts(stack).mean(
-            lambda part, own: evaluate(part, wi, wo, transport, side=side, key=own, known=known), key
+            lambda part, own: evaluate_known(part, wi, wo, transport, side=side, key=own, known=known), key
         )
     shape = _shape_of(stack)
     if shape:
@@ -106,9 +122,9 @@ def evaluate_with_error(
     Raises:
         ValueError: the transport has neither, or a prepared stack is given to one that needs other resolutions.
     """
-    _check_side(side)
+    require_choice("side", side, get_args(Side))
     wi, wo = read_directions(wi=wi, wo=wo)
-    if not isinstance(stack, Prepared):
+    if _shape_of(stack):
         require_single(stack, "evaluate_with_error")
     if isinstance(stack, Mixture):
         return _mixed_with_error(stack, wi, wo, transport, side, key)
@@ -134,6 +150,7 @@ def sample(
         of shape ``(..., C)``, whose mean is the albedo. Draws that leave no light (below an opaque base, say) have
         weight 0, and a direction in the tangent plane if they have none.
     """
+    require_key(key)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
         return _sample_mixture(stack, wi, key, transport)
@@ -177,6 +194,7 @@ def albedo(
 
     Maps of stacks as in `evaluate`.
     """
+    require_count("nodes", nodes, 1)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
         return _of_parts(stack).mean(lambda part, own: albedo(part, wi, transport, nodes=nodes, key=own), key)
@@ -194,6 +212,7 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
 
     The delta part of the BSDF: 0 over an opaque base and through rough interfaces. Maps of stacks as in `evaluate`.
     """
+    require_material(stack)
     require_numbers(stack)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
@@ -283,6 +302,7 @@ def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> 
 
 
 def _shape_of(stack: Stack | Mixture | Prepared) -> Shape:
+    require_material(stack, Prepared)
     return () if isinstance(stack, Prepared) else map_shape(stack)
 
 
@@ -312,11 +332,6 @@ def _evaluate_map(
         known, own_known = None, False
     own = maps.Own(own_known, above)
     return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own)
-
-
-def _check_side(side: Side) -> None:
-    if side not in get_args(Side):
-        raise ValueError(f"side: {side!r} is not one of {', '.join(map(repr, get_args(Side)))}")
 
 
 def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> list[Prepared] | None:

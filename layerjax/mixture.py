@@ -12,14 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._checks import in_short, require_key
 from layerjax._drawn import below_each_other
 from layerjax._parameters import RANGES, Parameter, check_range, floating, is_placeholder
 from layerjax._shapes import Shape, axes_of_map, channel_count, map_shape
 from layerjax._shown import Shown, in_words
-from layerjax.stack import Stack
+from layerjax.stack import Interface, Medium, Stack, TurbidMedium
+from layerjax.surfaces import Surface
 
 WEIGHTS = "Mixture.weights"
 RANGES[WEIGHTS] = (0.0, 1.0)
+_PARTS = "Mixture.parts"
 
 SUM_SLACK = 1e-6
 """By which weights may miss a sum of 1: digits that a file has left out."""
@@ -48,10 +51,16 @@ class Mixture(Shown):
     weights: dict[str, Parameter]
 
     def __init__(self, parts: Mapping[str, "Stack | Mixture"], weights: Sequence[Parameter] | Mapping[str, Parameter]):
+        if not isinstance(parts, Mapping):
+            raise ValueError(f"{_PARTS}: {in_short(parts)} is not a dictionary of stacks by name")
+        if not isinstance(weights, Mapping | Sequence | np.ndarray | jax.Array) or isinstance(weights, str):
+            raise ValueError(
+                f"{WEIGHTS}: {in_short(weights)} is not a list of shares, nor a dictionary of them by name"
+            )
         for name in parts:
             if not (isinstance(name, str) and _NAME.fullmatch(name)) or name in _TAKEN:
                 raise ValueError(
-                    f"Mixture.parts: {name!r} is no name; it must be letters, digits, - and _, a letter first, and not "
+                    f"{_PARTS}: {name!r} is no name; it must be letters, digits, - and _, a letter first, and not "
                     f"one of {', '.join(_TAKEN)}"
                 )
         self.parts = dict(parts)
@@ -60,7 +69,7 @@ class Mixture(Shown):
     def __check_init__(self) -> None:
         for name, part in self.parts.items():
             if not isinstance(part, Stack | Mixture):
-                raise ValueError(f"Mixture.parts[{name!r}]: {part!r:.60} is not a Stack or a Mixture")
+                raise ValueError(f"{_PARTS}[{name!r}]: {in_short(part)} is not a Stack or a Mixture")
         _check_sum(self.weights)
         channel_count(self)
 
@@ -91,6 +100,8 @@ class Mixture(Shown):
 
         By name, as they are within transformations: there, too, a key is that of the same part.
         """
+        if key is not None:
+            require_key(key)
         keys = [None] * len(self.parts) if key is None else [*jax.random.split(key, len(self.parts))]
         shares = self.shares()
         return [(shares[name], function(self.parts[name], own)) for name, own in zip(sorted(shares), keys, strict=True)]
@@ -108,6 +119,19 @@ class Mixture(Shown):
     def over(self, shape: Shape) -> "Mixture":
         """The same with parts that are maps of exactly this shape, or single stacks."""
         return self.each(lambda part: part.over(shape) if isinstance(part, Mixture) else _over(part, shape))
+
+
+def require_material(stack: object, *others: type) -> None:
+    """Refuse what is neither a `Stack` nor a `Mixture`, nor of these other types, and say what it should stand in."""
+    if isinstance(stack, (Stack, Mixture, *others)):
+        return
+    kinds = " or a ".join(kind.__name__ for kind in (Stack, Mixture, *others))
+    hint = ""
+    if isinstance(stack, Surface):
+        hint = "; a surface alone is Stack([], base=surface)"
+    elif isinstance(stack, Interface | Medium | TurbidMedium):
+        hint = "; a layer alone is Stack([layer])"
+    raise ValueError(f"stack: {in_short(stack)} is not a {kinds}{hint}")
 
 
 def stacks_of(material: Stack | Mixture) -> list[Stack]:

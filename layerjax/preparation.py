@@ -9,10 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from layerjax import transport as transports
+from layerjax._checks import in_short
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions
-from layerjax.mixture import Mixture, stacks_of
+from layerjax.mixture import Mixture, require_material, stacks_of
 from layerjax.stack import Stack, require_numbers, simplify_and_name
 from layerjax.transport import Transport
 from layerjax.transport.adding_doubling import AddingDoubling
@@ -45,6 +47,7 @@ def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "au
     Raises:
         ValueError: the stack holds a placeholder, or something that the transport cannot carry (it is named).
     """
+    require_material(stack)
     if isinstance(stack, Mixture):
         return stack.each(lambda part: part if isinstance(part, Prepared) else prepare(part, transport))
     return prepare_at(stack, transport, lambda: None)
@@ -72,6 +75,8 @@ def choose_transport(
     Raises:
         ValueError: as `prepare`.
     """
+    if (wi is None) != (wo is None):
+        raise ValueError("wi, wo: both directions are needed, or none of them")
     if wi is None or wo is None:
         return transport_for(stack, transport, None)
     return transport_for(stack, transport, known_directions(*read_directions(wi=wi, wo=wo)))
@@ -79,6 +84,7 @@ def choose_transport(
 
 def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
     """`choose_transport` for directions of which this is known; None: they are many, or not known."""
+    require_material(stack)
     found = [chosen_for(part, transport, lambda: known)[0] for part in stacks_of(stack)]
     solvers = [one for one in found if isinstance(one, AddingDoubling)]
     return _finest(solvers) if solvers else found[0]
@@ -103,11 +109,17 @@ def chosen_for(stack: Stack, transport: Any, known: Known) -> tuple[Transport, S
     """The transport with nothing left open, and the simplified stack."""
     require_numbers(stack)
     simplified, names = simplify_and_name(stack)
-    chosen = automatic(stack, simplified) if transport == "auto" else transport
+    chosen = automatic(stack, simplified) if isinstance(transport, str) and transport == "auto" else transport
     if not isinstance(chosen, Transport):
-        raise ValueError(f'transport: {transport!r} is not a Transport or "auto"')
+        raise ValueError(f'transport: {in_short(transport)} is not a Transport or "auto"{_meant(transport)}')
     chosen.check(simplified, names)
     return chosen.chosen_for(simplified, known), simplified
+
+
+def _meant(transport: object) -> str:
+    """The call that makes the transport which a class or a word names."""
+    named = getattr(transports, transport, None) if isinstance(transport, str) else transport
+    return f"; {named.__name__}() is one" if isinstance(named, type) and issubclass(named, Transport) else ""
 
 
 def _finest(found: Sequence[AddingDoubling]) -> AddingDoubling:

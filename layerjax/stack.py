@@ -4,7 +4,7 @@ All are pytrees whose numeric leaves are arrays (concrete or traced); what is no
 refuse concrete values outside the documented box (`layerjax.RANGES`) by name.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, cast
 
 import equinox as eqx
@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from layerjax._checks import in_short
 from layerjax._drawn import Row, picture
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, is_placeholder, leaves_with_names, parameter
@@ -112,7 +113,9 @@ class TurbidMedium(Shown):
 
 def _check_phase(owner: str, phase: Any) -> None:
     if not isinstance(phase, PhaseFunction):
-        raise ValueError(f"{owner}.phase: {phase!r} is not a HenyeyGreenstein, an SGGX or another PhaseFunction")
+        raise ValueError(
+            f"{owner}.phase: {in_short(phase)} is not a HenyeyGreenstein, an SGGX or another PhaseFunction"
+        )
 
 
 class Stack(Shown):
@@ -134,15 +137,19 @@ class Stack(Shown):
     base: Surface | None = None
 
     def __init__(self, layers: Iterable[Interface | Medium | TurbidMedium], base: Surface | None = None):
+        if not isinstance(layers, Iterable) or isinstance(layers, str | Mapping):
+            raise ValueError(f"Stack.layers: {in_short(layers)} is not a list of Interface, Medium and TurbidMedium")
         self.layers = cast(tuple[Interface | Medium, ...], tuple(layers))
         self.base = base
 
     def __check_init__(self) -> None:
         for index, layer in enumerate(self.layers):
             if not isinstance(layer, Interface | Medium | TurbidMedium):
-                raise ValueError(f"Stack.layers[{index}]: {layer!r} is not an Interface, a Medium or a TurbidMedium")
+                raise ValueError(
+                    f"Stack.layers[{index}]: {in_short(layer)} is not an Interface, a Medium or a TurbidMedium"
+                )
         if self.base is not None and not isinstance(self.base, Surface):
-            raise ValueError(f"Stack.base: {self.base!r} is not a surface or None")
+            raise ValueError(f"Stack.base: {in_short(self.base)} is not a surface or None")
         channel_count(self)
 
     @property

@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 # lowest first; what lies in a package may import what lies in those above its own line, and beside it
 PACKAGES = [
+    "layerjax._checks",
     "layerjax._known",
     "layerjax._numerics",
     "layerjax._parameters",

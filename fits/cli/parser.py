@@ -1,8 +1,8 @@
 """The `layerjax` command: what may be asked for, and how it ends.
 
 Exit codes: 0 done; 1 done, but not to be relied on (a chain that is too short, a fit that did not converge); 2 bad
-input, bad usage or a full disk, named on stderr, with nothing written but what the same command goes on with; 130
-interrupted.
+input, bad usage, a full disk or too little memory, named on stderr, with nothing written but what the same command goes
+on with; 130 interrupted.
 """
 
 import argparse
@@ -29,6 +29,9 @@ from fits.cli.parser_many import add_fit_many
 from fits.cli.parser_maps import add_fit_map
 from fits.names import EXPORTS
 
+MOST_LETTERS = 1000
+"""Of an error: JAX adds a table of all that it holds to one of memory."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; bad usage leaves through `SystemExit` as argparse does."""
@@ -49,9 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `layerjax info FILE | head`
         _end_output()
         return 0
-    except (ValueError, OSError) as error:
+    except Exception as error:
         _end_output()
-        if arguments.traceback:
+        if arguments.traceback or not _is_of_input(error):
             raise
         print(f"layerjax: error: {_one_line(error)}", file=sys.stderr)
         return 2
@@ -318,7 +321,20 @@ class _Version(argparse.Action):
         parser.exit()
 
 
+def _is_of_input(error: Exception) -> bool:
+    """Whether it is of what was given, or of the machine; of a fault of the program a traceback tells."""
+    return isinstance(error, ValueError | OSError | OverflowError) or _is_of_memory(error)
+
+
+def _is_of_memory(error: Exception) -> bool:
+    """JAX says it by the words of an error of its own."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error))
+
+
 def _one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
-    return " ".join(str(error).split()) or type(error).__name__
+    words = f"{' '.join(str(error).split()):.{MOST_LETTERS}}" or type(error).__name__
+    if _is_of_memory(error):
+        return f"memory is not enough: {words}"
+    return f"a number is too large: {words}" if isinstance(error, OverflowError) else words

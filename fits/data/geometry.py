@@ -110,7 +110,10 @@ def slices(
 
 
 def _angles(name: str, values: ArrayLike, low: float, high: float) -> Floats:
-    array = np.atleast_1d(np.asarray(values, float)).ravel()
+    try:
+        array = np.atleast_1d(np.asarray(values, float)).ravel()
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {' '.join(repr(values).split()):.60}, must be angles in degrees") from None
     if array.size == 0:
         raise ValueError(f"{name} is empty: it needs at least one angle in degrees in [{low:g}, {high:g}]")
     bad = ~((array >= low) & (array <= high))

@@ -5,7 +5,7 @@ A stack with its transport goes in, or a fit; what comes out is a file, and sent
 
 from typing import TYPE_CHECKING
 
-from fits._lazy import names_from
+from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.exporting.export import Exported as Exported
@@ -16,3 +16,4 @@ _HOMES = {"export": "export", "Exported": "export"}
 __all__ = list(_HOMES)
 
 __getattr__ = names_from(__name__, _HOMES)
+__dir__ = directory_of(__name__, _HOMES)

@@ -18,6 +18,7 @@ from fits.exporting.openpbr import document as openpbr
 from fits.inference.fit_result import Fit
 from fits.names import EXPORTS, To
 from fits.progress import Progress, silent
+from layerjax._checks import in_short
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -78,8 +79,8 @@ def export(
             needs, or for "openpbr" light that passes), a transport that is random or does not carry the stack, an extra
             that is not installed, or a file that is there without `force`.
     """
-    if to not in EXPORTS:
-        raise ValueError(f"to is {to!r}, must be one of {', '.join(EXPORTS)}")
+    if not isinstance(to, str) or to not in EXPORTS:
+        raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
     path = Path(path)
     if path.suffix.lower() != ENDINGS[to]:
         raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")
@@ -99,7 +100,7 @@ def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.M
             raise ValueError("transport: the fit's is a function of one's own; give one of layerjax")
         return material.stack, transport or own
     if not isinstance(material, lj.Stack | lj.Mixture):
-        raise ValueError(f"material is a {type(material).__name__}, must be a Stack, a Mixture or a Fit")
+        raise ValueError(f"material is {in_short(material)}, must be a Stack, a Mixture or a Fit")
     return material, transport or "auto"
 
 

@@ -5,7 +5,7 @@ A problem goes in; a `fits.Fit` comes out, of that a `fits.Posterior`, and of se
 
 from typing import TYPE_CHECKING
 
-from fits._lazy import names_from
+from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.inference.compare import Comparison as Comparison
@@ -31,3 +31,4 @@ _HOMES = {
 __all__ = list(_HOMES)
 
 __getattr__ = names_from(__name__, _HOMES)
+__dir__ = directory_of(__name__, _HOMES)

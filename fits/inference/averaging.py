@@ -9,7 +9,7 @@ from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.inference.fit_result import Fit
 from fits.inference.foresight import foresights
-from fits.inference.posterior import Posterior
+from fits.inference.posterior import Posterior, require_fits
 from fits.inference.predicting import DRAWS, LEVELS, predict
 from fits.inference.prediction import Prediction, banded
 from fits.progress import Progress
@@ -70,6 +70,7 @@ def average(
     Raises:
         ValueError: no candidate; weights that are missing, negative or all 0; or as `leave_out`.
     """
+    require_fits(candidates)
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:

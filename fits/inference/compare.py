@@ -11,7 +11,7 @@ import numpy as np
 from fits._lazy import shown_by
 from fits.inference.fit_result import Fit
 from fits.inference.foresight import Foresight, foresights
-from fits.inference.posterior import Posterior
+from fits.inference.posterior import Posterior, require_fits
 from fits.progress import Progress
 
 LEANING, CLEAR = 2.0, 10.0
@@ -84,6 +84,7 @@ def compare(
         ValueError: fewer than two candidates, different data, different objectives, or fits of several measurements,
             of which one may be compared, but not with `refit`.
     """
+    require_fits(candidates)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     fits = {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}

@@ -17,6 +17,7 @@ from fits.inference.optimise import refit
 from fits.inference.predicting import foretold
 from fits.problem.left_out import without
 from fits.progress import Progress
+from layerjax._checks import require_kind
 
 FEWEST_INCIDENCES = 3
 """With fewer, stretches of the scans are left out: what is fitted at one incidence says little of another."""
@@ -97,6 +98,7 @@ def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
     Raises:
         ValueError: as `leave_out`.
     """
+    require_kind("fit", fit, Fit)
     if not fit.is_posterior:
         raise ValueError(
             f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"

@@ -11,6 +11,7 @@ from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.importance import UNRELIABLE, Weighted, weighted
+from layerjax._checks import require_kind
 
 DRAWS = 1000
 
@@ -43,6 +44,7 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     Raises:
         ValueError: a fit of a named objective, or a part of one of several measurements.
     """
+    require_kind("fit", fit, Fit)
     if not fit.is_posterior:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
     fit.require_alone("evidence")

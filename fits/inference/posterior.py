@@ -1,9 +1,10 @@
 """What a chain of samples says about the parameters of a fit: estimates, predictions, and how far to trust them."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from fits.inference.fit_result import Fit
 from fits.inference.length import BURN_IN, LONG_ENOUGH, STEADY, autocorrelation_times, long_enough
 from fits.problem.logarithm import logarithm
 from fits.problem.model import Model
+from layerjax._checks import require_kind
 
 if TYPE_CHECKING:
     from arviz import InferenceData
@@ -196,3 +198,10 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
 
 def _constrained(model: Model, positions: Array) -> Array:
     return jax.vmap(model.box.constrain)(positions)
+
+
+def require_fits(candidates: object) -> None:
+    """Refuse what are no fits or posteriors by name."""
+    require_kind("candidates", candidates, Mapping)
+    for name, one in cast(Mapping[str, object], candidates).items():
+        require_kind(f"candidates[{name!r}]", one, Fit, Posterior)

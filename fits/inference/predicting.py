@@ -22,6 +22,7 @@ from fits.problem.logarithm import softness as soft
 from fits.problem.model import Model
 from fits.problem.nodes import places
 from fits.problem.problem import polar_angles
+from layerjax._checks import in_short, require_kind
 
 if TYPE_CHECKING:
     from fits.inference.mixture import Mixture
@@ -71,7 +72,10 @@ def predict(
         require_level(level)
     if draws < 2:
         raise ValueError(f"draws is {draws}; it must be at least 2")
+    require_kind("at", at, Geometry, Measurements)
     if not isinstance(of, Fit | Posterior):
+        if isinstance(of, type) or not hasattr(of, "predict"):
+            raise ValueError(f"of: {in_short(of)} is not a Fit, a Posterior or an Average")
         return of.predict(at, levels=levels, draws=draws, seed=seed)
     return foretold(of, at, levels=levels, draws=draws, seed=seed)
 

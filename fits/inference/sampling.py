@@ -20,6 +20,7 @@ from fits.inference.nuts import CHAINS, Nuts, require_blackjax
 from fits.inference.posterior import Posterior, posterior_of
 from fits.problem.problem import Problem
 from fits.progress import Progress
+from layerjax._checks import require_kind
 
 WALKERS = 32
 Sampler = Literal["emcee", "nuts"]
@@ -106,6 +107,7 @@ def _run(
 
 def _require_possible(fit: Fit, path: str | Path | None) -> None:
     """ValueError for a fit that cannot be sampled, or a place that a chain cannot be kept in."""
+    require_kind("fit", fit, Fit)
     if not fit.is_posterior:
         raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
     fit.require_alone("sample")

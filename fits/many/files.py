@@ -18,7 +18,7 @@ from fits.engines.failures import one_line
 from fits.inference.starts import Solver
 from fits.many.fitting import require_posterior
 from fits.many.inputs import PAGE, TABLE, TABLE_JSON, measurement_files, stack_files
-from fits.many.origin import Foreign, Other, done_before, fingerprint
+from fits.many.origin import ORIGIN, Foreign, Other, done_before, fingerprint
 from fits.many.page import page
 from fits.many.rows import Row, best_of
 from fits.many.searching import Searching
@@ -26,6 +26,7 @@ from fits.many.table import KIND, table_csv, table_json
 from fits.many.work import Job, Task, fit_one
 from fits.names import Objective, Strata
 from fits.progress import Progress
+from fits.reporting.directories import FIT
 from fits.reporting.results import REPORT
 
 LOCK = "fit-many.lock"
@@ -103,7 +104,8 @@ def fit_files(
         progress: called with ("fits", done, all, file and stack).
 
     Raises:
-        ValueError: no file can be read; no such file; names that are there twice; a result of another stack or of other
+        FileNotFoundError: no such file.
+        ValueError: no file can be read; names that are there twice; a result of another stack or of other
             settings, unless `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     reading = Reading(format, quantity, bins, strata, mask_retro, mask_grazing, tuple(only), tuple(hold_out))
@@ -142,6 +144,7 @@ def _carried_out(
         with suppress(OSError):
             plan.write(left_out, pictures=False)
         raise
+    plan.require_results()
     plan.write(left_out, pictures=True)
     return FittedFiles(plan.out, plan.ordered, left_out)
 
@@ -236,6 +239,13 @@ class _Plan:
         reasons = list(dict.fromkeys(row.failure for row in self.rows.values()))
         more = f"; and {len(reasons) - NAMED} more" if len(reasons) > NAMED else ""
         raise ValueError(f"no file can be fitted: {'; '.join(reasons[:NAMED])}{more}")
+
+    def require_results(self) -> None:
+        """What was removed while others were fitted is not there."""
+        for at, row in self.rows.items():
+            if row.fitted and not all((self.out / row.directory / name).is_file() for name in (ORIGIN, FIT)):
+                why = f"{row.directory}: was removed while others were fitted"
+                self.rows[at] = Row(row.file, row.stack, failure=why)
 
     def write(self, left_out: Sequence[str], pictures: bool) -> None:
         """Table and page of what is done by now."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from fits._files import require_there
 from fits.data.formats import sniff
 from fits.problem.stack_file import ProblemFile, read_problem
 
@@ -21,13 +22,13 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
     format: of all files; None: each says so itself.
 
     Raises:
-        ValueError: no such file, a folder without measurements, or a name that is there twice.
+        FileNotFoundError: no such file or folder.
+        ValueError: a folder without measurements, or a name that is there twice.
     """
     found: dict[str, Path] = {}
     beside: list[str] = []
     for place in map(Path, given):
-        if not place.exists():
-            raise ValueError(f"{place}: no such file or folder")
+        require_there(place, "no such file or folder")
         files = [place]
         if place.is_dir():
             every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits._files import require_there
 from fits._lazy import shown_by
 from fits.maps import chunk_files
 from fits.maps.sampled import Sampled, sampled_in
@@ -217,7 +218,7 @@ def is_ours(path: str | Path) -> bool:
     """Whether this is the store of a fitted map, be it damaged or of another version."""
     try:
         return _attributes(Path(path)).get("kind") == KIND
-    except ValueError:
+    except (ValueError, FileNotFoundError):
         return False
 
 
@@ -225,6 +226,7 @@ def open_map(path: str | Path) -> FittedMap:
     """Open the store of a fitted map, finished or not.
 
     Raises:
+        FileNotFoundError: nothing is there.
         ValueError: it is none, or its description is damaged.
     """
     path = Path(path)
@@ -252,8 +254,7 @@ def open_map(path: str | Path) -> FittedMap:
 def _attributes(path: Path) -> dict[str, Any]:
     """What the root of a store says under our key; ValueError that says what `path` is instead."""
     must = f"must be the store of a {KIND}, as `layerjax fit-map` writes it"
-    if not path.exists():
-        raise ValueError(f"{path}: no such file or directory")
+    require_there(path, "no such file or directory")
     if not path.is_dir():
         raise ValueError(f"{path}: is a file, {must}")
     if not is_store(path):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fits._files import require_there
 from fits.data.geometry import Floats
 
 Block = tuple[slice, ...]
@@ -219,8 +220,7 @@ def _in_file(given: str) -> Source | Named:
     inside = _INSIDE.fullmatch(given)
     path, name = (inside["path"], inside["name"].strip("/")) if inside else (given, "")
     suffix = Path(path).suffix.lower()
-    if not os.path.exists(path):
-        raise ValueError(f"{path}: no such file")
+    require_there(path)
     is_store = suffix in ZARR or any(os.path.isfile(os.path.join(path, file)) for file in _ZARR_FILES)
     if os.path.isdir(path) and not is_store:
         raise ValueError(

@@ -6,7 +6,7 @@ problems are also read from TOML files here, and simulated.
 
 from typing import TYPE_CHECKING
 
-from fits._lazy import names_from
+from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.problem.correlated import Correlated as Correlated
@@ -36,3 +36,4 @@ _HOMES = {
 __all__ = list(_HOMES)
 
 __getattr__ = names_from(__name__, _HOMES)
+__dir__ = directory_of(__name__, _HOMES)

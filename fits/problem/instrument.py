@@ -16,12 +16,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-import layerjax as lj
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
 from fits.data.scans import SAME_ANGLE
 from fits.problem.narrowness import needs_cone
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.values import shown
+from layerjax.transport.known_directions import KnownDirections, known_directions
 
 Floats = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class Optics(eqx.Module):
     share: Array | None
     forward: Array | None
     incidence: Array | None
-    known: lj.KnownDirections | None
+    known: KnownDirections | None
 
     def seen(self, values: Any, setting: Setting, count: int) -> Array:
         """Readings (N, C), where values(wi, wo, known) is the BSDF (K, C)."""
@@ -146,7 +146,7 @@ def optics_of(instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incide
         share=None if share is None else jnp.asarray(share),
         forward=None if forward is None else jnp.asarray(forward),
         incidence=None if gain is None else jnp.asarray(gain),
-        known=lj.known_directions(*pairs) if follow and not free else None,
+        known=known_directions(*pairs) if follow and not free else None,
     )
 
 

@@ -62,7 +62,7 @@ class Noise:
                     raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
                 for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
                     _check_range(f"{field}.{end}", float(value), least, LEVELS[1])
-            elif level is not None and level != 0:
+            elif level is not None and not (isinstance(level, int | float) and level == 0):
                 _check_range(field, level, least, LEVELS[1])
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")

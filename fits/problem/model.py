@@ -35,6 +35,8 @@ from fits.problem.process import Process, Whitened
 from fits.problem.spectra import with_values
 from fits.problem.whitening import Correlation
 from layerjax._shapes import require_single
+from layerjax.evaluate import evaluate_known
+from layerjax.transport.known_directions import KnownDirections
 
 Transport = lj.Transport | Literal["auto"] | Callable[[Any, Array, Array], Array]
 """How the values are computed: a layerjax transport, `"auto"`, or any callable in the place of one.
@@ -95,7 +97,7 @@ class Model(Density):
     lowest: Array
     degrees_of_freedom: Array
     transport: Transport
-    known: lj.KnownDirections | None
+    known: KnownDirections | None
     optics: Optics | None
     process: Process | None
     softness: Array | None
@@ -113,7 +115,7 @@ class Model(Density):
         """Scaled BSDF, (N, C), in 1/sr: a stack of one channel has the same in all."""
         parts = self.build(vector)
 
-        def values(wi: Array, wo: Array, known: lj.KnownDirections | None) -> Array:
+        def values(wi: Array, wo: Array, known: KnownDirections | None) -> Array:
             return forward(parts.stack, wi, wo, self.transport, self.side, known)
 
         if self.optics is None:
@@ -333,7 +335,7 @@ def forward(
     wo: Array | NDArray[np.float64],
     transport: Transport,
     side: Side = "all",
-    known: lj.KnownDirections | None = None,
+    known: KnownDirections | None = None,
 ) -> Array:
     """BSDF (N, C) in 1/sr along unit directions (N, 3): the one place where inference meets the forward models.
 
@@ -342,9 +344,7 @@ def forward(
     """
     if isinstance(transport, lj.Transport) and transport.random:
         raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
-    # a class is callable too, but only a transport that lacks its brackets: layerjax says so
-    if callable(transport) and not isinstance(transport, lj.Transport | type):
+    if callable(transport) and not isinstance(transport, lj.Transport | type):  # layerjax refuses classes
         return transport(stack, jnp.asarray(wi), jnp.asarray(wo))
-    if isinstance(stack, lj.Stack | lj.Mixture):
-        require_single(stack, "inference")
-    return lj.evaluate(stack, wi, wo, cast(lj.Transport | Literal["auto"], transport), side=side, known=known)
+    require_single(stack, "inference")
+    return evaluate_known(stack, wi, wo, transport, side=side, known=known)

@@ -34,9 +34,12 @@ from fits.problem.process import Process, make_process
 from fits.problem.spectra import require_in_range
 from fits.problem.totalling import Totalling
 from fits.problem.values import shown
+from layerjax._checks import in_short, require_kind
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
+from layerjax.mixture import require_material
 from layerjax.stack import with_known
+from layerjax.transport.known_directions import known_directions
 
 Floats = NDArray[np.float64]
 
@@ -140,6 +143,7 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.cor
 
 
 def _assemble(problem: Problem) -> Assembled:
+    _require_kinds(problem)
     _require_known(problem.objective, problem.scale)
     require_in_range(problem.stack)
     if isinstance(problem.data, Totals):
@@ -162,6 +166,16 @@ def _assemble(problem: Problem) -> Assembled:
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
     _require_same_channels(model, start, used)
     return Assembled(names, start, low, high, model)
+
+
+def _require_kinds(problem: Problem) -> None:
+    if isinstance(problem.transport, str | lj.Transport):
+        require_material(problem.stack)
+    elif not callable(problem.transport):  # a function takes any stack
+        raise ValueError(f'transport: {in_short(problem.transport)} is not a Transport or "auto", nor a function')
+    require_kind("data", problem.data, Measurements)
+    require_kind("noise", problem.noise, Noise)
+    require_kind("instrument", problem.instrument, Instrument, None)
 
 
 def _require_known(objective: str, scale: Any) -> None:
@@ -274,7 +288,7 @@ def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
     return {
         "wi": jnp.asarray(wi),
         "wo": jnp.asarray(wo),
-        "known": lj.known_directions(wi, wo) if follow and optics is None else None,
+        "known": known_directions(wi, wo) if follow and optics is None else None,
         "optics": optics,
         "side": _side(wi, wo),
     }

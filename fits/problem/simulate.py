@@ -9,6 +9,7 @@ from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
+from layerjax._checks import in_short, require_kind
 
 
 def simulate(
@@ -38,8 +39,9 @@ def simulate(
         ValueError: a negative `noise` or `floor`, or a transport that is random or cannot carry the stack.
     """
     for name, level in (("noise", noise), ("floor", floor)):
-        if not (math.isfinite(level) and level >= 0):
-            raise ValueError(f"{name} is {level}, must be finite and >= 0")
+        if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
+            raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
+    require_kind("geometry", geometry, Geometry, Measurements)
     # evaluate picks the precision of the directions: float64 if the session has it turned on
     exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)
     sigma = np.hypot(noise * exact, floor)

@@ -75,6 +75,7 @@ def read_problem(path: str | Path) -> ProblemFile:
     """Read a stack, and what else the TOML file says about fitting it.
 
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file, the place in it and what may stand there.
     """
     path = Path(path)

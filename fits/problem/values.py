@@ -78,7 +78,7 @@ class _Shown(reprlib.Repr):
 
 def shown(value: Any) -> str:
     """A value as an error shows it: on one line and short, whatever it is."""
-    return _shortened(_Shown().repr(value), 3 * _LONGEST)
+    return _shortened(" ".join(_Shown().repr(value).split()), 3 * _LONGEST)
 
 
 def portable_repr(thing: Any) -> str:

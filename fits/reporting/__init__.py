@@ -5,7 +5,7 @@ A `fits.Fit`, and its `fits.Posterior` where there is one, go in; files, figures
 
 from typing import TYPE_CHECKING
 
-from fits._lazy import names_from
+from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.reporting.html import report as report
@@ -23,3 +23,4 @@ _HOMES = {
 __all__ = list(_HOMES)
 
 __getattr__ = names_from(__name__, _HOMES)
+__dir__ = directory_of(__name__, _HOMES)

@@ -71,6 +71,10 @@ def report(
             raise ValueError("posterior, others, unseen: of a map there are none; it is reported by itself")
         write_map_page(fit, path, force)
         return
+    from fits.inference.fit_result import Fit
+    from layerjax._checks import require_kind
+
+    require_kind("fit", fit, Fit, FittedMap)
     fit.require_one("report")
     foretold = None if unseen is None else foretell(fit, posterior, unseen)
     images = draw(fit, posterior, others, name, foretold)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import read_json, text_checksum, write_json, write_text
+from fits._files import read_json, require_there, text_checksum, write_json, write_text
 from fits.data.formats import read, totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
@@ -67,6 +67,10 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
             callable, or it or a part of the stack is of a class of one's own, which a file cannot name; or a channel
             cannot be written (see `write_csv`); or the fit is of several measurements (see `Fit.part`).
     """
+    from fits.inference.fit_result import Fit
+    from layerjax._checks import require_kind
+
+    require_kind("fit", fit, Fit)
     fit.require_one("save_fit")
     with reserved(directory, force), replacing(directory, force) as folder:
         write_fit(fit, folder)
@@ -153,7 +157,7 @@ def load_fit(directory: str | Path) -> "Fit":
     """The fit that was saved in a directory.
 
     Raises:
-        ValueError: on one line, for a directory that holds none or a damaged one.
+        ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
     from fits.inference.fit_result import Fit, Minimum
     from fits.inference.identifiability import Combination
@@ -217,11 +221,13 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     Its estimates are refused where the chain is too short, unless it was saved as one to be reported all the same.
 
     Raises:
+        FileNotFoundError: there is no such directory.
         ValueError: on one line, for a damaged file.
     """
     from fits.inference.sampling import NoSteps, load
 
     directory = Path(directory)
+    require_there(directory, "no such directory")
     if not (directory / CHAIN).is_file():
         return None
     summary = read_json(directory / SUMMARY) if (directory / SUMMARY).is_file() else {}
@@ -272,6 +278,7 @@ def versions() -> dict[str, str]:
 
 def _content(directory: Path) -> dict[str, Any]:
     """What fit.json holds, if it and the files that it has checksums of are as they were written."""
+    require_there(directory, "no such directory")
     if not (directory / FIT).is_file():
         raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
     content = read_json(directory / FIT)

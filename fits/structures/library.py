@@ -98,6 +98,7 @@ def read_library(path: str | Path) -> Library:
     file; of a base of several layers ``[[bases.NAME.layers]]`` and ``[bases.NAME.base]``.
 
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file and the place in it.
     """
     path = Path(path)

@@ -35,6 +35,7 @@ from fits.problem.problem import Problem
 from fits.progress import Progress
 from fits.structures.files import Kept
 from fits.structures.library import Library, Structure, default_library
+from layerjax._checks import in_short, require_kind
 
 STARTS = 8
 BEAM = 2
@@ -130,8 +131,11 @@ def search(
     Raises:
         ValueError: layers out of range; another search's directory; or as `fit` and `leave_out`.
     """
-    if not 0 <= layers <= 6:
-        raise ValueError(f"layers is {layers}; it must be in [0, 6]")
+    require_kind("data", data, Measurements)
+    require_kind("library", library, Library, None)
+    require_kind("noise", noise, Noise, None)
+    if not (isinstance(layers, int) and 0 <= layers <= 6):
+        raise ValueError(f"layers is {in_short(layers)}; it must be in [0, 6]")
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
     # without an instrument it is the same search as before there were any

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._checks import require_choice
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax._parameters import check_range, is_placeholder
 from layerjax.directions import Vector, dot
@@ -35,9 +36,7 @@ TAIL = 4.6
 
 def check_facets(owner: str, distribution: Any, alpha: Any) -> None:
     """Refuse a distribution that is none, and a width outside the range that belongs to it."""
-    if distribution not in get_args(Distribution):
-        allowed = ", ".join(map(repr, get_args(Distribution)))
-        raise ValueError(f"{owner}.distribution: {distribution!r} is not one of {allowed}")
+    require_choice(f"{owner}.distribution", distribution, get_args(Distribution))
     if not is_placeholder(alpha):
         check_range(f"{owner}.alpha" if distribution == "ggx" else f"{owner}.alpha, {distribution}", alpha)
 

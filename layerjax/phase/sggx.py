@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._checks import require_choice
 from layerjax._numerics import safe_div
 from layerjax._parameters import Parameter, floating, is_placeholder, parameter
 from layerjax.directions import Vector, half_vector, normalize, reflect, split
@@ -36,8 +37,7 @@ class SGGX(PhaseFunction):
     axis: Parameter = eqx.field(converter=lambda axis: _axis(axis), default=None)
 
     def __check_init__(self) -> None:
-        if self.kind not in ("surface", "fiber"):
-            raise ValueError(f'SGGX.kind: {self.kind!r} is not one of "surface", "fiber"')
+        require_choice("SGGX.kind", self.kind, ("surface", "fiber"))
 
     def cross_section(self, w: Vector) -> Array:
         return sggx_area(w, self.kind, self.alpha, self._axis())

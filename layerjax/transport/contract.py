@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._batching import in_chunks, room
+from layerjax._checks import require_key
 from layerjax._numerics import safe_div
 from layerjax.channels import Channels, pick
 from layerjax.directions import UNIT_SLACK, Vector, dot, horizontal, select, split
@@ -142,7 +143,8 @@ class DeterministicTransport(Transport):
         """Scattered energy that leaves on wi's side and on the other, for unit irradiance."""
 
     def needed(self, key: Array | None, function: str) -> None:
-        return None
+        if key is not None:
+            require_key(key)
 
     def compared(self) -> "Sequence[Transport]":
         coarser = self.coarser()
@@ -202,6 +204,7 @@ class RandomTransport(Transport):
         if key is None:
             name = type(self).__name__
             raise ValueError(f"key: {name} draws random numbers: {function}(..., key=jax.random.key(seed))")
+        require_key(key)
         return key
 
     def compared(self) -> None:

@@ -7,6 +7,8 @@ import pytest
 
 import layerjax as lj
 from layerjax._shapes import map_shape
+from layerjax.evaluate import evaluate_known
+from layerjax.transport.known_directions import known_directions
 
 N = 5
 RNG = np.random.default_rng(7)
@@ -67,12 +69,12 @@ def test_a_map_is_its_texels(name):
     whole = stack_of(slice(None))
     assert map_shape(whole) == (N,)
     values = lj.evaluate(whole, WI, WO, transport)
-    alone = jax.jit(lambda *given: lj.evaluate(*given[:3], transport, known=given[3])) if stack_of is slab else None
+    alone = jax.jit(lambda *given: evaluate_known(*given[:3], transport, known=given[3])) if stack_of is slab else None
     single = jnp.stack(
         [
             lj.evaluate(stack_of(k), WI[k], WO[k], transport)
             if alone is None
-            else alone(stack_of(k), WI[k], WO[k], lj.known_directions(WI[k], WO[k]))
+            else alone(stack_of(k), WI[k], WO[k], known_directions(WI[k], WO[k]))
             for k in range(N)
         ]
     )

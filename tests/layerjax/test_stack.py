@@ -24,7 +24,7 @@ REFUSED = {
     "Medium.phase: 'haze' is not": lambda: lj.Medium(1.0, 0.5, "haze"),
     "HenyeyGreenstein.g: 1 is outside [-0.999, 0.999]": lambda: lj.HenyeyGreenstein(1.0),
     "SGGX.alpha: 0 is outside [0.0001, 1]": lambda: lj.SGGX("surface", 0.0),
-    'SGGX.kind: \'flake\' is not one of "surface", "fiber"': lambda: lj.SGGX("flake", 0.1),
+    "SGGX.kind: 'flake' is not one of 'surface', 'fiber'": lambda: lj.SGGX("flake", 0.1),
     "SGGX.axis: [0.0, 0.0, 0.0] is not a finite vector": lambda: lj.SGGX("fiber", 0.1, (0.0, 0.0, 0.0)),
     "SGGX.axis: shape (2,) given, (3,) needed": lambda: lj.SGGX("fiber", 0.1, (0.0, 1.0)),
     "SGGX.alpha: shape (0,) given, which holds no number": lambda: lj.SGGX("fiber", []),

@@ -34,6 +34,8 @@ from fits._files import write_bytes
 from fits.engines import Failure, run
 from fits.problem.compiled import cores
 from fits.reporting.plots.data import as_png
+from layerjax.evaluate import evaluate_known
+from layerjax.transport.known_directions import known_directions
 
 REPEATS, QUICK = 200, 20
 STARTS, WALKERS = 4, 12
@@ -228,8 +230,8 @@ def _simulator(posterior: str, other: lj.Transport | None) -> Callable[..., Any]
     """The transport as the fits use it: one program for all truths, told of the directions and of nothing else."""
     case = _case(posterior, other)
     transport = case.transport
-    known = lj.known_directions(case.readings.wi, case.readings.wo) if transport.uses_known else None
-    return jax.jit(lambda stack, wi, wo: lj.evaluate(stack, wi, wo, transport, known=known))
+    known = known_directions(case.readings.wi, case.readings.wo) if transport.uses_known else None
+    return jax.jit(lambda stack, wi, wo: evaluate_known(stack, wi, wo, transport, known=known))
 
 
 def _held(path: Path, settings: Mapping[str, Any]) -> list[Repeat]:

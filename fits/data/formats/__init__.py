@@ -81,6 +81,7 @@ def read(
         seed: of their choice.
 
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
     """
     path = Path(path)

@@ -88,7 +88,8 @@ def read_slab(
         wavelengths: the lowest and the highest that are read, in nm; None for all rows.
 
     Raises:
-        ValueError: on one line: no such file, another format, or numbers that are missing or out of range.
+        FileNotFoundError: there is no such file.
+        ValueError: on one line: another format, or numbers that are missing or out of range.
     """
     path = Path(path)
     require_file(path)

@@ -126,13 +126,15 @@ class AddingDoubling(DeterministicTransport):
             if value is not None and not (isinstance(value, int) and least <= value <= MOST):
                 raise ValueError(f"AddingDoubling.{name}: {value!r:.60} is not a whole number from {least} to {MOST}")
         given = (2, 4) if self.ordinates is None else self.ordinates
-        cosines, azimuths = given if len(given) == 2 else (0, 0)
+        cosines, azimuths = given if isinstance(given, tuple | list) and len(given) == 2 else (0, 0)
         if not (2 <= cosines <= MOST and 4 <= azimuths <= MOST and azimuths % 2 == 0):
             raise ValueError(
                 f"AddingDoubling.ordinates: {self.ordinates!r:.60} is not (cosines from 2 to {MOST}, an even number of "
                 f"azimuths from 4 to {MOST})"
             )
-        if self.tolerance is not None and not 0.0 < self.tolerance < 1.0:
+        if self.tolerance is not None and not (
+            isinstance(self.tolerance, float | np.floating) and 0.0 < self.tolerance < 1.0
+        ):
             raise ValueError(f"AddingDoubling.tolerance: {self.tolerance!r} is outside (0, 1)")
         for name, choice, choices in (("orders", self.orders, Orders), ("microfacets", self.microfacets, Microfacets)):
             if choice not in get_args(choices):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from layerjax._checks import require_choice, require_count, require_key
 from layerjax._numerics import horizon
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
@@ -89,16 +90,11 @@ def goniophotometer(
         raise ValueError("stack: goniophotometer takes a Stack; of a Mixture take the mean over its parts")
     require_numbers(stack)
     require_single(stack, "goniophotometer")
-    for name, value, least in (
-        ("paths", paths, 2),
-        ("polar", polar, 1),
-        ("azimuth", azimuth, 1),
-        ("orders", orders, 1),
-    ):
-        if value < least:
-            raise ValueError(f"goniophotometer: {name} = {value!r} is less than {least}")
-    if microfacets not in ("single", "multiple"):
-        raise ValueError(f"goniophotometer: microfacets = {microfacets!r} is not one of 'single', 'multiple'")
+    require_count("paths", paths, 2)
+    for name, value in (("polar", polar), ("azimuth", azimuth), ("orders", orders), ("lanes", lanes)):
+        require_count(name, value, 1)
+    require_choice("microfacets", microfacets, ("single", "multiple"))
+    require_key(key)
     (wi,) = read_directions(wi=wi)
     slim = in_precision(simplify(stack), wi.dtype)
     counts = (paths, polar, azimuth, orders, min(lanes, paths))

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._checks import require_choice, require_count
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
@@ -47,16 +48,10 @@ class RandomWalk(RandomTransport):
     lanes: int = eqx.field(static=True, default=4096)
 
     def __check_init__(self) -> None:
-        if self.paths < 2:
-            raise ValueError(f"RandomWalk.paths: {self.paths!r} is less than 2, which give no standard error")
-        if self.lanes < 1:
-            raise ValueError(f"RandomWalk.lanes: {self.lanes!r} is less than 1")
-        for name, value, allowed in (
-            ("microfacets", self.microfacets, ("single", "multiple")),
-            ("orders", self.orders, ("all", "first", "multiple")),
-        ):
-            if value not in allowed:
-                raise ValueError(f"RandomWalk.{name}: {value!r} is not one of {', '.join(map(repr, allowed))}")
+        require_count("RandomWalk.paths", self.paths, 2)  # one gives no standard error
+        require_count("RandomWalk.lanes", self.lanes, 1)
+        require_choice("RandomWalk.microfacets", self.microfacets, ("single", "multiple"))
+        require_choice("RandomWalk.orders", self.orders, ("all", "first", "multiple"))
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
         if self.microfacets == "multiple":

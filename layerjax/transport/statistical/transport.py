@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from layerjax import channels
+from layerjax._checks import require_choice
 from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax._parameters import is_placeholder
 from layerjax.channels import Channels
@@ -110,6 +111,8 @@ class Statistical(DeterministicTransport):
     own_side: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
+        for name in ("symmetric", "angles", "own_side"):
+            require_choice(f"Statistical.{name}", getattr(self, name), (True, False))
         for name, choices in (("microfacets", Microfacets), ("scattering", Scattering), ("diffuse", Diffuse)):
             value = getattr(self, name)
             if value not in get_args(choices):

@@ -11,9 +11,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+from fits.cli import commands
 from fits.cli.interrupts import raised_again
 from fits.cli.parser import main
 from fits.inference.fit_result import Fit
@@ -305,3 +307,31 @@ def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Pat
     after = contents(work)
     assert len(after.pop(str(work / ".result.starts")).splitlines()) > 1  # what it is of, and at least one start
     assert after == before
+
+
+LACKING = {
+    "memory": (MemoryError("Unable to allocate 74.5 GiB"), "memory is not enough: Unable to allocate 74.5 GiB"),
+    "memory, unsaid": (MemoryError(), "memory is not enough: MemoryError"),
+    "JAX's memory": (
+        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 bytes."),
+        "memory is not enough: RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.",
+    ),
+    "size": (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
+}
+
+
+@pytest.mark.parametrize(("error", "words"), LACKING.values(), ids=LACKING)
+def test_what_the_machine_lacks_is_one_line(
+    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception, words: str
+) -> None:
+    def fails(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(commands, "info", fails)
+    assert words in refused(["info", "data.csv"], capsys, work)
+
+
+def test_a_fault_of_the_program_has_its_traceback(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "info", lambda _: {}["nothing"])
+    with pytest.raises(KeyError):
+        main(["info", "data.csv"])

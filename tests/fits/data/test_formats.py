@@ -53,7 +53,7 @@ def test_bad_arguments(tmp_path):
         read(path, quantity="f")
     with pytest.raises(ValueError, match="geometry and bins apply to MERL and RGL files only"):
         read(path, geometry=slices())
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match="no such file"):
         read(tmp_path / "nothing.csv")
     with pytest.raises(ValueError, match="starts with 'type bsdf_data'"):
         read(path, format="fred")

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -254,11 +255,11 @@ def test_a_mistake_in_one_fit_ends_none_of_the_others(folder: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("files", "stacks", "message"),
     [
-        (["nowhere"], STACKS, "nowhere: no such file or folder"),
+        (["nowhere"], STACKS, "no such file or folder: 'nowhere'"),
         (["empty"], STACKS, "empty: holds no measurement file"),
         ([], STACKS, "no file is given"),
         (["scans"], [], "no stack is given"),
-        (["scans"], ["nowhere.toml"], "nowhere.toml: no such file"),
+        (["scans"], ["nowhere.toml"], "no such file: 'nowhere.toml'"),
         (["scans/broken.csv"], STACKS, "twenty"),
         (["scans", "scans/paint.csv"], STACKS, r"scans/paint.csv and scans/paint.csv: results go by the file's name"),
         (["scans"], ["coat.toml", "scans/../coat.toml"], "results go by the stack's name"),
@@ -271,7 +272,7 @@ def test_bad_input_is_named_and_writes_nothing(folder: Path, files: list[str], s
     (folder / "search.toml").write_text((folder / "bare.toml").read_text())
     (folder / "table.csv").write_text("")
     before = contents(folder)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         fits.fit_files(files, stacks, "out")
     assert contents(folder) == before
     assert not (folder / "out").exists()
@@ -293,3 +294,36 @@ def test_places_that_hold_something_else_are_left_alone(folder: Path) -> None:
     for force in (False, True):
         with pytest.raises(ValueError, match="coat: holds something that fit-many did not make"):
             fits.fit_files("scans/paint.csv", STACKS, "out", force=force, **FEW)
+
+
+def test_a_result_that_is_removed_meanwhile_is_not_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = work.fit_one
+    done: list[str] = []
+
+    def removing(job: work.Job, task: work.Task) -> Row:
+        if done:
+            shutil.rmtree(folder / "out" / done.pop(), ignore_errors=True)
+        row = whole(job, task)
+        done.append(row.directory)
+        return row
+
+    monkeypatch.setattr("fits.many.files.fit_one", removing)
+    found = fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    assert [row.fitted for row in found.rows] == [False, True]
+    assert found.rows[0].failure == "paint.csv/coat: was removed while others were fitted"
+    assert not found.complete
+    assert "was removed" in Path("out/table.csv").read_text()
+
+
+def test_an_output_that_is_removed_meanwhile_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = work.fit_one
+
+    def removing(job: work.Job, task: work.Task) -> Row:
+        row = whole(job, task)
+        shutil.rmtree(folder / "out")
+        return row
+
+    monkeypatch.setattr("fits.many.files.fit_one", removing)
+    with pytest.raises((ValueError, FileNotFoundError), match="out"):
+        fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    assert not (folder / "out").exists()

@@ -133,13 +133,13 @@ def test_channels_are_told_from_readings(shape: tuple, leading: tuple, channels:
         (np.ones((0, N)), r"values has shape \(0, 6\), must hold something"),
         (np.ones((2, N), complex), "values holds complex128, must hold real numbers"),
         ([["a"] * N], "values holds <U1, must hold real numbers"),
-        ("nowhere.npy", "nowhere.npy: no such file"),
+        ("nowhere.npy", "no such file: 'nowhere.npy'"),
         (".", "is a folder, .* layerjax fit-many"),
         (__file__, r"test_inputs.py: ends in '.py', a map is read from .npy, .h5, .hdf5 or .zarr"),
     ],
 )
 def test_values_that_are_none_are_named(values: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         readings(values, VIEW)
 
 

@@ -65,13 +65,13 @@ def test_what_is_no_transport_is_refused(transport) -> None:
 
 def test_maps_of_stacks_are_refused_by_name() -> None:
     """Also where a parameter makes one; neither fits nor simulations know of texels."""
-    rough = lj.Stack([], lj.OrenNayar(Free(0.4, 0.0, 1.0), [0.1, 0.2, 0.3]))
+    rough = lj.Stack([], lj.OrenNayar(Free(0.4, 0.0, 1.0), np.array([0.1, 0.2, 0.3])))
     free = lj.Stack([], lj.OrenNayar(0.4, Free([0.1, 0.2, 0.3], 0.0, 1.0)))
     for stack in (rough, free):
         with pytest.raises(ValueError, match=r"takes one stack; base.roughness of shape \(3,\) makes it a map"):
             Problem(stack, DATA, transport=lj.SingleScattering())
     with pytest.raises(ValueError, match=r"takes one stack; base.roughness of shape \(3,\)"):
-        simulate(lj.Stack([], lj.OrenNayar(0.4, [0.1, 0.2, 0.3])), slices(incidence=[20], outgoing=[10]))
+        simulate(lj.Stack([], lj.OrenNayar(0.4, np.array([0.1, 0.2, 0.3]))), slices(incidence=[20], outgoing=[10]))
 
 
 def test_what_holds_channels_together_has_no_weight_beside_a_named_objective() -> None:

@@ -278,7 +278,7 @@ LAYER = "[[layers]]\nkind = 'Medium'\n"
         ),
         (
             BASE + "[[layers]]\nkind = 'Interface'\nior = 1.5\nalpha = [0.1, 0.2]\n",
-            r"a stack file takes one stack; layers\[0\].alpha of shape \(2,\) makes it a map",
+            r"layers\[0\]: Interface.alpha: \(0.1, 0.2\) given, must be one number",
         ),
     ],
 )
@@ -290,7 +290,7 @@ def test_bad_files_are_one_line_that_names_the_place(tmp_path, text, message):
 
 
 def test_missing_and_binary_files(tmp_path):
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(FileNotFoundError, match="no such file"):
         read_problem(tmp_path / "nothing.toml")
     (tmp_path / "junk.toml").write_bytes(bytes(range(256)))
     with pytest.raises(ValueError, match="not a text file"):

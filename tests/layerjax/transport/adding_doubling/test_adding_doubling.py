@@ -9,7 +9,9 @@ import pytest
 
 import layerjax as lj
 from layerjax import HenyeyGreenstein, Interface, Lambertian, Medium, Stack
+from layerjax.evaluate import evaluate_known
 from layerjax.transport.adding_doubling.resolution import Resolution
+from layerjax.transport.known_directions import known_directions
 from tests.helpers.places import STORED
 
 PUBLISHED = STORED / "published_slab_values.csv"
@@ -234,9 +236,9 @@ def test_tolerance_of_a_concrete_stack_holds_within_jit():
     """Directions that are traced are read off tables, unless they are known: to four thirds of the tolerance."""
     stack = Stack([lj.Interface(1.5, 0.2), Medium(1.0, 0.95, HenyeyGreenstein(0.5))], lj.Lambertian(0.3))
     wi, wo = lj.direction([0.3, 0.8], 0.0), lj.direction([0.2, 0.7], [1.0, 3.0])
-    transport, known = lj.AddingDoubling(tolerance=0.03), lj.known_directions(wi, wo)
+    transport, known = lj.AddingDoubling(tolerance=0.03), known_directions(wi, wo)
     values = lj.evaluate(stack, wi, wo, transport)
-    within = jax.jit(lambda wi, wo, known: lj.evaluate(stack, wi, wo, transport, known=known))
+    within = jax.jit(lambda wi, wo, known: evaluate_known(stack, wi, wo, transport, known=known))
     np.testing.assert_allclose(within(wi, wo, None), values, rtol=0.04)
     np.testing.assert_allclose(within(wi, wo, known), values, rtol=0.04)
 

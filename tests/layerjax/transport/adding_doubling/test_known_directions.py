@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax.transport.known_directions import MOST_PAIRS
+from layerjax.evaluate import evaluate_known
+from layerjax.transport.known_directions import MOST_PAIRS, known_directions
 
 SOLVER = lj.AddingDoubling(nodes=8, modes=10)
 FINE = lj.AddingDoubling(nodes=24, modes=24)
@@ -71,15 +72,15 @@ def test_traced_directions_that_are_known():
     """The same values inside a program that takes the directions as arguments."""
     stack = STACKS["paint"]
     wi, wo = pairs(stack)
-    known = lj.known_directions(wi, wo)
-    traced = jax.jit(lambda wi, wo, known: lj.evaluate(stack, wi, wo, SOLVER, known=known))(wi, wo, known)
+    known = known_directions(wi, wo)
+    traced = jax.jit(lambda wi, wo, known: evaluate_known(stack, wi, wo, SOLVER, known=known))(wi, wo, known)
     np.testing.assert_allclose(traced, lj.evaluate(stack, wi, wo, SOLVER), rtol=1e-10)
 
 
 def test_directions_that_others_are_known_of_are_refused():
     wi, wo = pairs(STACKS["paint"])
     with pytest.raises(ValueError, match=r"known: it is of directions of shapes \(2,\) and \(2,\), wi and wo have"):
-        lj.evaluate(STACKS["paint"], wi, wo, SOLVER, known=lj.known_directions(wi[:2], wo[:2]))
+        evaluate_known(STACKS["paint"], wi, wo, SOLVER, known=known_directions(wi[:2], wo[:2]))
 
 
 def test_shapes_and_directions_without_light():
@@ -107,11 +108,11 @@ def test_reciprocity_through_a_slab():
 
 def test_many_directions_are_not_looked_at():
     wi = np.asarray(lj.direction(np.full(3, 0.3), np.zeros(3)))
-    assert lj.known_directions(wi, wi) is not None
-    assert lj.known_directions(np.broadcast_to(wi[:1], (MOST_PAIRS + 1, 3)), wi[:1]) is None
+    assert known_directions(wi, wi) is not None
+    assert known_directions(np.broadcast_to(wi[:1], (MOST_PAIRS + 1, 3)), wi[:1]) is None
     many = np.asarray(lj.direction(np.linspace(0.0, 1.5, 1000), np.zeros(1000)))
-    assert lj.known_directions(many, wi[:1]) is None
-    assert jax.jit(lambda w: jnp.asarray(lj.known_directions(w, w) is None))(wi)
+    assert known_directions(many, wi[:1]) is None
+    assert jax.jit(lambda w: jnp.asarray(known_directions(w, w) is None))(wi)
 
 
 @pytest.mark.slow

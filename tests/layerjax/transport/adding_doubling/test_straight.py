@@ -7,7 +7,9 @@ import pytest
 
 import layerjax as lj
 from layerjax.directions import split
+from layerjax.evaluate import evaluate_known
 from layerjax.transport.adding_doubling.straight import evaluate_straight, straight
+from layerjax.transport.known_directions import known_directions
 
 SOLVER = lj.AddingDoubling(nodes=6, modes=6)
 THETA_I, THETA_O, PHI = (
@@ -16,7 +18,7 @@ THETA_I, THETA_O, PHI = (
     np.array([0.0, 0.1, 2.0, 0.0, 0.1, 1.0]),
 )
 WI, WO = lj.direction(THETA_I, 0.0), lj.direction(THETA_O, PHI)
-KNOWN = lj.known_directions(WI, WO)
+KNOWN = known_directions(WI, WO)
 
 
 def slab(ior, alpha, ior_below, alpha_below):
@@ -101,7 +103,7 @@ def test_is_continuous_at_equal_indices():
     Values change by some 1e-6 of themselves over the steps of 1e-6. What is scattered besides steps by 6e-4 at normal
     incidence, where the solver's error at 6 nodes is 9e-3 (2e-5 at 12 nodes).
     """
-    values = jax.jit(lambda ior, below: lj.evaluate(slab(ior, 0.3, below, 0.2), WI, WO, SOLVER, known=KNOWN))
+    values = jax.jit(lambda ior, below: evaluate_known(slab(ior, 0.3, below, 0.2), WI, WO, SOLVER, known=KNOWN))
     for equal, near in (
         ((1.0, 1.4), (1.0 + 1e-6, 1.4)),
         ((1.4, 1.4), (1.4, 1.4 - 1e-6)),
@@ -116,7 +118,7 @@ def test_derivatives_are_those_of_differences():
     start = jnp.asarray([1.5, 0.05, 1.2, 0.1])
 
     def values(numbers):
-        return lj.evaluate(slab(*numbers), WI, WO, SOLVER, known=KNOWN)
+        return evaluate_known(slab(*numbers), WI, WO, SOLVER, known=KNOWN)
 
     slopes = jax.jit(jax.jacfwd(values))(start)
     compiled = jax.jit(values)

@@ -1,0 +1,45 @@
+"""Arguments of a wrong kind are refused in one line, which names the argument and what it should be."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import numpy as np
+
+MOST_LETTERS = 60
+
+
+def in_short(value: object) -> str:
+    """A value of whatever kind, on one line and cut short; a class is called one."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    return f"{' '.join(repr(value).split()):.{MOST_LETTERS}}"
+
+
+def require_kind(name: str, value: object, *kinds: type | None) -> None:
+    """Refuse what is of none of these types; None among them: it may be None."""
+    if not isinstance(value, tuple(kind for kind in kinds if kind is not None)) and not (value is None in kinds):
+        words = " or ".join("None" if kind is None else f"a {kind.__name__}" for kind in kinds)
+        raise ValueError(f"{name}: {in_short(value)} is not {words}")
+
+
+def require_count(name: str, value: object, least: int) -> None:
+    """Refuse what is not a whole number of at least `least`."""
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name}: {in_short(value)} is not a whole number of at least {least}")
+
+
+def require_choice(name: str, value: object, allowed: Iterable[Any]) -> None:
+    """Refuse what is not one of these words, or neither True nor False."""
+    if not any(value is one or (isinstance(value, str) and value == one) for one in allowed):
+        raise ValueError(f"{name}: {in_short(value)} is not one of {', '.join(map(repr, allowed))}")
+
+
+def require_key(key: Any) -> None:
+    """Refuse what is not a single JAX random key, typed or of the older kind."""
+    if isinstance(key, jax.Array | np.ndarray):
+        typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+        if key.shape == () if typed else key.dtype == np.uint32 and key.ndim == 1 and key.size in (2, 4):
+            return
+    seed = key if isinstance(key, int) else 0
+    raise ValueError(f"key: {in_short(key)} is not a JAX random key, such as jax.random.key({seed})")
