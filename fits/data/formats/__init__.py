@@ -24,6 +24,7 @@ from fits.data.formats import (
     window_xml,
     zemax,
 )
+from fits.data.formats._text import without_mark
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
@@ -39,7 +40,6 @@ _SAYING: dict[str, Callable[[Path], Measurements]] = {  # the file says what it 
     "klems": window_xml.read,
     "tensortree": window_xml.read,
     "pab": pab.read,
-    "alta": alta.read,
     "speos": speos.read,
     "ssdd": ssdd.read,
 }
@@ -71,7 +71,8 @@ def read(
             Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; all others say what they hold.
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
+            hold need it; all others say it themselves.
         geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
             directions at which the file has values.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
@@ -125,6 +126,8 @@ def _read_as(
         return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
     if kind in _TOLD:
         return _TOLD[kind](path, checked or "brdf")
+    if kind == "alta":
+        return alta.read(path, checked)
     if kind in _SAYING:
         found = _SAYING[kind](path)
         if checked not in (None, found.source.quantity):
@@ -142,6 +145,7 @@ def sniff(path: Path) -> str:
     for magic, what in _KNOWN_ELSEWHERE.items():
         if head.startswith(magic):
             raise ValueError(f"{path}: this is {what}, which has no reader here (formats: {', '.join(FORMATS)})")
+    head = without_mark(head)
     if rgl.recognises(head):
         return "rgl"
     if merl.recognises(head) or path.suffix.lower() == ".binary":
@@ -159,7 +163,9 @@ def sniff(path: Path) -> str:
 
 def _sniff_text(path: Path, head: bytes) -> str:
     """`sniff` for a file that holds no zero byte."""
-    every = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
+    if window_xml.recognises(head):
+        return "tensortree" if b"tensortree" in head.lower() else "klems"
+    every = [line.strip() for line in head.decode("utf-8", "replace").splitlines()]
     if alta.recognises(every):
         return "alta"
     if pab.recognises(every):
@@ -168,8 +174,6 @@ def _sniff_text(path: Path, head: bytes) -> str:
     first = lines[0] if lines else ""
     if first.startswith(rxt.FIRST):
         return "rxt"
-    if window_xml.recognises(first):
-        return "tensortree" if b"tensortree" in head.lower() else "klems"
     if fred.recognises(first):
         return "fred"
     if lighttools.recognises(lines):

@@ -9,6 +9,7 @@ import numpy as np
 from fits.data.geometry import Floats
 
 BOM = b"\xef\xbb\xbf"
+BOMS_16 = (b"\xff\xfe", b"\xfe\xff")
 ANY_NUMBER = (-math.inf, math.inf)
 
 
@@ -42,9 +43,18 @@ class Line:
         return [self.parse(cell, column, allowed) for column, cell in enumerate(self.text.split(), start=1)]
 
 
+def without_mark(raw: bytes) -> bytes:
+    """The same bytes without a byte order mark; those of UTF-16, which nothing else tells from binary, as UTF-8."""
+    if raw.startswith(BOMS_16):
+        return raw.decode("utf-16", "replace").encode()
+    return raw.removeprefix(BOM)
+
+
 def read_lines(path: Path, encoding: str = "utf-8") -> list[Line]:
     """All lines of a text file, without a byte order mark; ValueError for an empty file or one that is not text."""
-    raw = path.read_bytes().removeprefix(BOM)
+    marked = path.read_bytes()
+    raw = without_mark(marked)
+    encoding = "utf-8" if marked.startswith(BOMS_16) else encoding
     if not raw.strip():
         raise ValueError(f"{path}: the file is empty")
     try:

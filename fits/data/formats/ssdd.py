@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.formats._text import BOM, Line, plural, rows
+from fits.data.formats._text import Line, plural, rows, without_mark
 from fits.data.geometry import TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
@@ -51,7 +51,7 @@ class _Block:
 
 def recognises(head: bytes) -> bool:
     """Whether a file starts as this format."""
-    return head.removeprefix(BOM).lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
+    return head.lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
 
 
 def read(path: Path) -> Measurements:
@@ -89,7 +89,7 @@ def read(path: Path) -> Measurements:
 
 
 def _blocks(path: Path) -> list[_Block]:
-    raw = path.read_bytes()
+    raw = without_mark(path.read_bytes())
     blocks: list[_Block] = []
     place, number = 0, 0
     current: _Block | None = None
@@ -98,7 +98,7 @@ def _blocks(path: Path) -> list[_Block]:
         words = line.text.split()
         if not words or line.text.startswith("#"):
             continue
-        key = words[0].lstrip("\ufeff")
+        key = words[0]
         if number == 1 and key != "VERSION":
             raise line.error(f"{key[:40]!r} found, must be VERSION")
         if key == "VERSION":

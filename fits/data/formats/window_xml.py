@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.formats import tensor_tree
-from fits.data.formats._window import COME, blocks, layer_of, number_of, text_of
+from fits.data.formats._window import COME, ELEMENT, blocks, layer_of, number_of, text_of
 from fits.data.geometry import Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
-FIRST = ("<?xml", "<WindowElement")
 CHANNELS = {"visible": "Y", "cie-x": "X", "cie-z": "Z"}
 _MOST_PATCHES = 2000
 
@@ -32,9 +31,9 @@ class Basis:
     directions: Floats
 
 
-def recognises(first_line: str) -> bool:
-    """Whether this is the first line of an XML file."""
-    return first_line.startswith(FIRST)
+def recognises(head: bytes) -> bool:
+    """Whether a file starts as XML, or holds the element of WINDOW further down."""
+    return head.lstrip().startswith(b"<?xml") or ELEMENT.search(head) is not None
 
 
 def read(path: Path) -> Measurements:

@@ -139,6 +139,8 @@ def test_isotropic_by_formula(tmp_path: Path) -> None:
         for (side, i, _), share in shares.items()
     )
     data = read(_file(tmp_path, head + tables, "x.brdf"))
+    ended = read(_file(tmp_path, f"{head}{tables}End of file\n", "y.brdf"))
+    np.testing.assert_array_equal(ended.values, data.values)
     assert data.channels == ("450 nm", "650 nm")
     for (side, i, w), share in shares.items():
         here = (abs(data.theta_i - i) < 1e-6) & (data.wo[:, 2] < -1e-9 if side else data.wo[:, 2] > 1e-9)
