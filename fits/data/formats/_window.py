@@ -18,8 +18,8 @@ def layer_of(path: Path) -> ElementTree.Element:
     """The layer of the file, without namespaces. What stands before the XML is no part of it, as for Radiance."""
     marked = path.read_bytes()
     raw = without_mark(marked)
-    element = ELEMENT.search(raw)
-    begin = element.start() if element else 0
+    start = ELEMENT.search(raw)
+    begin = start.start() if start else 0
     declared = raw.rfind(b"<?xml", 0, begin)
     begin = begin if declared < 0 else declared
     # what was UTF-16 is UTF-8 now, whatever its declaration says
