@@ -93,19 +93,27 @@ def read(
             corners, weights = np.minimum(index, np.array(SHAPE) - 1e-9).astype(int)[None], np.ones((1, len(index)))
         else:
             corners, weights = corners_around(index)
-    corner_values = table[:, corners[..., 0], corners[..., 1], corners[..., 2]]  # (3, corners, N)
-    corner_values = np.where(weights == 0, 0.0, corner_values)
+    values, valid, more_notes = _looked_up(path, table, corners, weights)
+    return _readings(path, geometry, values, valid, notes + more_notes)
+
+
+def _looked_up(
+    path: Path, table: Floats, corners: Indices, weights: Floats
+) -> tuple[Floats, NDArray[np.bool_], list[str]]:
+    """Means (N, 3) over bins (K, N, 3) with weights (K, N), whether they were measured (N,), and notes."""
+    corner_values = np.where(weights == 0, 0.0, table[:, corners[..., 0], corners[..., 1], corners[..., 2]])
     lost = _damaged(path, corner_values).any(axis=(0, 1))
     valid = np.asarray((corner_values >= 0).all(axis=(0, 1)))
     if lost.all():
         raise ValueError(f"{path}: all bins that are asked for hold nan")
     values = np.where(valid, (weights * corner_values).sum(axis=1), 0.0).T * SCALE
+    notes = []
     if lost.any():
         notes.append(f"left out: {plural(int(lost.sum()), 'sample')} that need a bin that holds nan")
     if not (valid | lost).all():
         count = int((~valid & ~lost).sum())
         notes.append(f"masked: {plural(count, 'sample')} that need a bin without a measurement")
-    return _readings(path, geometry, values, valid, notes)
+    return values, valid, notes
 
 
 def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, seed: int) -> Measurements:
