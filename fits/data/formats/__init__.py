@@ -61,6 +61,8 @@ def read(
     bins: int | Literal["all"] | None = None,
     strata: Strata = "bins",
     seed: int = 0,
+    wavelengths: tuple[float, float] | None = None,
+    corrected: bool | None = None,
 ) -> Measurements:
     """Read a measurement file: CSV, MERL, RGL, Zemax, LightTools, Speos, WINDOW XML, FRED, ASTM, pab, ALTA, SSDD, iad.
 
@@ -80,6 +82,7 @@ def read(
         strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
             the projected solid angle of light and viewer.
         seed: of their choice.
+        wavelengths, corrected: for iad's files only: see `read_slab`.
 
     Raises:
         ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
@@ -92,7 +95,13 @@ def read(
         raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")
     if kind != "merl" and (lookup != "centre" or strata != "bins"):
         raise ValueError(f"{path}: lookup and strata apply to MERL files only, this is a {kind} file")
+    if kind != "rxt" and not (wavelengths is None and corrected is None):
+        raise ValueError(f"{path}: wavelengths and corrected apply to rxt files only, this is a {kind} file")
+    if kind in ("totals", "rxt") and checked is not None:
+        raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
     try:
+        if kind == "rxt":
+            return rxt.read_slab(path, wavelengths=wavelengths, corrected=corrected).totals
         return _read_as(kind, path, checked, geometry, lookup, bins, strata, seed)
     except ValueError as error:
         if str(error).startswith(str(path)):
@@ -112,10 +121,8 @@ def _read_as(
 ) -> Measurements:
     if kind == "csv":
         return csv.read(path, checked)
-    if kind in ("totals", "rxt"):
-        if checked is not None:
-            raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
-        return totals_csv.read(path) if kind == "totals" else rxt.read_slab(path).totals
+    if kind == "totals":
+        return totals_csv.read(path)
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {checked!r}, a MERL file always holds 'brdf'")
