@@ -104,7 +104,7 @@ def fit_files(
         progress: called with ("fits", done, all, file and stack).
 
     Raises:
-        ValueError: no file can be read; names that are there twice; a result of another stack or of other settings, unless
+        ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     held = tuple(only), tuple(hold_out)
