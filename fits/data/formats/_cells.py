@@ -4,7 +4,7 @@ import csv
 
 import numpy as np
 
-from fits.data.formats._text import Line, plural
+from fits.data.formats._text import ANY_NUMBER, Line, plural
 from fits.data.geometry import Floats
 
 MISSING = ("", "nan", "-nan", "na", "n/a", "null")
@@ -38,7 +38,7 @@ class Table:
         self.cells = [cells for cells, kept in zip(self.cells, keep, strict=True) if kept]
         return len(keep) - len(self.body)
 
-    def column(self, name: str, allowed: tuple[float, float] = (-np.inf, np.inf), empty: float | None = None) -> Floats:
+    def column(self, name: str, allowed: tuple[float, float] = ANY_NUMBER, empty: float | None = None) -> Floats:
         """The numbers of a column, (N,); a missing one gives `empty`, or is an error where that is None."""
         if name not in self.names:
             raise self.header.error(f"no column {name!r}, the file has {', '.join(self.names)}")

@@ -28,12 +28,12 @@ from fits.data import geometry
 from fits.data.formats._cells import Table, delimiter_of, named
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import Measurements, Source, channel_names, check_quantity, to_bsdf
+from fits.data.measurements import LARGEST, SMALLEST_SIGMA, Measurements, Source, channel_names, check_quantity, to_bsdf
 from fits.data.totals import Totals
 from fits.names import QUANTITIES, Quantity
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
-_NOT_NEGATIVE = (0.0, float("inf"))
+_NOT_NEGATIVE = (0.0, LARGEST)
 SUFFIXES = ("_std", "_sigma")
 _QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
     **{quantity: quantity for quantity in QUANTITIES},
@@ -240,10 +240,15 @@ def _sigma(table: Table, columns: list[str | None], used: np.ndarray, notes: lis
     sigma = np.stack(
         [table.column(name, _NOT_NEGATIVE, empty=np.nan) if name else unknown for name in columns], axis=-1
     )
-    zero = used & (sigma == 0).any(axis=1)
+    zero = used & (sigma < SMALLEST_SIGMA).any(axis=1)
     if zero.any():
-        row, name = int(np.argmax(zero)), columns[int(np.argmax((sigma == 0)[np.argmax(zero)]))]
-        raise table.body[row].error("0 is not allowed, must be > 0 (leave the cell empty where it is unknown)", name)
+        row = int(np.argmax(zero))
+        column = int(np.argmax(sigma[row] < SMALLEST_SIGMA))
+        raise table.body[row].error(
+            f"{sigma[row, column]:g} is not allowed, must be > 0, at least {SMALLEST_SIGMA:g} (leave the cell empty "
+            "where it is unknown)",
+            columns[column],
+        )
     if np.isnan(sigma).all():
         notes.append("the standard deviation columns are empty: sigma is unknown")
         return None

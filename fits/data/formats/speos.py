@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from fits.data.formats._rows import Rows
-from fits.data.formats._text import plural, read_lines, within, without_mark
+from fits.data.formats._text import plural, read_lines, require_room, within, without_mark
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
@@ -136,7 +136,7 @@ def _read_isotropic(path: Path, lines: Rows) -> Measurements:
     counts = lines.numbers(2, "counts of incidences and wavelengths", (1, _MOST)).astype(int)
     incidences = lines.numbers(int(counts[0]), "incidences", (0.0, 90.0))
     wavelengths = lines.numbers(int(counts[1]), "wavelengths", (0.0, 1e6))
-    names = tuple(f"{one:g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    names = tuple(f"{one:.12g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
     found: dict[Side, list[list[Floats]]] = {side: [] for side in header.sides}
     nodes: dict[Side, list[Table]] = {side: [] for side in header.sides}
     factors = []
@@ -195,12 +195,14 @@ def _read_anisotropic(path: Path, lines: Rows) -> Measurements:
     wavelengths = np.unique(np.concatenate([one.wavelengths for one in spectra.values()]))
     if all(np.ptp(one.shares) <= 1e-9 * one.shares.max() for one in spectra.values()):
         wavelengths = wavelengths[:1]
-    names = tuple(f"{one:g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    names = tuple(f"{one:.12g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    require_room(path, sum(table.values.size for side in header.sides for table in tables[side]), len(names))
     parts, factors = [], []
     for side in header.sides:
         spectrum = spectra[side]
         share = np.interp(wavelengths, spectrum.wavelengths, spectrum.shares)
-        factor = np.array([_factor(one, _reference(tables[side], spectrum, header.quantity)) for one in share])
+        reference = _reference(tables[side], spectrum, header.quantity)
+        factor = np.array([_factor(one, reference) for one in share])
         factors += list(factor)
         parts += [_readings(table, table.values.ravel()[:, None] * factor, header.quantity) for table in tables[side]]
     note = "the vector that marks the sample is azimuth 0; rotations taken as counter-clockwise from the light's travel"

@@ -110,18 +110,20 @@ def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
         if not name:
             raise ValueError(f"{path}: an AngleBasis without AngleBasisName")
         directions: list[Floats] = []
+        total = 0
         for ring in basis.iter("AngleBasisBlock"):
             low, high = (number_of(path, ring, f"ThetaBounds/{bound}Theta") for bound in ("Lower", "Upper"))
             count = number_of(path, ring, "nPhis")
             if not (0.0 <= low < high <= 90.0 and 1 <= count <= _MOST_PATCHES and count == int(count)):
                 raise ValueError(f"{path}: {name}: a ring from {low:g} to {high:g} degrees in {count:g} patches")
+            total += int(count)
+            if total > _MOST_PATCHES:
+                raise ValueError(f"{path}: {name}: {total} patches or more, must be {_MOST_PATCHES} at most")
             theta = 0.0 if count == 1 and low == 0.0 else 0.5 * (low + high)
             directions.append(direction(theta, 360.0 * np.arange(int(count)) / count))
         if not directions:
             raise ValueError(f"{path}: {name}: no AngleBasisBlock")
         found.append(Basis(name, np.concatenate(directions)))
-        if len(found[-1].directions) > _MOST_PATCHES:
-            raise ValueError(f"{path}: {name}: {len(found[-1].directions)} patches, must be {_MOST_PATCHES} at most")
     return found
 
 

@@ -178,6 +178,9 @@ GOOD = "10,180,20,0,0.5\n"
         (HEADER + "\n10,180,nan,0,1\n", "line 2, column 'theta_o': nan is not allowed, must be a number in"),
         (HEADER + "\n10,180,20,0,\n10,180,25,0,NaN\n", "line 1: no sample below holds a number in column brdf"),
         (HEADER + "\n10,180,20,0,inf\n", "line 2, column 'brdf': inf is not allowed"),
+        (HEADER + "\n10,180,20,0,1e300\n", r"line 2, column 'brdf': 1e300 is not allowed, .*at most 1e\+30 in size"),
+        (HEADER + ",brdf_std\n10,180,20,0,1,1e-200\n", "line 2, column 'brdf_std': 1e-200 is not allowed, must be > 0"),
+        (HEADER + ",brdf_std\n10,180,20,0,1,1e300\n", "line 2, column 'brdf_std': 1e300 is not allowed"),
         (HEADER + "\n91,180,20,0,1\n", r"line 2, column 'theta_i': 91 is not allowed, must be a number in \[0, 90\]"),
         (HEADER + "\n10,180,-5,0,1\n", r"line 2, column 'theta_o': -5 is not allowed, must be a number in \[0, 180\]"),
         (

@@ -1,5 +1,6 @@
 """XML of WINDOW and Radiance that does not begin as XML does: known by what it holds, as for Radiance."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -42,3 +43,17 @@ def test_other_xml_says_what_it_is(tmp_path: Path) -> None:
     path.write_text("<?xml version='1.0'?><html/>")
     with pytest.raises(ValueError, match=r"page\.xml: an XML file of <html>, must be a <WindowElement>"):
         read(path)
+
+
+def test_rings_stand_for_no_more_patches_than_there_may_be(tmp_path: Path) -> None:
+    ring = MATRIX[MATRIX.index("<AngleBasisBlock>") : MATRIX.index("</AngleBasis>")].replace(
+        "<nPhis>1<", "<nPhis>2000<"
+    )
+    path = tmp_path / "rings.xml"
+    path.write_text(MATRIX.replace("<AngleBasisBlock>", 20_000 * ring + "<AngleBasisBlock>", 1))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"rings\.xml: two: 4000 patches or more, must be 2000 at most"):
+        read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6  # 40 million patches would take a GB
