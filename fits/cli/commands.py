@@ -234,7 +234,7 @@ def info(arguments: Namespace) -> int:
     data = measurements(arguments)
     for table in (source_table(data), data_table(data)):
         print_table(table, sys.stdout)
-    for sentence in [] if isinstance(data, Totals) else data_statements(data):
+    for sentence in data_statements(data):
         print(sentence)
     if Path(out).exists() and not arguments.force:
         print(f"Picture: {out} exists already (--force draws it again)")

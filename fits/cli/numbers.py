@@ -44,6 +44,14 @@ def length(word: str) -> float:
     return _number(word, float, 1.0, None)
 
 
+def interval(words: str) -> tuple[float, float]:
+    """The lowest and the highest wavelength, in nanometres."""
+    ends = [length(word) for word in words.split(",")]
+    if len(ends) != 2 or ends[0] > ends[1]:
+        raise argparse.ArgumentTypeError(f"{words!r} given, must be the lowest and the highest, as in 600,620")
+    return ends[0], ends[1]
+
+
 def _number(word: str, kind: type[int] | type[float], low: float, high: float | None) -> float:
     allowed = f"{'a whole number' if kind is int else 'a number'} " + (
         f">= {low:g}" if high is None else f"in [{low:g}, {high:g}]"

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from fits.cli.numbers import angle, count, level, seed
+from fits.cli.numbers import angle, count, interval, level, seed
 from fits.names import FORMATS, OBJECTIVES, QUANTITIES, STRATA
 
 MAX_STEPS = 20_000
@@ -12,7 +12,7 @@ LAYERS = 3
 SAMPLING = ("sampler", "walkers", "ess", "surrogate", "max_steps", "allow_short")
 """Options of `add_sampling`."""
 
-READING = ("format", "quantity", "bins", "all", "strata")
+READING = ("format", "quantity", "bins", "all", "strata", "wavelengths", "corrected")
 """Options of `add_format`."""
 
 
@@ -52,6 +52,14 @@ def add_format(parser: "argparse._ActionsContainer") -> None:
     several.add_argument("--bins", type=count, metavar="N", help="of a MERL or RGL table, N bins from all over it")
     several.add_argument(
         "--all", action="store_const", const=True, help="of such a table, every bin that holds a measurement"
+    )
+    parser.add_argument(
+        "--wavelengths", type=interval, metavar="LOW,HIGH", help="of an .rxt file, the rows between these, in nm"
+    )
+    parser.add_argument(
+        "--corrected",
+        action=argparse.BooleanOptionalAction,
+        help="of an .rxt file, values are the sample's own, whatever its spheres (default: what its comments say)",
     )
     parser.add_argument(
         "--strata", choices=STRATA, help="what each of N bins has an equal share of: the table, or flux (default: bins)"

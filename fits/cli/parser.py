@@ -275,7 +275,9 @@ def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
         help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
     )
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
-    parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
+    parser.add_argument(
+        "--size", type=count, default=256, metavar="N", help="pixels a sphere, 16 to 1024 (default: %(default)s)"
+    )
     add_force(parser, "overwrite the file")
 
 

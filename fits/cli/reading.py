@@ -14,6 +14,8 @@ def reading(arguments: Namespace) -> Reading:
         quantity=arguments.quantity,
         bins="all" if arguments.all else arguments.bins,
         strata=arguments.strata,
+        wavelengths=arguments.wavelengths,
+        corrected=arguments.corrected,
         mask_retro=getattr(arguments, "mask_retro", None),
         mask_grazing=getattr(arguments, "mask_grazing", None),
         only=tuple(getattr(arguments, "only", ())),

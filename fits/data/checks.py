@@ -21,6 +21,12 @@ LEAST_COVERED = 0.5
 FAR = 30.0
 """Degrees from the mirror direction within which a peak is looked for."""
 
+STEEP = 5.0
+"""Degrees of incidence from which the light has a side."""
+
+BRIGHTER = 1.3
+"""Ratio of the brightest readings of two sides from which one of them is the brighter: more than noise makes."""
+
 Floats = NDArray[np.float64]
 
 
@@ -51,11 +57,25 @@ class Energy:
 
 @dataclass(frozen=True)
 class Peak:
-    """Of a scan through the mirror direction: degrees between readings there, and how many are above half its top."""
+    """Of a scan through the mirror direction: degrees between readings there, and how many are above half its top.
+
+    stands_out: whether readings about it fall to half of its top, so that it is a peak, and no flank of another.
+    """
 
     theta: float
     step: float
     readings: int
+    stands_out: bool
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Of light at this polar angle, the brightest reading in its plane on its own side, and on the mirror side; NaN
+    where all of them are on its own."""
+
+    theta: float
+    light: float
+    mirror: float
 
 
 def reciprocity(data: Measurements) -> Agreement | None:
@@ -130,7 +150,30 @@ def peaks(data: Measurements) -> list[Peak]:
         while high < near.size - 1 and level[high + 1] >= 0.5 * level[top]:
             high += 1
         step = float(np.median(np.diff(angle[near])[max(0, low - 1) : high + 1]))
-        found.append(Peak(mirror, step, high - low + 1))
+        falls = top > 0 and (low > 0 or high < near.size - 1)
+        of_light = angle[near[top]] < -0.5 * mirror - SAME_ANGLE
+        found.append(Peak(mirror, step, high - low + 1, bool(falls and not of_light)))
+    return found
+
+
+def sides(data: Measurements) -> list[Sides]:
+    """Of each scan in the plane of incidence, as far as it reaches on both sides of the normal."""
+    used = _above(data)
+    angle, found = signed_angle(used), []
+    flat = in_plane(used)
+    for rows in scans(used):
+        rows = rows[flat[rows]]
+        if not rows.size or used.theta_i[rows[0]] < STEEP:
+            continue
+        own, level = angle[rows], used.values[rows].mean(axis=1)
+        if own.min() >= -SAME_ANGLE:
+            continue
+        one_sided = own.max() <= SAME_ANGLE
+        reach = np.inf if one_sided else min(own.max(), -own.min()) + SAME_ANGLE
+        light, mirror = (level[(sign * own > SAME_ANGLE) & (sign * own <= reach)] for sign in (-1, 1))
+        if light.size and (mirror.size or one_sided):
+            brightest = np.nan if one_sided else float(mirror.max())
+            found.append(Sides(float(used.theta_i[rows[0]]), float(light.max()), brightest))
     return found
 
 

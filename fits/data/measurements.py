@@ -13,6 +13,9 @@ from fits.data.geometry import TANGENT_COSINE, Floats, Pairs
 from fits.data.selection import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
 
+LARGEST, SMALLEST_SIGMA = 1e30, 1e-100
+"""Of values in 1/sr in size, and of standard deviations of used samples: residuals over them have finite squares."""
+
 
 @dataclass(frozen=True)
 class Source:
@@ -40,15 +43,15 @@ class Measurements(Pairs):
     Args:
         wi: (N, 3) unit vectors towards the light, pointing away from the surface.
         wo: (N, 3) unit vectors towards the viewer, pointing away from the surface.
-        values: (N, C), BSDF in 1/sr without the cosine.
-        sigma: (N, C), standard deviations in 1/sr, above 0 in used samples; None where nothing is known.
+        values: (N, C), BSDF in 1/sr without the cosine, at most 1e30 in size.
+        sigma: (N, C), standard deviations in 1/sr, at least 1e-100 in used samples; None where nothing is known.
         mask: (N,) bool, True where a sample takes part in fits.
         channels: C names.
         source: where the samples came from.
 
     Raises:
-        ValueError: shapes do not fit together, a number is not finite, a direction is no unit vector, or sigma is
-            negative, or zero in a sample that is used.
+        ValueError: shapes do not fit together, a number is not finite or too large, a direction is no unit vector, or
+            sigma is negative, or next to zero in a sample that is used.
     """
 
     wi: Floats
@@ -72,6 +75,10 @@ class Measurements(Pairs):
                 raise ValueError(f"{name} holds {array[~np.isfinite(array)][0]}, must be finite")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        for name in ("values", "sigma")[: 1 if self.sigma is None else 2]:
+            size = np.max(np.abs(getattr(self, name)), initial=0.0)
+            if size > LARGEST:
+                raise ValueError(f"{name} holds {size:g}, must be at most {LARGEST:g} in size")
         for name in ("wi", "wo"):
             length = np.linalg.norm(getattr(self, name), axis=-1)
             if (abs(length - 1) > 1e-6).any():
@@ -79,8 +86,12 @@ class Measurements(Pairs):
         if self.sigma is not None:
             if (self.sigma < 0).any():
                 raise ValueError(f"sigma is {self.sigma.min():g}, must be >= 0")
-            if (self.sigma[self.mask] == 0).any():
-                raise ValueError("sigma is 0 in a sample that is used, must be > 0 (sigma=None where it is unknown)")
+            least = np.min(self.sigma[self.mask], initial=np.inf)
+            if least < SMALLEST_SIGMA:
+                raise ValueError(
+                    f"sigma is {least:g} in a sample that is used, must be > 0, at least {SMALLEST_SIGMA:g} "
+                    "(sigma=None where it is unknown)"
+                )
 
     def __repr__(self) -> str:
         masked = int((~self.mask).sum())

@@ -21,7 +21,7 @@ class Reading:
     """How a file is read; options of the command line have these names, and errors name those.
 
     Args:
-        format, quantity, bins, strata: see `fits.read`.
+        format, quantity, bins, strata, wavelengths, corrected: see `fits.read`.
         mask_retro: leave out readings within so many degrees of retro-reflection.
         mask_grazing: leave out readings beyond so many degrees from the normal.
         only: fit these readings alone (see `select`, and ``channel=red,green``).
@@ -36,12 +36,22 @@ class Reading:
     mask_grazing: float | None = None
     only: tuple[str, ...] = ()
     hold_out: tuple[str, ...] = ()
+    wavelengths: tuple[float, float] | None = None
+    corrected: bool | None = None
 
     def whole(self, path: str | Path) -> Measurements:
         """All that a file holds. ValueError as `fits.read`."""
         if self.strata is not None and self.bins in (None, "all"):
             raise ValueError("--strata is given without --bins")
-        return read(path, self.format, self.quantity, bins=self.bins, strata=self.strata or "bins")
+        return read(
+            path,
+            self.format,
+            self.quantity,
+            bins=self.bins,
+            strata=self.strata or "bins",
+            wavelengths=self.wavelengths,
+            corrected=self.corrected,
+        )
 
     def measurements(self, path: str | Path) -> Measurements:
         """What a file holds, with what is to be left out masked."""

@@ -76,6 +76,8 @@ def fit_files(
     mask_grazing: float | None = None,
     only: Sequence[str] = (),
     hold_out: Sequence[str] = (),
+    wavelengths: tuple[float, float] | None = None,
+    corrected: bool | None = None,
     objective: Objective | None = None,
     starts: int = 32,
     seed: int = 0,
@@ -96,8 +98,7 @@ def fit_files(
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a `Searching` says how.
-        format, quantity, bins, strata: see `fits.read`, of all files.
-        mask_retro, mask_grazing, only, hold_out: see `fits.data.reading.Reading`.
+        format to corrected: of all files, see `fits.data.reading.Reading`.
         objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
@@ -105,10 +106,11 @@ def fit_files(
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: no file can be read; names that are there twice; a result of another stack or of other
-            settings, unless `force`; a directory in use, or that holds something else; as `fits.engines.run`.
+        ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
+            `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
-    reading = Reading(format, quantity, bins, strata, mask_retro, mask_grazing, tuple(only), tuple(hold_out))
+    held = tuple(only), tuple(hold_out)
+    reading = Reading(format, quantity, bins, strata, mask_retro, mask_grazing, *held, wavelengths, corrected)
     found, left_out = measurement_files(_several(files), format)
     given = stack_files(_several(stacks))
     for problem in given.values():

@@ -7,7 +7,7 @@ import numpy as np
 import layerjax as lj
 from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
-from fits.data.measurements import Measurements, Source, channel_names
+from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import in_short, require_kind
 
@@ -47,7 +47,7 @@ def simulate(
     sigma = np.hypot(noise * exact, floor)
     noisy = exact + sigma * np.random.default_rng(seed).standard_normal(exact.shape)
     notes = (f"noise: relative {noise:g}, floor {floor:g} 1/sr, seed {seed}",)
-    noiseless = (sigma == 0).any(axis=1)
+    noiseless = np.any(sigma < SMALLEST_SIGMA, axis=1)
     known = noise > 0 or floor > 0
     return Measurements(
         geometry.wi,

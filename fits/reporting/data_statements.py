@@ -3,7 +3,23 @@
 import math
 from typing import TYPE_CHECKING
 
-from fits.data.checks import Agreement, Energy, Peak, energies, peaks, reciprocity, repeats, symmetry
+import numpy as np
+
+from fits.data.checks import (
+    BRIGHTER,
+    FAR,
+    Agreement,
+    Energy,
+    Peak,
+    Sides,
+    energies,
+    peaks,
+    reciprocity,
+    repeats,
+    sides,
+    symmetry,
+)
+from fits.data.totals import Totals
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -15,14 +31,49 @@ SHOWN = 6
 """Incidences whose energy is listed."""
 
 
+RADIANS = 1.6
+"""A little more than a right angle in radians: degrees of which no angle exceeds this may be none."""
+
+
 def data_statements(data: "Measurements") -> list[str]:
-    """Sentences on reciprocity, energy, symmetry, sampling and repeated readings of the used samples."""
+    """Sentences on reciprocity, energy, symmetry, sampling and repeated readings of the used samples; before them on
+    angles that look wrong. Of totals, of which no more can be said, on these alone."""
+    if isinstance(data, Totals):
+        return _units(data)
     return [
+        *_units(data),
+        *_brighter_side(sides(data)),
         _reciprocity(reciprocity(data)),
         _energy(energies(data)),
         _symmetry(symmetry(data)),
         _sampling(peaks(data)),
         _repeats(repeats(data)),
+    ]
+
+
+def _units(data: "Measurements") -> list[str]:
+    angles = data.theta_i if isinstance(data, Totals) else np.concatenate([data.theta_i, data.theta_o])
+    steepest = np.max(angles, initial=0.0)
+    if not 0.0 < steepest < RADIANS:
+        return []
+    return [f"Angles: none is above {steepest:.4g}°: are they radians? They were read as degrees."]
+
+
+def _brighter_side(found: list[Sides]) -> list[str]:
+    doubt = (
+        "Unless the sample sends light back, azimuths of this file count from the mirror direction, which must lie at "
+        "phi_o = phi_i + 180."
+    )
+    if found and all(math.isnan(one.mirror) for one in found):
+        return [f"Sides: all readings in the plane of incidence lie on the light's side. {doubt}"]
+    of_light = [one for one in found if one.light > BRIGHTER * max(one.mirror, 0.0)]
+    of_mirror = [one for one in found if one.mirror > BRIGHTER * max(one.light, 0.0)]
+    if len(of_light) <= len(of_mirror):
+        return []
+    worst = max(of_light, key=lambda one: one.light)
+    return [
+        f"Sides: the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there, and "
+        f"{worst.mirror:.3g} on the mirror side. {doubt}"
     ]
 
 
@@ -71,7 +122,12 @@ def _energy(found: list[Energy]) -> str:
 def _sampling(found: list[Peak]) -> str:
     if not found:
         return "Sampling: no scan crosses the mirror direction of its light, the peak was not seen."
-    worst = min(found, key=lambda one: one.readings)
+    if not any(one.stands_out for one in found):
+        return (
+            f"Sampling: no peak stands out about the mirror direction: readings within {FAR:g}° of it nowhere fall "
+            "to half of the brightest one."
+        )
+    worst = min((one for one in found if one.stands_out), key=lambda one: one.readings)
     words = (
         f"Sampling: the peak about the mirror direction holds {worst.readings} readings above half its height at least "
         f"(at {worst.theta:g}°, in steps of {worst.step:.2g}°)"

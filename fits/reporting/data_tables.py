@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from fits.data.measurements import Measurements
 
 MOST_CHANNELS = 6
-"""Of totals, that have a column each; of more, the range."""
+"""That have a column each; of more, the range over all of them."""
+
+NAMED = 12
+"""Channels that are named one by one."""
 
 
 def source_table(data: "Measurements") -> Table:
@@ -24,13 +27,19 @@ def source_table(data: "Measurements") -> Table:
         ("format", source.format),
         ("values came as", came_as(data)),
         ("readings", f"{len(data)}, {used} used, {len(data) - used} masked"),
-        ("channels", ", ".join(data.channels)),
+        ("channels", _channel_words(data.channels)),
         *flat,
         ("sigma", _sigma_words(data)),
         *(("attribution", word) for word in (source.attribution,) if word),
         *(("note", note) for note in source.notes),
     ]
     return Table(source.path, ("", ""), tuple(rows))
+
+
+def _channel_words(names: tuple[str, ...]) -> str:
+    if len(names) <= NAMED:
+        return ", ".join(names)
+    return f"{', '.join(names[:3])}, ..., {names[-1]} ({len(names):,} of them)"
 
 
 def came_as(data: "Measurements") -> str:
@@ -62,9 +71,8 @@ def data_table(data: "Measurements") -> Table:
     rows = []
     for incidence in incidences(data):
         theta, values = data.theta_o[incidence.rows], data.values[incidence.rows]
-        ranges = [
-            f"{values[:, channel].min():.3g} to {values[:, channel].max():.3g}" for channel in range(values.shape[1])
-        ]
+        columns = values.T if values.shape[1] <= MOST_CHANNELS else values[None]
+        ranges = [f"{own.min():.3g} to {own.max():.3g}" for own in columns]
         counts = (
             len(incidence.rows),
             np.count_nonzero(data.mask[incidence.rows]),
@@ -72,9 +80,10 @@ def data_table(data: "Measurements") -> Table:
         )
         angles = (degrees(incidence.theta), degrees(incidence.phi), f"{degrees(theta.min())} to {degrees(theta.max())}")
         rows.append((*angles, *map(str, counts), *ranges))
-    heads = tuple(f"BRDF {channel}" for channel in data.channels)
-    columns = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
-    return Table("Angles, and BRDF in 1/sr", columns, tuple(shortened(rows, 40)), keys=2)
+    few = len(data.channels) <= MOST_CHANNELS
+    heads = tuple(f"BRDF {channel}" for channel in data.channels) if few else ("BRDF",)
+    names = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
+    return Table("Angles, and BRDF in 1/sr", names, tuple(shortened(rows, 40)), keys=2)
 
 
 def _totals_table(totals: Totals) -> Table:

@@ -33,6 +33,9 @@ SUN, SKY = 0.8, 0.2
 SAMPLES = 2
 """Points along each side of a pixel."""
 
+SIZES = (16, 1024)
+"""Pixels of a sphere's diameter; more take several GB, and the whole picture has no more across."""
+
 INCIDENCES = (0.0, 30.0, 60.0, 80.0)
 SKY_COSINES, SKY_AZIMUTHS = 24, 24
 """Directions at which the reflected sky is tabulated."""
@@ -60,14 +63,14 @@ def render(
         stack: the material; every parameter a number.
         transport: see `layerjax.prepare`; None: `AddingDoubling`, all orders of scattering.
         title: what stands above it.
-        size: pixels of a sphere's diameter, >= 16.
+        size: pixels of a sphere's diameter, in [16, 1024].
 
     Raises:
-        ValueError: the size is too small, the stack ends in another index than that of air, or the transport is random
-            or does not carry the stack.
+        ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
+            random or does not carry the stack.
     """
-    if size < 16:
-        raise ValueError(f"size: {size} is not >= 16 pixels")
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise ValueError(f"size is {size}, must be in [{SIZES[0]}, {SIZES[1]}] pixels")
     for part in stacks_of(stack):
         _require_air_below(part)
     chosen = lj.AddingDoubling() if transport is None else transport

@@ -24,6 +24,7 @@ from fits.data.formats import (
     window_xml,
     zemax,
 )
+from fits.data.formats._text import without_mark
 from fits.data.formats.csv import write_csv as write_csv
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
@@ -39,7 +40,6 @@ _SAYING: dict[str, Callable[[Path], Measurements]] = {  # the file says what it 
     "klems": window_xml.read,
     "tensortree": window_xml.read,
     "pab": pab.read,
-    "alta": alta.read,
     "speos": speos.read,
     "ssdd": ssdd.read,
 }
@@ -61,6 +61,8 @@ def read(
     bins: int | Literal["all"] | None = None,
     strata: Strata = "bins",
     seed: int = 0,
+    wavelengths: tuple[float, float] | None = None,
+    corrected: bool | None = None,
 ) -> Measurements:
     """Read a measurement file: CSV, MERL, RGL, Zemax, LightTools, Speos, WINDOW XML, FRED, ASTM, pab, ALTA, SSDD, iad.
 
@@ -71,7 +73,8 @@ def read(
             Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
         quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
             "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; all others say what they hold.
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
+            hold need it; all others say it themselves.
         geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
             directions at which the file has values.
         lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
@@ -79,6 +82,7 @@ def read(
         strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
             the projected solid angle of light and viewer.
         seed: of their choice.
+        wavelengths, corrected: for iad's files only: see `read_slab`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -92,7 +96,13 @@ def read(
         raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")
     if kind != "merl" and (lookup != "centre" or strata != "bins"):
         raise ValueError(f"{path}: lookup and strata apply to MERL files only, this is a {kind} file")
+    if kind != "rxt" and not (wavelengths is None and corrected is None):
+        raise ValueError(f"{path}: wavelengths and corrected apply to rxt files only, this is a {kind} file")
+    if kind in ("totals", "rxt") and checked is not None:
+        raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
     try:
+        if kind == "rxt":
+            return rxt.read_slab(path, wavelengths=wavelengths, corrected=corrected).totals
         return _read_as(kind, path, checked, geometry, lookup, bins, strata, seed)
     except ValueError as error:
         if str(error).startswith(str(path)):
@@ -112,10 +122,8 @@ def _read_as(
 ) -> Measurements:
     if kind == "csv":
         return csv.read(path, checked)
-    if kind in ("totals", "rxt"):
-        if checked is not None:
-            raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
-        return totals_csv.read(path) if kind == "totals" else rxt.read_slab(path).totals
+    if kind == "totals":
+        return totals_csv.read(path)
     if kind == "merl":
         if checked not in (None, "brdf"):
             raise ValueError(f"{path}: quantity is {checked!r}, a MERL file always holds 'brdf'")
@@ -126,6 +134,8 @@ def _read_as(
         return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
     if kind in _TOLD:
         return _TOLD[kind](path, checked or "brdf")
+    if kind == "alta":
+        return alta.read(path, checked)
     if kind in _SAYING:
         found = _SAYING[kind](path)
         if checked not in (None, found.source.quantity):
@@ -143,6 +153,7 @@ def sniff(path: Path) -> str:
     for magic, what in _KNOWN_ELSEWHERE.items():
         if head.startswith(magic):
             raise ValueError(f"{path}: this is {what}, which has no reader here (formats: {', '.join(FORMATS)})")
+    head = without_mark(head)
     if rgl.recognises(head):
         return "rgl"
     if merl.recognises(head) or path.suffix.lower() == ".binary":
@@ -160,7 +171,9 @@ def sniff(path: Path) -> str:
 
 def _sniff_text(path: Path, head: bytes) -> str:
     """`sniff` for a file that holds no zero byte."""
-    every = [line.strip() for line in head.decode("utf-8-sig", "replace").splitlines()]
+    if window_xml.recognises(head):
+        return "tensortree" if b"tensortree" in head.lower() else "klems"
+    every = [line.strip() for line in head.decode("utf-8", "replace").splitlines()]
     if alta.recognises(every):
         return "alta"
     if pab.recognises(every):
@@ -169,8 +182,6 @@ def _sniff_text(path: Path, head: bytes) -> str:
     first = lines[0] if lines else ""
     if first.startswith(rxt.FIRST):
         return "rxt"
-    if window_xml.recognises(first):
-        return "tensortree" if b"tensortree" in head.lower() else "klems"
     if fred.recognises(first):
         return "fred"
     if lighttools.recognises(lines):

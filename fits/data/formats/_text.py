@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from fits.data.geometry import Floats
+from fits.data.measurements import LARGEST
 
 BOM = b"\xef\xbb\xbf"
-ANY_NUMBER = (-math.inf, math.inf)
+BOMS_16 = (b"\xff\xfe", b"\xfe\xff")
+ANY_NUMBER = (-LARGEST, LARGEST)
+MOST_VALUES = 20_000_000
+"""Samples times channels that are made of one file: 160 MB, which are copied some times."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,11 @@ class Line:
     def parse(self, cell: str, column: str | int, allowed: tuple[float, float] = ANY_NUMBER) -> float:
         """The finite number in a cell, inside the closed range `allowed`."""
         low, high = allowed
-        wanted = "a finite number" if allowed == ANY_NUMBER else f"a number in [{low:g}, {high:g}]"
+        wanted = (
+            f"a finite number of at most {high:g} in size"
+            if allowed == ANY_NUMBER
+            else f"a number in [{low:g}, {high:g}]"
+        )
         try:
             value = float(cell)
         except ValueError:
@@ -42,9 +50,18 @@ class Line:
         return [self.parse(cell, column, allowed) for column, cell in enumerate(self.text.split(), start=1)]
 
 
+def without_mark(raw: bytes) -> bytes:
+    """The same bytes without a byte order mark; those of UTF-16, which nothing else tells from binary, as UTF-8."""
+    if raw.startswith(BOMS_16):
+        return raw.decode("utf-16", "replace").encode()
+    return raw.removeprefix(BOM)
+
+
 def read_lines(path: Path, encoding: str = "utf-8") -> list[Line]:
     """All lines of a text file, without a byte order mark; ValueError for an empty file or one that is not text."""
-    raw = path.read_bytes().removeprefix(BOM)
+    marked = path.read_bytes()
+    raw = without_mark(marked)
+    encoding = "utf-8" if marked.startswith(BOMS_16) else encoding
     if not raw.strip():
         raise ValueError(f"{path}: the file is empty")
     try:
@@ -68,7 +85,7 @@ def rows(lines: list[Line], columns: int) -> Floats:
         numbers = np.array(cells, np.float64)
     except ValueError:
         numbers = np.empty(0)
-    if numbers.shape == (len(lines), columns) and np.isfinite(numbers).all():
+    if numbers.shape == (len(lines), columns) and np.max(np.abs(numbers), initial=0.0) <= LARGEST:  # NaN is not
         return numbers
     for line, found in zip(lines, cells, strict=True):  # which one it was
         if len(found) != columns:
@@ -88,6 +105,15 @@ def within(lines: list[Line], values: Floats, column: str | int, allowed: tuple[
 
 def _columns(cells: list[str]) -> list[tuple[str, int]]:
     return [(cell, column) for column, cell in enumerate(cells, start=1)]
+
+
+def require_room(path: Path, samples: int, channels: int) -> None:
+    """ValueError for more than can be held: files may state few numbers that stand for many."""
+    if samples * channels > MOST_VALUES:
+        raise ValueError(
+            f"{path}: {plural(samples, 'sample')} of {plural(channels, 'channel')} are {samples * channels:,} numbers, "
+            f"must be {MOST_VALUES:,} at most"
+        )
 
 
 def plural(count: int, noun: str) -> str:

@@ -1,17 +1,31 @@
 """What the readers of XML files of LBNL WINDOW and Radiance share: the layer, its blocks, and texts in it."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
+
+from fits.data.formats._text import BOMS_16, without_mark
 
 COME = {"front": 1.0, "back": -1.0}
 """Of the side that light comes from: the sign of z. WINDOW's front is the top."""
 
 
+ELEMENT = re.compile(rb"<(\w+:)?WindowElement\b")
+
+
 def layer_of(path: Path) -> ElementTree.Element:
-    """The layer of the file, without namespaces."""
+    """The layer of the file, without namespaces. What stands before the XML is no part of it, as for Radiance."""
+    marked = path.read_bytes()
+    raw = without_mark(marked)
+    start = ELEMENT.search(raw)
+    begin = start.start() if start else 0
+    declared = raw.rfind(b"<?xml", 0, begin)
+    begin = begin if declared < 0 else declared
+    # what was UTF-16 is UTF-8 now, whatever its declaration says
+    parser = ElementTree.XMLParser(encoding="utf-8" if marked.startswith(BOMS_16) else None)
     try:
-        root = ElementTree.fromstring(path.read_bytes())
+        root = ElementTree.fromstring(raw[begin:].lstrip(), parser)
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise ValueError(f"{path}: not well-formed XML: {error}") from None
     for element in root.iter():

@@ -19,18 +19,19 @@ import numpy as np
 from fits.data.formats._text import Line, plural, read_lines, rows
 from fits.data.geometry import TANGENT_COSINE, Floats
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
-from fits.names import Quantity
+from fits.names import QUANTITIES, Quantity
 
-_HOLDS: dict[str, tuple[Quantity, int, tuple[str, ...] | None]] = {
+_HOLDS: dict[str, tuple[Quantity | None, int, tuple[str, ...] | None]] = {
     "INV_STERADIAN": ("brdf", 0, None),
     "INV_STERADIAN_COSINE_FACTOR": ("brdf_cos", 0, None),
-    "ENERGY": ("brdf", 0, None),
-    "RGB_COLOR": ("brdf", 3, None),
-    "XYZ_COLOR": ("brdf", 3, ("X", "Y", "Z")),
+    "UNKNOWN": (None, 0, None),
+    "UNKNOWN_OUTPUT": (None, 0, None),
+    "ENERGY": (None, 0, None),
+    "RGB_COLOR": (None, 3, None),
+    "XYZ_COLOR": (None, 3, ("X", "Y", "Z")),
 }
-"""Of PARAM_OUT: the quantity, how many columns (0: any), and names."""
+"""Of PARAM_OUT: the quantity (None: it does not say), how many columns (0: any), and names."""
 
-_UNSAID = ("ENERGY", "RGB_COLOR", "XYZ_COLOR")
 _KEYS = ("DIM", "PARAM_IN", "PARAM_OUT", "VS", "FORMAT")
 _MOST = 1000
 
@@ -43,8 +44,8 @@ def recognises(lines: list[str]) -> bool:
     return {"#DIM", "#PARAM_IN"} <= keys
 
 
-def read(path: Path) -> Measurements:
-    """Read such a file; the quantity is what it says. Errors as in `fits.read`."""
+def read(path: Path, quantity: Quantity | None = None) -> Measurements:
+    """Read such a file, whose numbers are what it says, or `quantity` where it does not. Errors as in `fits.read`."""
     raw = path.read_bytes()
     if b"#BEGIN_STREAM" in raw:
         raise ValueError(f"{path}: ALTA's binary data, which have no reader here; data2data writes them as text")
@@ -54,7 +55,7 @@ def read(path: Path) -> Measurements:
     dim_x, dim_y, spare = _dimensions(said)
     if dim_x != columns:
         raise said["DIM"][0].error(f"{dim_x} columns of {coordinates}, must be {columns}")
-    quantity, names = _quantity(said, dim_y)
+    holds, names = _quantity(path, said, dim_y, quantity)
     body = [line for line in lines if line.text.strip() and not line.text.lstrip().startswith("#")]
     if not body:
         raise ValueError(f"{path}: no samples below the header, must be at least one")
@@ -66,18 +67,16 @@ def read(path: Path) -> Measurements:
     if not real.any():
         raise ValueError(f"{path}: none of the {plural(len(body), 'sample')} has directions in {coordinates}")
     wo, wi = (w[real] / size[real, None] for w, size in zip((wo, wi), length, strict=True))
-    values = to_bsdf(table[real, dim_x : dim_x + dim_y], wo, quantity)
+    values = to_bsdf(table[real, dim_x : dim_x + dim_y], wo, holds)
     used = np.minimum(wi[:, 2], wo[:, 2]) > TANGENT_COSINE
     notes = [f"directions from {coordinates}"]
-    if said["PARAM_OUT"][1][0] in _UNSAID:
-        notes.append(f"{said['PARAM_OUT'][1][0]} taken as the BRDF in 1/sr: the file does not say")
     if spare:
         notes.append("vertical segments (VS) are left out: the file does not say how sure they are")
     if not real.all():
         notes.append(f"left out: {plural(int((~real).sum()), 'sample')} of no directions")
     if not used.all():
         notes.append(f"masked: {plural(int((~used).sum()), 'sample')} with light or view at or below the horizon")
-    source = Source(str(path), "alta", quantity, tuple(notes))
+    source = Source(str(path), "alta", holds, tuple(notes))
     return Measurements(wi, wo, values, None, used, names or channel_names(dim_y), source)
 
 
@@ -91,7 +90,7 @@ def _header(path: Path, lines: list[Line]) -> dict[str, tuple[Line, list[str]]]:
             break
         if words[0][1:] in _KEYS:
             said[words[0][1:]] = (line, words[1:])
-    for key in ("DIM", "PARAM_IN", "PARAM_OUT"):
+    for key in ("DIM", "PARAM_IN"):
         if key not in said or not said[key][1]:
             raise ValueError(f"{path}: the header has no line '#{key} ...'")
     return said
@@ -111,14 +110,26 @@ def _dimensions(said: dict[str, tuple[Line, list[str]]]) -> tuple[int, int, int]
     return int(sizes[0]), int(sizes[1]), sum(int(word) for word in words)
 
 
-def _quantity(said: dict[str, tuple[Line, list[str]]], dim_y: int) -> tuple[Quantity, tuple[str, ...] | None]:
-    line, words = said["PARAM_OUT"]
-    if words[0] not in _HOLDS:
-        raise line.error(f"PARAM_OUT is {words[0][:40]!r}, must be one of {', '.join(_HOLDS)}")
-    quantity, count, names = _HOLDS[words[0]]
+def _quantity(
+    path: Path, said: dict[str, tuple[Line, list[str]]], dim_y: int, given: Quantity | None
+) -> tuple[Quantity, tuple[str, ...] | None]:
+    """What the values are, by the file or else by who asks, and names of their columns."""
+    line, words = said.get("PARAM_OUT", (said["DIM"][0], []))
+    word = words[0] if words else "UNKNOWN"
+    if word not in _HOLDS:
+        raise line.error(f"PARAM_OUT is {word[:40]!r}, must be one of {', '.join(_HOLDS)}")
+    stated, count, names = _HOLDS[word]
     if count not in (0, dim_y):
-        raise line.error(f"{words[0]} has {count} columns, DIM says {dim_y}")
-    return quantity, names
+        raise line.error(f"{word} has {count} columns, DIM says {dim_y}")
+    if given is not None and stated not in (None, given):
+        raise ValueError(f"{path}: quantity is {given!r}, this alta file says {stated!r}")
+    holds = stated or given
+    if holds is None:
+        raise ValueError(
+            f"{path}: {f'PARAM_OUT {word}' if words else 'no PARAM_OUT: the header'} does not say what the values are: "
+            f"give quantity (--quantity), one of {', '.join(QUANTITIES)}"
+        )
+    return holds, names
 
 
 def _coordinates(entry: tuple[Line, list[str]]) -> tuple[str, int, Callable[[Floats], Pair]]:

@@ -9,10 +9,11 @@ brdf | brdf_cos | reflectance_factor
                              f in 1/sr | f |cos theta_o| | pi f. For several channels one column each: brdf_red, ...
 bsdf | bsdf_cos | brf, reflectance
                              other names for the same; a note says what they were taken for
-<that column>_std | _sigma   its standard deviation (optional); an empty cell means unknown
+<that column>_std | _sigma   its standard deviation (optional); an empty cell or nan means unknown
 used                         1 or 0 (optional): whether the sample takes part in fits
 
-Other columns are left out and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
+A row without a value (an empty cell, nan or NA in a value column) is left out, and a note says how many were. Other
+columns are left out and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
 them. The delimiter is a comma, semicolon or tab.
 """
 
@@ -24,14 +25,15 @@ import numpy as np
 
 from fits._files import write_text
 from fits.data import geometry
+from fits.data.formats._cells import Table, delimiter_of, named
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import Measurements, Source, channel_names, check_quantity, to_bsdf
+from fits.data.measurements import LARGEST, SMALLEST_SIGMA, Measurements, Source, channel_names, check_quantity, to_bsdf
 from fits.data.totals import Totals
 from fits.names import QUANTITIES, Quantity
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
-_NOT_NEGATIVE = (0.0, float("inf"))
+_NOT_NEGATIVE = (0.0, LARGEST)
 SUFFIXES = ("_std", "_sigma")
 _QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
     **{quantity: quantity for quantity in QUANTITIES},
@@ -68,14 +70,17 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     table = Table(header, body)
     kind, channels = _value_columns(header, table.names, quantity)
     chosen = _QUANTITY_OF[kind]
+    empty = table.leave_out_missing(list(channels.values()))
 
     written_here = lines[0].text == _FIRST_LINE
     wi, wo, notes = _directions(table, written_here)
+    if empty:
+        notes.append(f"left out: {plural(empty, 'sample')} without a value (an empty cell, or nan)")
     if kind != chosen:
-        notes.append(f"{_named(list(channels.values()))} taken for {_MEANING[chosen]}")
+        notes.append(f"{named(list(channels.values()))} taken for {_MEANING[chosen]}")
 
     values = to_bsdf(np.stack([table.column(name) for name in channels.values()], axis=-1), wo, chosen)
-    used = table.column("used", (0.0, 1.0)) == 1 if "used" in table.names else np.ones(len(body), bool)
+    used = table.column("used", (0.0, 1.0)) == 1 if "used" in table.names else np.ones(len(table.body), bool)
     tangent = np.minimum(abs(wi[:, 2]), abs(wo[:, 2])) < geometry.TANGENT_COSINE
     if (used & tangent).any():
         notes.append(
@@ -158,7 +163,7 @@ def csv_text(measurements: Measurements) -> str:
     return text.getvalue()
 
 
-def _directions(table: "Table", written_here: bool) -> tuple[Floats, Floats, list[str]]:
+def _directions(table: Table, written_here: bool) -> tuple[Floats, Floats, list[str]]:
     """Unit vectors towards light and viewer, (N, 3) each, and what is to be noted of them."""
     theta_i = table.column("theta_i", _BELOW_TOO if written_here else _ABOVE)
     notes = []
@@ -170,51 +175,6 @@ def _directions(table: "Table", written_here: bool) -> tuple[Floats, Floats, lis
         theta_o = table.column("theta_o", _SIGNED)
         notes = ["no azimuth columns: theta_o is signed, in the plane of incidence, positive on the mirror side"]
     return geometry.direction(theta_i, phi_i), geometry.direction(theta_o, phi_o), notes
-
-
-class Table:
-    """The cells below a header line; columns are parsed when asked for, so that unused ones may hold anything."""
-
-    def __init__(self, header: Line, body: list[Line]) -> None:
-        self.header, self.body = header, body
-        delimiter = delimiter_of(header.text)
-        self.names = [name.strip() for name in _cells(header, delimiter)]
-        for position, name in enumerate(self.names):
-            if name in self.names[:position]:
-                raise header.error("this column appears twice, each may appear once", name)
-        if not body:
-            raise header.error("no samples below the header, must be at least one")
-        self.cells = [_cells(line, delimiter) for line in body]
-        for line, cells in zip(body, self.cells, strict=True):
-            if len(cells) != len(self.names):
-                raise line.error(f"{plural(len(cells), 'cell')}, must be {len(self.names)} as in the header")
-
-    def column(self, name: str, allowed: tuple[float, float] = (-np.inf, np.inf), empty: float | None = None) -> Floats:
-        """The numbers of a column, (N,); an empty cell gives `empty`, or is an error where that is None."""
-        if name not in self.names:
-            raise self.header.error(f"no column {name!r}, the file has {', '.join(self.names)}")
-        position = self.names.index(name)
-        return np.array(
-            [
-                empty
-                if empty is not None and not cells[position].strip()
-                else line.parse(cells[position], name, allowed)
-                for line, cells in zip(self.body, self.cells, strict=True)
-            ],
-            dtype=float,
-        )
-
-
-def _cells(line: Line, delimiter: str) -> list[str]:
-    try:
-        return next(csv.reader([line.text], delimiter=delimiter, strict=True))
-    except csv.Error as error:
-        raise line.error(f"not a line of CSV ({error})") from None
-
-
-def delimiter_of(header: str) -> str:
-    """What divides the cells of a header line."""
-    return max(",;\t", key=header.count)
 
 
 def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
@@ -268,12 +228,6 @@ def _names_to_write(channels: tuple[str, ...]) -> list[str]:
     return columns
 
 
-def _named(columns: list[str]) -> str:
-    if len(columns) == 1:
-        return f"column {columns[0]}"
-    return f"columns {', '.join(columns if len(columns) < 5 else [columns[0], '...', columns[-1]])}"
-
-
 def _spread_column(names: list[str], column: str) -> str | None:
     return next((column + suffix for suffix in SUFFIXES if column + suffix in names), None)
 
@@ -286,10 +240,15 @@ def _sigma(table: Table, columns: list[str | None], used: np.ndarray, notes: lis
     sigma = np.stack(
         [table.column(name, _NOT_NEGATIVE, empty=np.nan) if name else unknown for name in columns], axis=-1
     )
-    zero = used & (sigma == 0).any(axis=1)
+    zero = used & (sigma < SMALLEST_SIGMA).any(axis=1)
     if zero.any():
-        row, name = int(np.argmax(zero)), columns[int(np.argmax((sigma == 0)[np.argmax(zero)]))]
-        raise table.body[row].error("0 is not allowed, must be > 0 (leave the cell empty where it is unknown)", name)
+        row = int(np.argmax(zero))
+        column = int(np.argmax(sigma[row] < SMALLEST_SIGMA))
+        raise table.body[row].error(
+            f"{sigma[row, column]:g} is not allowed, must be > 0, at least {SMALLEST_SIGMA:g} (leave the cell empty "
+            "where it is unknown)",
+            columns[column],
+        )
     if np.isnan(sigma).all():
         notes.append("the standard deviation columns are empty: sigma is unknown")
         return None

@@ -21,6 +21,7 @@ from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
 
 _FORMAT = {"angles": ("deg",), "bsdf": ("value",)}  # FRED also knows angles=sin and bsdf=log
+_NOTHING = "a specular direction (a line of two numbers) without scatter directions, or the last number is missing"
 _TILT, _INCIDENCE, _AZIMUTH = (-90.0, 90.0), (0.0, 90.0), (-360.0, 360.0)
 
 
@@ -41,20 +42,27 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     scale = _scale(lines[1])
 
     specular: tuple[float, float] | None = None
+    opened: Line | None = None  # a block in which nothing was found yet
     rows = []
     for line in lines[2:]:
         cells = line.text.split()
         if len(cells) == 2:
+            if opened is not None:
+                raise opened.error(_NOTHING)
+            opened = line
             specular = line.parse(cells[0], "theta_spec", _INCIDENCE), line.parse(cells[1], "phi_spec", _AZIMUTH)
         elif len(cells) == 3:
             if specular is None:
                 raise line.error("a scatter direction before any specular direction (a line of two numbers)")
+            opened = None
             scatter = line.parse(cells[0], "theta_scat", _TILT), line.parse(cells[1], "phi_scat", _AZIMUTH)
             rows.append((*specular, *scatter, line.parse(cells[2], "bsdf")))
         else:
             raise line.error(
                 f"{plural(len(cells), 'number')}, must be 2 (specular direction) or 3 (direction and BSDF)"
             )
+    if opened is not None:
+        raise opened.error(_NOTHING)
     if not rows:
         raise ValueError(f"{path}: no samples below the header, must be at least one")
     theta_s, phi_s, theta_o, phi_o, bsdf = np.array(rows).T

@@ -65,7 +65,8 @@ def read(
     strata: what each of so many bins stands for an equal share of: "bins" of the table, which are dense around the
         mirror direction, or "flux", the projected solid angle of light and viewer, as in an integral over both.
     seed: of the choice.
-    A sample that needs a bin without a measurement is masked and holds 0; bins that are chosen all have one.
+    A sample that needs a bin without a measurement, or one that holds nan, is masked and holds 0; bins that are chosen
+    all have one.
     """
     if lookup not in LOOKUPS:
         raise ValueError(f"lookup is {lookup!r}, must be one of {', '.join(LOOKUPS)}")
@@ -92,19 +93,33 @@ def read(
             corners, weights = np.minimum(index, np.array(SHAPE) - 1e-9).astype(int)[None], np.ones((1, len(index)))
         else:
             corners, weights = corners_around(index)
-    corner_values = table[:, corners[..., 0], corners[..., 1], corners[..., 2]]  # (3, corners, N)
-    _require_finite(path, corner_values)
-    valid = ((corner_values >= 0) | (weights == 0)).all(axis=(0, 1))
+    values, valid, more_notes = _looked_up(path, table, corners, weights)
+    return _readings(path, geometry, values, valid, notes + more_notes)
+
+
+def _looked_up(
+    path: Path, table: Floats, corners: Indices, weights: Floats
+) -> tuple[Floats, NDArray[np.bool_], list[str]]:
+    """Means (N, 3) over bins (K, N, 3) with weights (K, N), whether they were measured (N,), and notes."""
+    corner_values = np.where(weights == 0, 0.0, table[:, corners[..., 0], corners[..., 1], corners[..., 2]])
+    lost = _damaged(path, corner_values).any(axis=(0, 1))
+    valid = np.asarray((corner_values >= 0).all(axis=(0, 1)))
+    if lost.all():
+        raise ValueError(f"{path}: all bins that are asked for hold nan")
     values = np.where(valid, (weights * corner_values).sum(axis=1), 0.0).T * SCALE
-    if not valid.all():
-        notes.append(f"masked: {plural(int((~valid).sum()), 'sample')} that need a bin without a measurement")
-    return _readings(path, geometry, values, valid, notes)
+    notes = []
+    if lost.any():
+        notes.append(f"left out: {plural(int(lost.sum()), 'sample')} that need a bin that holds nan")
+    if not (valid | lost).all():
+        count = int((~valid & ~lost).sum())
+        notes.append(f"masked: {plural(count, 'sample')} that need a bin without a measurement")
+    return values, valid, notes
 
 
 def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, seed: int) -> Measurements:
     """Readings at the centres of bins that hold a measurement."""
     table = _table(path)
-    _require_finite(path, table)
+    lost = _damaged(path, table).any(axis=0)
     wi, wo = centre(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
     cosine_i, cosine_o = wi[:, 2].reshape(SHAPE), wo[:, 2].reshape(SHAPE)
     readable = (cosine_i > 0) & (cosine_o > 0) & (table >= 0).all(axis=0)
@@ -123,7 +138,10 @@ def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, s
     turn = np.radians(LIGHT_AZIMUTH - azimuth(wi))
     values = table[:, *chosen.T].T * SCALE
     geometry = Geometry(_turned(wi, turn), _turned(wo, turn))
-    return _readings(path, geometry, values, np.ones(len(values), bool), [CONVENTION, note])
+    notes = [CONVENTION, note]
+    if lost.any():
+        notes.append(f"left out: {plural(int(lost.sum()), 'bin')} of the table that hold nan")
+    return _readings(path, geometry, values, np.ones(len(values), bool), notes)
 
 
 def _readings(
@@ -133,9 +151,11 @@ def _readings(
     return Measurements(geometry.wi, geometry.wo, values, None, valid, CHANNELS, source)
 
 
-def _require_finite(path: Path, values: Floats) -> None:
-    if not np.isfinite(values).all():
-        raise ValueError(f"{path}: the table holds {values[~np.isfinite(values)][0]}, must be finite")
+def _damaged(path: Path, values: Floats) -> NDArray[np.bool_]:
+    """Where values are nan, which programs write for what was not measured; ValueError for infinite ones."""
+    if np.isinf(values).any():
+        raise ValueError(f"{path}: the table holds {values[np.isinf(values)][0]}, must be finite")
+    return np.isnan(values)
 
 
 def half_difference(wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:

@@ -3,9 +3,13 @@
 After ``IAD1`` stand numbers, whatever the lines; ``#`` begins a comment. In this order: index of the sample, of the
 slides; thickness of the sample, of a slide, diameter of the beam in mm; reflectance of the standard; how many spheres
 at a time; five numbers of the reflection sphere and five of the transmission sphere (diameter, ports of sample, light
-and detector in mm, reflectance of the wall). Then either how many kinds of readings a row has (1: M_R, 2: and M_T, 3:
-and M_U), or letters that name its columns: L wavelength, r M_R, t M_T, u M_U, n index of the sample, N of the slides,
-d thickness, g asymmetry. Then the rows; with a count, a number above 1 at the head of a row is its wavelength.
+and detector in mm, reflectance of the wall). Then either how many columns a row has (1: M_R, 2: and M_T, 3: and M_U, 4:
+and the wall's reflectance, 5: and that of the other sphere, 6, 7: and of the standards), or letters that name them, as
+`COLUMNS` says. Then the rows; with a count, a number above 1 at the head of a row is its wavelength. As `iad_io.w` of
+iad 4 reads it.
+
+The header does not say how readings were compared. By two beams the sphere has the same gain for sample and standard,
+and iad makes no correction (`iad -X`); where a comment of the file says so, neither does this reader, and a note tells.
 """
 
 import re
@@ -15,9 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fits._files import require_file
-from fits.data.formats._text import Line, read_lines
+from fits.data.formats._text import Line, plural, read_lines
 from fits.data.geometry import Floats
 from fits.data.measurements import Source
 from fits.data.spheres import Sphere, Spheres
@@ -26,17 +31,59 @@ from fits.data.totals import KINDS, Kind, Totals
 if TYPE_CHECKING:
     import layerjax as lj
 
+Indices = NDArray[np.int_]
+
 FIRST = "IAD1"
 HEADER = 17
 """Numbers before the readings: seven of the sample and how it was read, and five of each sphere."""
 
 LETTERS: dict[str, Kind] = {"r": "reflectance", "t": "transmittance", "u": "unscattered"}
-BESIDE = ("L", "n", "N", "d", "g")
+COUNTED = "rtuwWRT"
+"""Columns that a count stands for."""
+
+COLUMNS = {
+    **LETTERS,
+    "L": "wavelength in nm",
+    "i": "incidence in degrees",
+    "n": "index of the sample",
+    "N": "index of the slides",
+    "d": "thickness of the sample in mm",
+    "D": "thickness of a slide in mm",
+    "g": "asymmetry",
+    "R": "reflectance of the standard",
+    "w": "reflectance of the wall, of both spheres where there is no W",
+    "W": "reflectance of the wall of the transmission sphere",
+    "S": "number of spheres",
+    "M": "number of spheres",
+    "c": "share of what is mirrored that M_R holds",
+    "C": "share of what passes unscattered that M_T holds",
+    "E": "optical depth of a slide",
+}
+UNUSED = {
+    "T": "standard of the transmission sphere",
+    "B": "beam",
+    "a": "albedo",
+    "A": "mu_a",
+    "b": "optical depth",
+    "F": "mu_s",
+    "e": "tolerance",
+    "q": "quadrature",
+}
+"""Columns that iad's inversion takes and that say nothing of readings here."""
+
+MUST_BE = {"c": 1.0, "C": 1.0, "E": 0.0}
+"""What the model cannot follow otherwise."""
+
 SMOOTH = 1e-4
 """Roughness of a polished face."""
 
 ALIKE = 0.01
-"""Indices and thicknesses that vary by less from row to row are taken for one."""
+"""Numbers of the slab and of the standard that vary by less from row to row, of their value, are taken for one."""
+
+WALLS_ALIKE = 0.002
+"""Reflectances of walls that do: what is lost at a wall decides, not what is sent back."""
+
+_TWO_BEAMS = re.compile(r"(?i:dual[ -]?beam)|\biad\s(.*\s)?-X\b")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +91,11 @@ class Slab:
     """A slab as iad describes it, and what was read of it.
 
     Attributes:
-        totals: a channel for each row of the file.
-        wavelengths: of the rows, in nm; None where the file has none.
+        totals: a channel for each row of the file, or each wavelength where there are several incidences.
+        wavelengths: of the channels, in nm; None where the file has none.
         ior, ior_slides: refractive indices; of the slides 1 where there are none.
         thickness_mm: of the sample.
-        asymmetry: g of the rows, None where the file has none.
+        asymmetry: g of the channels, None where the file has none.
     """
 
     totals: Totals
@@ -72,19 +119,20 @@ class Slab:
 def read_slab(
     path: str | Path,
     *,
-    incidence: float = 0.0,
+    incidence: float | None = None,
     sigma: float = 0.01,
-    corrected: bool = False,
+    corrected: bool | None = None,
     wavelengths: tuple[float, float] | None = None,
 ) -> Slab:
     """Read an ``.rxt`` file.
 
     Args:
         path: the file.
-        incidence: polar angle of the light, in [0, 90) degrees; the format does not say it.
-        sigma: standard deviation of every reading, above 0; nor this.
+        incidence: polar angle of the light, in [0, 90) degrees; None: that of column ``i``, or 0 without one.
+        sigma: standard deviation of every reading, above 0; the format does not say it.
         corrected: the readings are of the slab itself, whatever the spheres: two beams were compared, say. Else what
             spheres add is part of the model (`Spheres`): of one at a time, each for its reading, or of two together.
+            None: corrected if a comment of the file says that two beams were compared, and a note tells of it.
         wavelengths: the lowest and the highest that are read, in nm; None for all rows.
 
     Raises:
@@ -101,45 +149,113 @@ def read_slab(
     if len(words) < HEADER:
         raise ValueError(f"{path}: {len(words)} numbers, must be {HEADER} before the readings")
     header = [line.parse(text, place) for place, (line, text) in enumerate(words[:HEADER], start=1)]
-    ior, slides, thickness, slide = header[:4]
-    by = None if corrected else _spheres(path, header)
     columns = _columns(path, words[HEADER:])
     if wavelengths is not None:
-        columns = _within(path, columns, *wavelengths)
-    given = {kind: columns[letter] for letter, kind in LETTERS.items() if letter in columns}
-    if not given:
+        columns = _within(path, columns, *_interval(wavelengths))
+    if not any(letter in columns for letter in LETTERS):
         raise ValueError(f"{path}: no column of r, t or u")
-    count = len(next(iter(given.values())))
-    waves = columns.get("L")
-    names = [f"row {place + 1}" for place in range(count)]
-    if waves is not None and len(set(waves)) == count:
-        names = [f"{wave:g} nm" for wave in waves]
-    shares: dict[str, Any] = {kind: given[kind][None] for kind in KINDS if kind in given}
-    totals = Totals.of(incidence, **shares, sigma=sigma, channels=names, spheres=by)
-    totals = replace(totals, source=Source(str(path), "rxt"))
-    slides = _one(path, "N", columns, slides) if slide > 0 and slides > 0 else 1.0
+    for letter, needed in MUST_BE.items():
+        if letter in columns and (columns[letter] != needed).any():
+            bad = columns[letter][columns[letter] != needed][0]
+            raise ValueError(f"{path}: {letter}, the {COLUMNS[letter]}, is {bad:g}, must be {needed:g}")
+    slides = _one(path, "N", columns, header[1])
+    glass = columns.get("D", np.array(header[3:4]))
+    if (glass > 0).any() != (glass > 0).all():
+        raise ValueError(f"{path}: D is 0 in some rows only; choose rows that are alike by their wavelengths")
+    totals, first = _totals(path, columns, incidence, sigma)
+    by, notes = _compared(path, _described(path, header, columns), lines, corrected)
+    unused = [f"{letter} ({UNUSED[letter]})" for letter in columns if letter in UNUSED]
+    notes += [f"columns not used: {', '.join(unused)}"] if unused else []
     return Slab(
-        totals=totals,
-        wavelengths=waves,
-        ior=_one(path, "n", columns, ior),
-        ior_slides=slides,
-        thickness_mm=_one(path, "d", columns, thickness),
-        asymmetry=columns.get("g"),
+        totals=replace(totals, spheres=by, source=Source(str(path), "rxt", notes=tuple(notes))),
+        wavelengths=columns["L"][first] if "L" in columns else None,
+        ior=_one(path, "n", columns, header[0]),
+        ior_slides=slides if (glass > 0).all() and slides > 0 else 1.0,
+        thickness_mm=_one(path, "d", columns, header[2]),
+        asymmetry=columns["g"][first] if "g" in columns else None,
     )
 
 
-def _spheres(path: Path, header: list[float]) -> Spheres | None:
-    """What the header says of spheres; a sphere of no diameter is none."""
-    standard, count = header[5], header[6]
+def _totals(path: Path, columns: dict[str, Floats], given: float | None, sigma: float) -> tuple[Totals, Indices]:
+    """Readings by incidence and channel, and the rows (C,) of the first incidence, which name the channels."""
+    count = len(next(iter(columns.values())))
+    if given is not None and "i" in columns:
+        raise ValueError(f"{path}: incidence is {given:g}, and the file has a column i of its own: leave it out")
+    at = columns.get("i", np.full(count, given or 0.0))
+    angles = at[np.sort(np.unique(at, return_index=True)[1])]
+    rows = [np.flatnonzero(at == angle) for angle in angles]
+    waves = columns.get("L")
+    for angle, own in zip(angles, rows, strict=True):
+        alike = len(own) == len(rows[0]) and (waves is None or np.array_equal(waves[own], waves[rows[0]]))
+        if not alike:
+            raise ValueError(
+                f"{path}: rows at {angle:g} degrees have other wavelengths than those at {angles[0]:g}, must have "
+                "the same: choose rows by their wavelengths"
+            )
+    first = rows[0]
+    names = [f"row {place + 1}" for place in range(len(first))]
+    if waves is not None and len(set(waves[first])) == len(first):
+        names = [f"{wave:g} nm" for wave in waves[first]]
+    given_kinds = {kind: columns[letter] for letter, kind in LETTERS.items() if letter in columns}
+    shares: dict[str, Any] = {kind: given_kinds[kind][np.array(rows)] for kind in KINDS if kind in given_kinds}
+    try:
+        return Totals.of(angles, **shares, sigma=sigma, channels=names), first
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _compared(
+    path: Path, by: Spheres | None, lines: list[Line], corrected: bool | None
+) -> tuple[Spheres | None, list[str]]:
+    """The spheres that the model takes on itself, and what is to be noted."""
+    if corrected is not None or by is None:
+        return (None if corrected else by), []
+    comments = (line.text.partition("#")[2] for line in lines)
+    if not any(_TWO_BEAMS.search(comment) for comment in comments):
+        return by, []
+    if by.together:
+        raise ValueError(
+            f"{path}: a comment says that two beams were compared, and the header that two spheres stand together: "
+            "say which holds with corrected (--corrected, --no-corrected)"
+        )
+    return None, [
+        "a comment says that two beams were compared: spheres are left out, as by iad -X (--no-corrected counts them)"
+    ]
+
+
+def _described(path: Path, header: list[float], columns: dict[str, Floats]) -> Spheres | None:
+    """What header and columns say of spheres; a sphere of no diameter is none."""
+    counts = [columns[letter] for letter in "SM" if letter in columns] or [np.array(header[6:7])]
+    if len(set(np.concatenate(counts))) > 1:
+        raise ValueError(f"{path}: the number of spheres varies; choose rows that are alike by their wavelengths")
+    count = float(counts[0][0])
     if count not in (0, 1, 2):
         raise ValueError(f"{path}: number of spheres is {count:g}, must be 0, 1 or 2")
     if count == 0:
         return None
+    walls = [_one(path, "w", columns, header[11], WALLS_ALIKE)]
+    walls.append(_one(path, "W" if "W" in columns else "w", columns, header[16], WALLS_ALIKE))
+    standard = _one(path, "R", columns, header[5])
+    ports = header[7:11], header[12:16]
     try:
-        front, behind = (Sphere(*numbers) if numbers[0] else None for numbers in (header[7:12], header[12:17]))
+        front, behind = (
+            Sphere(port[0], port[1], port[2], port[3], wall) if port[0] else None
+            for port, wall in zip(ports, walls, strict=True)
+        )
         return Spheres(front, behind, standard, together=count == 2)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _interval(wavelengths: Any) -> tuple[float, float]:
+    """The lowest and the highest; ValueError for what is no such pair."""
+    try:
+        low, high = (float(one) for one in wavelengths)
+    except (TypeError, ValueError):
+        low = high = np.nan
+    if not 0.0 <= low <= high < np.inf:
+        raise ValueError(f"wavelengths is {wavelengths!r}, must be two numbers in nm, the lowest and the highest")
+    return low, high
 
 
 def _words(line: Line) -> list[tuple[Line, str]]:
@@ -150,28 +266,30 @@ def _words(line: Line) -> list[tuple[Line, str]]:
 
 def _columns(path: Path, words: list[tuple[Line, str]]) -> dict[str, Floats]:
     """The readings by the letters of their columns, (rows,) each."""
-    letters = []
-    for _, text in words:
-        if _is_number(text):
-            break
-        letters.append(text)
+    letters: list[str] = []
+    place = 0
+    while place < len(words) and not _is_number(words[place][1]):
+        letters += words[place][1].replace("-", "")  # iad takes them with or without blanks and dashes
+        place += 1
     if letters:
-        return _lettered(path, letters, words[len(letters) :])
+        return _lettered(path, letters, words[place:])
     if not words:
         raise ValueError(f"{path}: no readings behind the description of the spheres")
     line, text = words[0]
-    kinds = line.parse(text, "number of measurements", (1.0, 3.0))
-    if kinds != int(kinds):
-        raise line.error(f"{text} is not allowed, must be 1, 2 or 3", "number of measurements")
-    names = [*LETTERS][: int(kinds)]
+    count = line.parse(text, "number of measurements", (1.0, len(COUNTED)))
+    if count != int(count):
+        raise line.error(f"{text} is not allowed, must be a whole number in [1, 7]", "number of measurements")
+    names = [*COUNTED[: int(count)]]
     first = words[1:2] and words[1][0].parse(words[1][1], "L")
     return _lettered(path, ["L", *names] if first and first > 1.0 else names, words[1:])
 
 
 def _lettered(path: Path, letters: list[str], words: list[tuple[Line, str]]) -> dict[str, Floats]:
-    for letter in letters:
-        if letter not in (*LETTERS, *BESIDE):
-            raise ValueError(f"{path}: column {letter!r} is not one of {', '.join((*LETTERS, *BESIDE))}")
+    for place, letter in enumerate(letters):
+        if letter not in COLUMNS | UNUSED:
+            raise ValueError(f"{path}: column {letter!r} is not one of {', '.join(COLUMNS | UNUSED)}")
+        if letter in letters[:place]:
+            raise ValueError(f"{path}: column {letter!r} appears twice, each may appear once")
     numbers = [line.parse(text, letters[place % len(letters)]) for place, (line, text) in enumerate(words)]
     if not numbers or len(numbers) % len(letters):
         on_lines: dict[int, list[Line]] = {}
@@ -179,7 +297,7 @@ def _lettered(path: Path, letters: list[str], words: list[tuple[Line, str]]) -> 
             on_lines.setdefault(line.number, []).append(line)
         for found in on_lines.values():
             if len(found) % len(letters):
-                raise found[0].error(f"{len(found)} numbers, must be {len(letters)}: {' '.join(letters)}")
+                raise found[0].error(f"{plural(len(found), 'number')}, must be {len(letters)}: {' '.join(letters)}")
         raise ValueError(f"{path}: no readings behind the names of the columns")
     rows = np.array(numbers).reshape(-1, len(letters))
     return {letter: rows[:, place] for place, letter in enumerate(letters)}
@@ -198,15 +316,15 @@ def _within(path: Path, columns: dict[str, Floats], low: float, high: float) -> 
     return {letter: column[keep] for letter, column in columns.items()}
 
 
-def _one(path: Path, letter: str, columns: dict[str, Floats], default: float) -> float:
-    """One number for all rows: their mean, where they are alike."""
+def _one(path: Path, letter: str, columns: dict[str, Floats], default: float, within: float | None = None) -> float:
+    """One number for all rows: their mean, where they are alike: within so much, or `ALIKE` of it."""
     if letter not in columns:
         return default
     values = columns[letter]
-    if np.ptp(values) > ALIKE * np.mean(values):
+    if np.ptp(values) > (ALIKE * np.mean(values) if within is None else within):
         raise ValueError(
-            f"{path}: {letter} goes from {values.min():g} to {values.max():g}; one slab has one, within "
-            f"{100 * ALIKE:g} %: choose rows that are alike by their wavelengths"
+            f"{path}: {letter}, the {COLUMNS[letter]}, goes from {values.min():g} to {values.max():g}, "
+            "and one slab has one: restrict the wavelengths, by wavelengths=(low, high) or --wavelengths LOW,HIGH"
         )
     return float(np.mean(values))
 

@@ -19,13 +19,15 @@ from typing import Literal
 import numpy as np
 
 from fits.data.formats._rows import Rows
-from fits.data.formats._text import plural, read_lines, within
+from fits.data.formats._text import plural, read_lines, require_room, within, without_mark
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
 
 MAGIC = b"OPTIS"
 _MOST = 100_000
+_END = "End of file"
+"""Last line of files, with or without it."""
 Side = Literal["reflection", "transmission"]
 
 
@@ -75,21 +77,24 @@ class _Header:
 
 def recognises(head: bytes) -> bool:
     """Whether a file starts as one of Speos' (then OPTIS') tables."""
-    return head.startswith(MAGIC)
+    return head.lstrip().startswith(MAGIC)
 
 
 def read(path: Path) -> Measurements:
     """Read such a file; channels are wavelengths where it has several that differ. Errors as in `fits.read`."""
-    raw = path.read_bytes()
-    if not raw.startswith(MAGIC):
+    head = without_mark(path.read_bytes())[:10_000]
+    if not recognises(head):
         raise ValueError(f"{path}: a Speos BSDF starts with 'OPTIS - ...'")
-    mode = raw.partition(b"\n")[2][:1]
+    above = len(head[: len(head) - len(head.lstrip())].splitlines())
+    mode = b"".join(head.splitlines()[above + 1 : above + 2]).strip()[:1]
     if mode == b"1":
-        raise ValueError(f"{path}, line 2: a binary file, which has no reader here; Speos' viewers save it as text")
+        raise ValueError(
+            f"{path}, line {above + 2}: a binary file, which has no reader here; Speos' viewers save it as text"
+        )
     if mode != b"0":
-        raise ValueError(f"{path}, line 2: must be 0 for text, or 1 for binary")
+        raise ValueError(f"{path}, line {above + 2}: must be 0 for text, or 1 for binary")
     lines = Rows(path, read_lines(path, "latin-1"))
-    title = lines.text("the title").text.lower()
+    title = lines.filled("the title").text.lower()
     lines.text("the mode")
     lines.text("a comment")
     lines.skip_text(lines.whole("the length of the description", (0, 1_000_000)))
@@ -131,7 +136,7 @@ def _read_isotropic(path: Path, lines: Rows) -> Measurements:
     counts = lines.numbers(2, "counts of incidences and wavelengths", (1, _MOST)).astype(int)
     incidences = lines.numbers(int(counts[0]), "incidences", (0.0, 90.0))
     wavelengths = lines.numbers(int(counts[1]), "wavelengths", (0.0, 1e6))
-    names = tuple(f"{one:g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    names = tuple(f"{one:.12g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
     found: dict[Side, list[list[Floats]]] = {side: [] for side in header.sides}
     nodes: dict[Side, list[Table]] = {side: [] for side in header.sides}
     factors = []
@@ -151,7 +156,7 @@ def _read_isotropic(path: Path, lines: Rows) -> Measurements:
             raise place.error("tables of one incidence have different angles at different wavelengths")
         factors.append(_factor(0.01 * percent, table.share(header.quantity)))
         found[side][-1].append(factors[-1] * table.values.ravel())
-    lines.end()
+    lines.end(allowed=_END)
     parts = [
         _readings(table, np.stack(values, axis=-1), header.quantity)
         for side in header.sides
@@ -186,16 +191,18 @@ def _read_anisotropic(path: Path, lines: Rows) -> Measurements:
         tables[side] = [_table(lines, *pair) for pair in header.incidences[side]]
         if any(table.side != side for table in tables[side]):
             raise lines.last.error(f"polar angles of a table of {side} lie on the other side")
-    lines.end(allowed="End of file")
+    lines.end(allowed=_END)
     wavelengths = np.unique(np.concatenate([one.wavelengths for one in spectra.values()]))
     if all(np.ptp(one.shares) <= 1e-9 * one.shares.max() for one in spectra.values()):
         wavelengths = wavelengths[:1]
-    names = tuple(f"{one:g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    names = tuple(f"{one:.12g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
+    require_room(path, sum(table.values.size for side in header.sides for table in tables[side]), len(names))
     parts, factors = [], []
     for side in header.sides:
         spectrum = spectra[side]
         share = np.interp(wavelengths, spectrum.wavelengths, spectrum.shares)
-        factor = np.array([_factor(one, _reference(tables[side], spectrum, header.quantity)) for one in share])
+        reference = _reference(tables[side], spectrum, header.quantity)
+        factor = np.array([_factor(one, reference) for one in share])
         factors += list(factor)
         parts += [_readings(table, table.values.ravel()[:, None] * factor, header.quantity) for table in tables[side]]
     note = "the vector that marks the sample is azimuth 0; rotations taken as counter-clockwise from the light's travel"

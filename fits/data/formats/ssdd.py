@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.formats._text import BOM, Line, plural, rows
+from fits.data.formats._text import Line, plural, require_room, rows, without_mark
 from fits.data.geometry import TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
@@ -30,7 +30,6 @@ _COLOURS = {"monochrome": channel_names(1), "rgb": channel_names(3), "xyz": ("X"
 _SYSTEMS = ("spherical_coordinate_system", "specular_coordinate_system", "half_difference_coordinate_system")
 _TYPES = ("brdf", "btdf", "specular_reflectance", "specular_transmittance")
 _FREE = ("SOFTWARE", "API", "DATE", "NAME", "SOURCE_TYPE", "DEVICE", "CREATION_DATE", "MEASUREMENT_DATE")
-_MOST_VALUES = 100_000_000
 
 
 @dataclass
@@ -51,7 +50,7 @@ class _Block:
 
 def recognises(head: bytes) -> bool:
     """Whether a file starts as this format."""
-    return head.removeprefix(BOM).lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
+    return head.lstrip().startswith(b"VERSION") and b"DATA_TYPE" in head
 
 
 def read(path: Path) -> Measurements:
@@ -89,7 +88,8 @@ def read(path: Path) -> Measurements:
 
 
 def _blocks(path: Path) -> list[_Block]:
-    raw = path.read_bytes()
+    raw = without_mark(path.read_bytes())
+    raw = raw if b"\n" in raw else raw.replace(b"\r", b"\n")  # as old programs end lines
     blocks: list[_Block] = []
     place, number = 0, 0
     current: _Block | None = None
@@ -98,7 +98,7 @@ def _blocks(path: Path) -> list[_Block]:
         words = line.text.split()
         if not words or line.text.startswith("#"):
             continue
-        key = words[0].lstrip("\ufeff")
+        key = words[0]
         if number == 1 and key != "VERSION":
             raise line.error(f"{key[:40]!r} found, must be VERSION")
         if key == "VERSION":
@@ -147,8 +147,7 @@ def _data(path: Path, raw: bytes, place: int, number: int, line: Line, block: _B
     """Fill in the numbers; returns where the next line starts."""
     _check(line, block)
     count, width = int(np.prod([float(size) for size in block.shape])), len(_channels(block))
-    if count * width > _MOST_VALUES:
-        raise line.error(f"{count * width} values, must be {_MOST_VALUES} at most")
+    require_room(path, count, width)
     mode = line.text.split()[1:]
     if mode == ["binary"]:
         size = 4 * count * width

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._files import write_text
+from fits.data.formats._cells import Table, delimiter_of
 from fits.data.formats._text import content, read_lines
-from fits.data.formats.csv import SUFFIXES, Table, delimiter_of
+from fits.data.formats.csv import SUFFIXES
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
 from fits.data.measurements import Source, channel_names
 from fits.data.totals import KINDS, Kind, Totals

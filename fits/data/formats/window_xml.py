@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.formats import tensor_tree
-from fits.data.formats._window import COME, blocks, layer_of, number_of, text_of
+from fits.data.formats._window import COME, ELEMENT, blocks, layer_of, number_of, text_of
 from fits.data.geometry import Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
 
-FIRST = ("<?xml", "<WindowElement")
 CHANNELS = {"visible": "Y", "cie-x": "X", "cie-z": "Z"}
 _MOST_PATCHES = 2000
 
@@ -32,9 +31,9 @@ class Basis:
     directions: Floats
 
 
-def recognises(first_line: str) -> bool:
-    """Whether this is the first line of an XML file."""
-    return first_line.startswith(FIRST)
+def recognises(head: bytes) -> bool:
+    """Whether a file starts as XML, or holds the element of WINDOW further down."""
+    return head.lstrip().startswith(b"<?xml") or ELEMENT.search(head) is not None
 
 
 def read(path: Path) -> Measurements:
@@ -111,18 +110,20 @@ def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
         if not name:
             raise ValueError(f"{path}: an AngleBasis without AngleBasisName")
         directions: list[Floats] = []
+        total = 0
         for ring in basis.iter("AngleBasisBlock"):
             low, high = (number_of(path, ring, f"ThetaBounds/{bound}Theta") for bound in ("Lower", "Upper"))
             count = number_of(path, ring, "nPhis")
             if not (0.0 <= low < high <= 90.0 and 1 <= count <= _MOST_PATCHES and count == int(count)):
                 raise ValueError(f"{path}: {name}: a ring from {low:g} to {high:g} degrees in {count:g} patches")
+            total += int(count)
+            if total > _MOST_PATCHES:
+                raise ValueError(f"{path}: {name}: {total} patches or more, must be {_MOST_PATCHES} at most")
             theta = 0.0 if count == 1 and low == 0.0 else 0.5 * (low + high)
             directions.append(direction(theta, 360.0 * np.arange(int(count)) / count))
         if not directions:
             raise ValueError(f"{path}: {name}: no AngleBasisBlock")
         found.append(Basis(name, np.concatenate(directions)))
-        if len(found[-1].directions) > _MOST_PATCHES:
-            raise ValueError(f"{path}: {name}: {len(found[-1].directions)} patches, must be {_MOST_PATCHES} at most")
     return found
 
 

@@ -28,6 +28,7 @@ NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
 COARSE = 20.0  # degrees between neighbours on a map from which it shows points
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
+MOST_CHANNELS = 6  # in one picture, evenly spaced among all
 MOST_INCIDENCES = 9  # in one picture; data with more is shown at evenly spaced ones
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -48,7 +49,12 @@ STYLE: dict[Any, Any] = {
 
 
 def data_picture(data: "Measurements") -> Figure:
-    """What a file holds: in-plane values against angle, one panel per channel, and maps where data leaves the plane."""
+    """What a file holds: in-plane values against angle, one panel per channel, and maps where data leaves the plane.
+
+    Of more than six channels some are shown, evenly spaced and with both ends.
+    """
+    shown_channels = np.unique(np.linspace(0, len(data.channels) - 1, MOST_CHANNELS).round().astype(int))
+    data = data.of_channels([data.channels[place] for place in shown_channels])
     shown = chosen(incidences(data))
     maps = mapped(data, shown)
     with mpl.rc_context(STYLE):

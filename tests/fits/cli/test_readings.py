@@ -8,6 +8,7 @@ import pytest
 from fits.cli.parser import main
 from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.reporting.plots.data import MOST_CHANNELS, data_picture
 
 
 def test_info_says_what_is_there_and_draws_it(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,6 +28,17 @@ def test_info_says_what_is_there_and_draws_it(work: Path, capsys: pytest.Capture
 def test_info_of_what_is_all_masked(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", "data.csv", "--mask-grazing", "1"]) == 0
     assert "no reading is used" in capsys.readouterr().out
+
+
+def test_info_of_many_channels_shows_some(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = ",".join(f"brdf_{k}" for k in range(400))
+    rows = [f"30,{theta}," + ",".join(map(str, np.linspace(1.0, 2.0, 400))) for theta in range(-60, 61, 10)]
+    (work / "spectral.csv").write_text("\n".join([f"theta_i,theta_o,{names}", *rows]))
+    assert main(["info", "spectral.csv"]) == 0
+    told = capsys.readouterr().out
+    assert "0, 1, 2, ..., 399 (400 of them)" in told
+    assert "1 to 2" in told
+    assert len(data_picture(read("spectral.csv")).subfigs[0].axes) == MOST_CHANNELS
 
 
 def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> None:

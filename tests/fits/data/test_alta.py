@@ -102,10 +102,35 @@ def test_what_numbers_are(tmp_path: Path) -> None:
     np.testing.assert_allclose(data.values, 0.2 / np.cos(0.6))
     path = tmp_path / "b.alta"
     path.write_text("#DIM 1 3\n#VS 1 1 2\n#PARAM_IN COS_TH\n#PARAM_OUT XYZ_COLOR\n0.9 1 2 3 .1 .1 .1 .1\n")
-    data = read(path)
+    data = read(path, quantity="brdf")
     assert data.channels == ("X", "Y", "Z")
     np.testing.assert_array_equal(data.values, [[1, 2, 3]])
     assert "vertical segments" in " ".join(data.source.notes)
+
+
+@pytest.mark.parametrize("output", ["", "#PARAM_OUT", *(f"#PARAM_OUT {word}" for word in ("UNKNOWN", "ENERGY"))])
+def test_what_the_file_does_not_say_is_asked_for(tmp_path: Path, output: str) -> None:
+    path = tmp_path / "hand.alta"
+    rows = "0.2618 -0.2618 0.0 0.4\n0.2618 0.5236 0.0 0.1\n"
+    path.write_text(f"#DIM 3 1\n#PARAM_IN ISOTROPIC_TL_TV_PROJ_DPHI\n{output}\n{rows}")
+    with pytest.raises(ValueError, match=r"hand\.alta: .*does not say what the values are: give quantity") as asked:
+        read(path)
+    assert "\n" not in str(asked.value)
+    np.testing.assert_allclose(read(path, quantity="brdf").values[:, 0], [0.4, 0.1])
+    cosines = np.cos([0.2618, 0.5236])
+    np.testing.assert_allclose(read(path, quantity="brdf_cos").values[:, 0], [0.4, 0.1] / cosines)
+    np.testing.assert_allclose(read(path, quantity="reflectance_factor").values[:, 0], np.array([0.4, 0.1]) / np.pi)
+
+
+def test_colours_do_not_say_it_either_and_what_is_said_holds(tmp_path: Path) -> None:
+    path = tmp_path / "a.alta"
+    path.write_text("#DIM 1 3\n#PARAM_IN COS_TH\n#PARAM_OUT RGB_COLOR\n0.9 1 2 3\n")
+    with pytest.raises(ValueError, match="PARAM_OUT RGB_COLOR does not say what the values are"):
+        read(path)
+    assert read(path, quantity="brdf").channels == ("red", "green", "blue")
+    path.write_text("#DIM 1 1\n#PARAM_IN COS_TH\n#PARAM_OUT INV_STERADIAN\n0.9 1\n")
+    with pytest.raises(ValueError, match=r"a\.alta: quantity is 'brdf_cos', this alta file says 'brdf'"):
+        read(path, quantity="brdf_cos")
 
 
 @pytest.mark.parametrize(

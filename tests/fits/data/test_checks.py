@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fits
-from fits.data.checks import energies, peaks, reciprocity, repeats, symmetry
+from fits.data.checks import energies, peaks, reciprocity, repeats, sides, symmetry
 from fits.data.measurements import Measurements
 from fits.reporting.data_statements import data_statements
 
@@ -104,3 +104,60 @@ def test_what_the_shipped_readings_say() -> None:
     assert energies(paint) == []
     assert min(one.readings for one in peaks(paint)) >= 3
     assert len(data_statements(paint)) == 5
+    assert not any(
+        words.startswith(("Sides", "Angles")) for words in (*data_statements(paint), *data_statements(steel))
+    )
+
+
+SCANS = fits.slices(ANGLES)
+SIGNED = np.degrees(np.arctan2(SCANS.wo[:, 0], SCANS.wo[:, 2]))
+
+
+def statement(readings: Measurements, of: str) -> str:
+    return " ".join(words for words in data_statements(readings) if words.startswith(f"{of}:"))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_no_peak_is_told_of_where_there_is_none(noise: float) -> None:
+    flat = 0.2 * (1.0 + noise * np.random.default_rng(0).standard_normal(len(SCANS)))
+    readings = data(lambda i, o, between: flat, SCANS)
+    assert "no peak stands out about the mirror direction" in statement(readings, "Sampling")
+    assert not any(one.stands_out for one in peaks(readings))
+    assert statement(readings, "Sides") == ""
+
+
+@pytest.mark.parametrize("width", [4.0, 10.0])
+def test_a_peak_on_the_side_of_the_light_is_told_of(width: float) -> None:
+    """Azimuths that count from the mirror direction: what is read is mirrored."""
+
+    def lobe(sign: float) -> Measurements:
+        return data(lambda i, o, between: 0.05 + np.exp(-(((SIGNED - sign * i) / width) ** 2)), SCANS)
+
+    turned = lobe(-1.0)
+    assert "the brightest side is the light's: at 10° up to 1.05 there" in statement(turned, "Sides")
+    assert "phi_o = phi_i + 180" in statement(turned, "Sides")
+    assert "no peak stands out" in statement(turned, "Sampling")
+    assert all(one.light > one.mirror for one in sides(turned))
+    assert sides(turned.where((SIGNED > -6.0) & (np.abs(SIGNED - 8.0) > 8.0)).used()) == []  # nothing to compare
+    one_side = turned.where(SIGNED < 1.0).used()
+    assert "all readings in the plane of incidence lie on the light's side" in statement(one_side, "Sides")
+    assert statement(lobe(1.0).where(SIGNED > -1.0).used(), "Sides") == ""
+    assert statement(lobe(1.0), "Sides") == ""
+    assert "the peak about the mirror direction holds" in statement(lobe(1.0), "Sampling")
+
+
+def test_angles_in_radians_are_asked_about(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("theta_i,theta_o,brdf\n0.5236,0.7854,1\n0.5236,-1.4,1\n")
+    assert statement(fits.read(path), "Angles") == (
+        "Angles: none is above 1.4°: are they radians? They were read as degrees."
+    )
+    path.write_text("theta_i,total_reflectance\n0.1396,0.3\n")
+    assert "none is above 0.1396°: are they radians?" in statement(fits.read(path), "Angles")
+    for text in (
+        "theta_i,theta_o,brdf\n0,0,1\n",
+        "theta_i,theta_o,brdf\n0,2,1\n",
+        "theta_i,total_reflectance\n8,0.3\n",
+    ):
+        path.write_text(text)
+        assert statement(fits.read(path), "Angles") == ""

@@ -113,6 +113,20 @@ def test_missing_spread_is_estimated_and_noted(tmp_path):
     assert "sigma is unknown" in empty.source.notes[0]
 
 
+@pytest.mark.parametrize("missing", ["", " ", "nan", "NaN", "-nan", "NA", "null"])
+def test_what_was_not_measured_is_left_out_and_counted(tmp_path, missing):
+    rows = f"10,180,20,0,1,0.1,7\n10,180,25,0,{missing},0.1,8\n10,180,30,0,3,{missing},{missing}\n"
+    data = read(_file(tmp_path, f"{HEADER},brdf_std,reflectance_factor\n{rows}"), quantity="brdf")
+    np.testing.assert_allclose(data.values[:, 0], [1, 3])
+    np.testing.assert_allclose(data.theta_o, [20, 30])
+    np.testing.assert_allclose(data.sigma[:, 0], [0.1, 0.3])  # unknown: as much of the value as where it is known
+    assert data.source.notes[0] == "left out: 1 sample without a value (an empty cell, or nan)"
+    colours = f"theta_i,theta_o,brdf_red,brdf_blue\n10,20,1,{missing}\n10,25,{missing},1\n10,30,1,2\n"
+    data = read(_file(tmp_path, colours))
+    np.testing.assert_array_equal(data.values, [[1, 2]])
+    assert "left out: 2 samples without a value (an empty cell, or nan)" in data.source.notes
+
+
 def test_signed_theta_without_azimuths(tmp_path):
     data = read(_file(tmp_path, "theta_i;theta_o;brdf\n30;30;1\n30;-30;2\n30;-120;3\n"))
     np.testing.assert_allclose(data.wo, [direction(30, 0), direction(30, 180), direction(120, 180)], atol=1e-15)
@@ -160,9 +174,13 @@ GOOD = "10,180,20,0,0.5\n"
         ),
         ("theta_i,theta_o,brf_cos\n10,20,1\n", "column 'brf_cos': no channel may be called 'cos'; products with the"),
         (HEADER + "\n" + GOOD + "10,180,20,0,abc\n", "line 3, column 'brdf': 'abc' is not a number, must be a finite"),
-        (HEADER + "\n# x\n\n10,180,20,0,\n", "line 4, column 'brdf': '' is not a number"),
-        (HEADER + "\n10,180,20,0,nan\n", "line 2, column 'brdf': nan is not allowed, must be a finite number"),
+        (HEADER + "\n# x\n\n,180,20,0,1\n", "line 4, column 'theta_i': '' is not a number"),
+        (HEADER + "\n10,180,nan,0,1\n", "line 2, column 'theta_o': nan is not allowed, must be a number in"),
+        (HEADER + "\n10,180,20,0,\n10,180,25,0,NaN\n", "line 1: no sample below holds a number in column brdf"),
         (HEADER + "\n10,180,20,0,inf\n", "line 2, column 'brdf': inf is not allowed"),
+        (HEADER + "\n10,180,20,0,1e300\n", r"line 2, column 'brdf': 1e300 is not allowed, .*at most 1e\+30 in size"),
+        (HEADER + ",brdf_std\n10,180,20,0,1,1e-200\n", "line 2, column 'brdf_std': 1e-200 is not allowed, must be > 0"),
+        (HEADER + ",brdf_std\n10,180,20,0,1,1e300\n", "line 2, column 'brdf_std': 1e300 is not allowed"),
         (HEADER + "\n91,180,20,0,1\n", r"line 2, column 'theta_i': 91 is not allowed, must be a number in \[0, 90\]"),
         (HEADER + "\n10,180,-5,0,1\n", r"line 2, column 'theta_o': -5 is not allowed, must be a number in \[0, 180\]"),
         (

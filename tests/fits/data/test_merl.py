@@ -226,8 +226,27 @@ def test_bad_files(tmp_path, path):
     broken = bytearray(whole)
     broken[12:] = np.full((MERL_BYTES - 12) // 8, np.nan).tobytes()
     other.write_bytes(broken)
-    with pytest.raises(ValueError, match="the table holds nan, must be finite"):
+    with pytest.raises(ValueError, match="all bins that are asked for hold nan"):
         read(other)
+    broken[12:] = np.full((MERL_BYTES - 12) // 8, np.inf).tobytes()
+    other.write_bytes(broken)
+    with pytest.raises(ValueError, match="the table holds inf, must be finite"):
+        read(other)
+
+
+def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path):
+    whole = read(path)
+    table = np.frombuffer(path.read_bytes(), "<f8", offset=12).reshape(3, *SHAPE).copy()
+    table[1, *_bins(whole)[:2].astype(int).T] = np.nan  # one channel is enough
+    other = tmp_path / "holes.binary"
+    other.write_bytes(np.array(SHAPE, "<i4").tobytes() + table.tobytes())
+    data = read(other)
+    np.testing.assert_array_equal(np.flatnonzero(whole.mask & ~data.mask), [0, 1])
+    np.testing.assert_array_equal(data.values[2:], whole.values[2:])
+    assert "left out: 2 samples that need a bin that holds nan" in data.source.notes
+    every = read(other, bins="all")
+    assert len(every) == len(read(path, bins="all")) - 2
+    assert "left out: 2 bins of the table that hold nan" in every.source.notes
 
 
 def test_bad_arguments(path):

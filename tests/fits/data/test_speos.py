@@ -1,5 +1,6 @@
 """Speos tables: a file of Speos' own, files written from formulas, and errors."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,8 @@ def test_isotropic_by_formula(tmp_path: Path) -> None:
         for (side, i, _), share in shares.items()
     )
     data = read(_file(tmp_path, head + tables, "x.brdf"))
+    ended = read(_file(tmp_path, f"{head}{tables}End of file\n", "y.brdf"))
+    np.testing.assert_array_equal(ended.values, data.values)
     assert data.channels == ("450 nm", "650 nm")
     for (side, i, w), share in shares.items():
         here = (abs(data.theta_i - i) < 1e-6) & (data.wo[:, 2] < -1e-9 if side else data.wo[:, 2] > 1e-9)
@@ -175,3 +178,17 @@ def test_bad_files(tmp_path: Path, change: tuple[str, str], message: str) -> Non
 def test_speos_says_what_it_holds(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="quantity is 'brdf', this speos file says 'brdf_cos'"):
         read(GAUSSIAN, quantity="brdf")
+
+
+def test_a_long_spectrum_may_stand_for_more_than_there_is_room_for(tmp_path: Path) -> None:
+    """A small file: all values of its tables at each of 30,000 wavelengths would be 23 million."""
+    spectrum = "10\t0\nwhite\n30000\n" + "".join(f"{400 + 0.01 * k:.2f} {20 + k % 7}\n" for k in range(30_000))
+    path = _file(tmp_path, _anisotropic([0.0], [10.0], spectrum, _table(THETA, PHI, _lobe(10.0, THETA, PHI))))
+    tracemalloc.start()
+    with pytest.raises(
+        ValueError, match=r"775 samples of 30000 channels are 23,250,000 numbers, must be 20,000,000 at"
+    ):
+        read(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100e6

@@ -39,8 +39,9 @@ def test_an_opaque_material_has_no_picture_from_behind() -> None:
 
 
 def test_bad_arguments_are_named() -> None:
-    with pytest.raises(ValueError, match="size: 4 is not >= 16 pixels"):
-        render(WHITE, SINGLE, size=4)
+    for size in (4, 1025, 100_000):
+        with pytest.raises(ValueError, match=rf"size is {size}, must be in \[16, 1024\] pixels"):
+            render(WHITE, SINGLE, size=size)
     with pytest.raises(ValueError, match=r"layers: the stack ends in a medium of index 1\.5, .* Interface of ior 1"):
         render(lj.Stack([lj.Interface(1.5, 0.2)]), size=16)
     with pytest.raises(ValueError, match="transport: RandomWalk is random"):
@@ -58,6 +59,7 @@ def test_the_command(tmp_path, capsys) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
     for words, complaint in (
         ([str(stack), "--out", str(picture)], "exists already"),
+        (["fabric", "--out", str(tmp_path / "a.png"), "--size", "100000"], "size is 100000, must be in [16, 1024]"),
         (["fabrik", "--out", str(tmp_path / "a.png")], "neither a .toml file nor one of the gallery: window_shade"),
         (["fabric", "--out", str(tmp_path / "a.jpg")], "pictures can be written as .png only"),
     ):
