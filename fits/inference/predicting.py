@@ -150,6 +150,21 @@ def _vectors(
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
 
 
+def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:
+    """The BSDF of the best fit along other directions, (M, 3) each, where the stack alone has these values, (M, C)."""
+    if fit.problem.model.process is None:
+        return values
+    _, floor = (np.asarray(part, float) for part in fit.problem.call(_levels, fit.vector[None]))
+    softness = _softness(fit, np.hypot(_own_sigma(fit, values[None], None), floor))
+    lack = np.asarray(fit.problem.call("lack_at", fit.vector, fit.predicted, places(wi, wo))[0])
+    return softness * np.sinh(np.asarray(logarithm(values, softness)) + lack)
+
+
+def _softness(fit: Fit, additive: Floats) -> Floats:
+    typical = np.full(additive.shape, np.median(np.abs(fit.problem.data.used().values)))
+    return soft(typical, additive)
+
+
 def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
     """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
     used = fit.problem.data.used()
@@ -171,8 +186,7 @@ def _readings(
     if fit.problem.model.process is None:
         return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
     lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
-    typical = np.full(values.shape[1:], np.median(np.abs(fit.problem.data.used().values)))
-    softness = soft(typical, np.hypot(sigma, np.median(floor)))
+    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
     means = np.asarray(logarithm(values, softness)) + lack
     corrected = softness * np.sinh(means)
     noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
@@ -188,4 +202,4 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
 
 
 def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
-    return jax.lax.map(lambda vector: model.lack_at(vector, where), vectors)
+    return jax.lax.map(lambda vector: model.lack_at(vector, model.predict(vector), where), vectors)

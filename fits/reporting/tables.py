@@ -144,8 +144,8 @@ def alone_table(fit: "Fit") -> Table:
 def minima_table(fit: "Fit") -> Table:
     """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
     shown = fit.minima[:MOST_MINIMA]
-    as_good = {id(minimum) for minimum in fit.alternatives}
-    heads = ["best", *("as good" if id(minimum) in as_good else "worse" for minimum in shown[1:])]
+    equal = {id(minimum) for minimum in fit.alternatives}
+    heads = ["best", *("same cost" if id(minimum) in equal else "higher cost" for minimum in shown[1:])]
     rows = [
         ("starts", *(str(minimum.count) for minimum in shown)),
         ("cost", *(f"{minimum.cost:.6g}" for minimum in shown)),

@@ -20,7 +20,8 @@ from fits.problem.nodes import places
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed
 from fits.problem.problem import Problem
-from fits.reporting import tables, verdicts
+from fits.reporting import tables
+from fits.reporting.agreement import discrepancy
 from fits.reporting.results import load_fit, save_fit
 from tests.helpers.models import line
 
@@ -95,9 +96,10 @@ def test_where_they_cannot_be_counted_they_are_not(noise: Noise) -> None:
 
 
 def test_both_are_told(wrong: Fit) -> None:
-    words = " ".join(verdicts.shared_errors(wrong))
-    assert "residuals of neighbours in angle are correlated by +0." in words
-    assert "correlated = false leaves them out" in words
+    words = " ".join(discrepancy(wrong))
+    assert "neighbouring residuals correlate by +0." in words
+    assert "Set `correlated = false` to disable it" in words
+    assert f"deviation of {100.0 * wrong.values['noise.correlated.amplitude']:.2g} % of the BRDF" in words
     table = tables.alone_table(wrong)
     assert [row[0] for row in table.rows] == ["['a']", "['b']"]
     assert len(table.rows[0]) == len(table.columns)

@@ -19,6 +19,7 @@ from fits.inference.optimise import fit
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting import tables, verdicts
+from fits.reporting.agreement import explains
 from fits.reporting.diagnostics import residual_structure, standardised
 from fits.reporting.html import report
 from fits.reporting.plots import data as pictures
@@ -141,11 +142,11 @@ class Altered:
 
 def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
     data, residuals = coat_fit.problem.data, standardised(coat_fit)
-    good = " ".join(verdicts.explains(coat_fit, residual_structure(data, residuals)))
+    good = " ".join(explains(coat_fit, residual_structure(data, residuals)))
     assert "what the stated noise predicts" in good
     assert "too small" not in good
     bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
-    words = " ".join(verdicts.explains(bad, residual_structure(data, 3 * residuals)))
+    words = " ".join(explains(bad, residual_structure(data, 3 * residuals)))
     assert "multiplies them by 3" in words
     sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
     assert fine
