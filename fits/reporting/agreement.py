@@ -16,7 +16,7 @@ MISFIT_SIGMAS = 3.0
 LARGE_FACTOR = 1.5
 """From which a misfit is said as a factor: as a share of the model it saturates at 100 %."""
 
-UNDESCRIBED = 1.0
+UNDESCRIBED = 1.5
 """Median misfit, in standard deviations of the stated noise, above which a stack does not describe the sample; that of
 the right one is 0.67."""
 
@@ -138,24 +138,22 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
         f"Chi-square per degree of freedom{term} is {ratio:.3g} ({fit.chi_square:.5g} over {freedom}); the right model "
         f"with the right noise gives 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}.",
     ]
-    beyond = excess(fit.chi_square, freedom)
+    beyond, size = excess(fit.chi_square, freedom), 1.0
+    if abs(beyond) > MISFIT_SIGMAS:
+        size = math.sqrt(ratio)
     if beyond > MISFIT_SIGMAS:
-        sentences.append(
-            "The model does not explain the data to within the stated noise. The quoted errors assume that it does, so "
-            f"they are too small: scaling them to the scatter that is there multiplies them by {math.sqrt(ratio):.2g}, "
-            "and even that does not account for what a wrong model does to the values themselves."
-        )
+        sentences.append("The model does not explain the data to within the stated noise, as the quoted errors assume.")
     elif beyond < -MISFIT_SIGMAS:
         sentences.append(
-            "The data scatters less than the stated noise: sigma is too large, or holds an error that all readings "
-            f"share. For what is random, the quoted errors are too large by {1.0 / math.sqrt(ratio):.2g}."
+            "The data scatter less than the stated noise: sigma is too large, or holds an error that all readings share."
         )
     elif not correlated:
         sentences.append("The overall size of the residuals is what the stated noise predicts.")
-    return sentences + _structure(structure, correlated)
+    return sentences + _structure(structure, size, correlated)
 
 
-def _structure(structure: ResidualStructure, whitened: bool = False) -> list[str]:
+def _structure(structure: ResidualStructure, size: float = 1.0, whitened: bool = False) -> list[str]:
+    """Sentences on residuals; size: by what that of all of them makes the quoted errors too small."""
     sentences = []
     kind = "Residuals whitened by the fitted covariance have" if whitened else "Residuals have"
     if math.isfinite(structure.lag_one):
@@ -165,13 +163,7 @@ def _structure(structure: ResidualStructure, whitened: bool = False) -> list[str
             f"{1.0 / math.sqrt(2.0 * structure.count):.2g} and {1.0 / math.sqrt(structure.pairs):.2g} "
             f"({structure.pairs} pairs)."
         )
-        if structure.lag_one_sigma > MISFIT_SIGMAS:
-            independent = max(1.0, structure.count * structure.independent_share)
-            sentences.append(
-                f"So the {structure.count} residuals are worth about {independent:.0f} independent ones, which alone "
-                f"makes the quoted errors too small by about {structure.independent_share**-0.5:.2g}. Such runs come "
-                "from structure that the model lacks, or from a calibration error that is smooth in angle."
-            )
+    sentences += _net(structure, size)
     if len(structure.by_incidence) > 1:
         worst = structure.worst
         sentences.append(
@@ -184,3 +176,29 @@ def _structure(structure: ResidualStructure, whitened: bool = False) -> list[str
         "(Kolmogorov-Smirnov distance)."
     )
     return sentences
+
+
+def _net(structure: ResidualStructure, size: float) -> list[str]:
+    """What size and correlation of the residuals together say of the quoted errors; nothing, where both are as assumed."""
+    share = structure.independent_share if structure.lag_one_sigma > MISFIT_SIGMAS else 1.0
+    net = size / math.sqrt(share)
+    if net == 1.0:
+        return []
+    parts = []
+    if size != 1.0:
+        parts.append(f"{size:.2g} for the size of the residuals")
+    if share != 1.0:
+        independent = max(1.0, structure.count * share)
+        parts.append(
+            f"{share**-0.5:.2g} for their correlation, which makes {structure.count} of them worth about "
+            f"{independent:.0f} independent ones"
+        )
+    small = (
+        f"too small by a factor of about {net:.2g}" if net > 1.0 else f"too large by a factor of about {1.0 / net:.2g}"
+    )
+    words = [f"So the quoted errors are {small} ({' times '.join(parts)})."]
+    if share != 1.0:
+        words.append("Such runs come from structure that the model lacks, or from a calibration error smooth in angle.")
+    if net > 1.0:
+        words.append("Even that does not account for what a wrong model does to the values themselves.")
+    return [" ".join(words)]

@@ -81,6 +81,19 @@ def test_residuals_of_a_fit_are_nearly_so_and_the_page_says_so_once(fitted: Fit)
     assert np.sqrt(np.mean(misfit(fitted) ** 2)) < structure.rms
 
 
+def test_there_is_one_statement_on_the_quoted_errors(fitted: Fit) -> None:
+    """Small residuals that are all alike once made the errors too large by 2.3 and too small by 4.4 on one page."""
+    structure = replace(
+        residual_structure(fitted.problem.data, standardised(fitted)), rms=0.43, lag_one=0.9, lag_one_sigma=18.0
+    )
+    small = replace(fitted)
+    vars(small)["chi_square"] = 0.19 * fitted.degrees_of_freedom
+    told = [line for line in explains(small, structure) if "quoted errors are" in line]
+    assert len(told) == 1
+    net = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
+    assert f"too small by a factor of about {net:.2g} (0.44 for the size of the residuals times 4.4" in told[0]
+
+
 def test_a_stack_that_misses_is_said_to_though_the_discrepancy_explains_all(fitted: Fit) -> None:
     """chi-square is fine, since the discrepancy takes up the misfit; the stack alone is off by a third."""
     off = replace(fitted, vector=fitted.vector * np.array([1.4, 1.4, 3.0, 1.0, 1.0, 1.0]))

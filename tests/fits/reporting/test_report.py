@@ -147,7 +147,7 @@ def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
     assert "too small" not in good
     bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
     words = " ".join(explains(bad, residual_structure(data, 3 * residuals)))
-    assert "multiplies them by 3" in words
+    assert "too small by a factor of about 3 (3 for the size of the residuals)" in words
     sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
     assert fine
     values = data.used().values
