@@ -145,7 +145,7 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
         sentences.append("The model does not explain the data to within the stated noise, as the quoted errors assume.")
     elif beyond < -MISFIT_SIGMAS:
         sentences.append(
-            "The data scatter less than the stated noise: sigma is too large, or holds an error that all readings share."
+            "The data scatter less than the stated noise: sigma is too large, or holds an error common to all readings."
         )
     elif not correlated:
         sentences.append("The overall size of the residuals is what the stated noise predicts.")
@@ -179,7 +179,7 @@ def _structure(structure: ResidualStructure, size: float = 1.0, whitened: bool =
 
 
 def _net(structure: ResidualStructure, size: float) -> list[str]:
-    """What size and correlation of the residuals together say of the quoted errors; nothing, where both are as assumed."""
+    """What size and correlation of the residuals together say of the quoted errors; nothing, if both are as assumed."""
     share = structure.independent_share if structure.lag_one_sigma > MISFIT_SIGMAS else 1.0
     net = size / math.sqrt(share)
     if net == 1.0:

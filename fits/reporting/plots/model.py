@@ -91,11 +91,16 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
             upper.set_title(incidence.label)
             upper.tick_params(labelbottom=False)
-            lower.set_ylabel((misfit_label(first) if len(fits) == 1 else r"residual / $\sigma$") if column == 0 else "")
+            lower.set_ylabel(_residual_label(first) if column == 0 else "")
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
+
+
+def _residual_label(fit: "Fit") -> str:
+    words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
+    return f"{words}\nwith discrepancy" if fit.problem.noise.correlated else words
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
