@@ -5,10 +5,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fits.data.checks import repeats
+from fits.data.totals import Totals
+from fits.problem.likelihood import DEFAULT_RELATIVE
+from fits.problem.parameters import is_free
 from fits.reporting.diagnostics import ResidualStructure
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
+    from fits.problem.problem import Problem
 
 MISFIT_SIGMAS = 3.0
 """Chi-square so many of its own standard deviations away from its expectation is not chance."""
@@ -118,6 +123,34 @@ def without_discrepancy(fit: "Fit") -> float:
 def excess(square: float, freedom: int) -> float:
     """Chi-square above its expectation, in its own standard deviations."""
     return (square / freedom - 1.0) / math.sqrt(2.0 / freedom) if freedom > 0 else math.nan
+
+
+def noise_notes(problem: "Problem") -> list[str]:
+    """What of the noise was assumed without being told, or counts beside the file's own."""
+    noise, used = problem.noise, problem.data.used()
+    if problem.objective != "likelihood":
+        return []
+    if problem.noise_is_assumed:
+        found = None if isinstance(used, Totals) else repeats(used)
+        words = f"Nothing is stated of the noise: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
+        if found is not None and found.noise > 0.0:
+            return [
+                f"{words} {found.count:,} repeated readings scatter by about {100.0 * found.noise:.2g} %: "
+                f"`relative = {found.noise:.2g}` under [noise], or `--noise` of a search, states that."
+            ]
+        return [
+            f"{words} State it as `relative` under [noise], or `--noise` of a search; given start, low and high there, "
+            "it is fitted."
+        ]
+    if used.sigma is None or not noise.use_sigma or noise.relative in (None, 0):
+        return []
+    lit = used.values > 0.0
+    own = f", {100.0 * float(np.median(used.sigma[lit] / used.values[lit])):.2g} % in the median" if lit.any() else ""
+    more = "a fitted relative part" if is_free(noise.relative) else f"relative = {noise.relative:g}"
+    return [
+        f"Noise: the data's own sigma{own}, and {more} beside it, added in quadrature. Leave `relative` out if sigma "
+        "holds it already; `use_sigma = false` leaves sigma out."
+    ]
 
 
 def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:

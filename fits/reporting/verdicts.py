@@ -18,6 +18,7 @@ from fits.reporting.agreement import (
     discrepancy,
     excess,
     misdescribed,
+    noise_notes,
     without_discrepancy,
 )
 from fits.reporting.diagnostics import ResidualStructure
@@ -66,7 +67,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
 def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]:
     """The verdict in a few sentences, and whether it is without reservation."""
     sentences = [] if fit.converged else ["The fit did not converge: these are the best values seen, not a minimum."]
-    close, undescribed = agreement(fit), misdescribed(fit)
+    close, undescribed, notes = agreement(fit), misdescribed(fit), noise_notes(fit.problem)
     if not fit.is_posterior:
         sentences.append("Fitted with a named residual, not a likelihood: the errors are only indicative.")
     elif excess(fit.chi_square, fit.degrees_of_freedom) > MISFIT_SIGMAS:
@@ -92,8 +93,12 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
     if fit.alternatives and not undescribed:
         sentences.append("Another local minimum of the same model fits equally well.")
     if undescribed or sentences:
-        return [*undescribed, *close, *sentences], False
-    return [*close, "The model explains the data to within its noise, and the data resolve every parameter."], True
+        return [*undescribed, *close, *notes, *sentences], False
+    return [
+        *close,
+        *notes,
+        "The model explains the data to within its noise, and the data resolve every parameter.",
+    ], True
 
 
 def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
@@ -102,7 +107,7 @@ def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     if fit.problem.noise.correlated:
         good = f"{good} with the discrepancy term, {without_discrepancy(fit):.4g} without"
-    starts = f"{fit.minima[0].count} of {sum(fit.ended.values())} starts ended here"
+    starts = f"{fit.minima[0].count} of {_started(fit)} ended here"
     others = f", other local minima that fit equally well: {len(fit.alternatives)}" if describes(fit) else ""
     accurate = f"; numerical error of the model: {numerical_error(fit)}" if fit.resolution else ""
     return [*lines, f"{good}; {starts}{others}{accurate}"]
@@ -118,7 +123,8 @@ def noise_in_words(problem: "Problem") -> str:
         if f"noise.{level}" in problem.names:
             parts.append(f"a fitted {level} part")
         elif value > 0.0:
-            parts.append(f"{value:.3g} {unit}")
+            assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
+            parts.append(f"{value:.3g} {unit}{assumed}")
     if noise.correlated:
         parts.append("errors that neighbouring readings share")
     tails = (
@@ -189,14 +195,29 @@ def starts_in_words(fit: "Fit") -> str:
         return "not recorded"
     run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
     where = ", ".join(f"{fit.ended[key]} {word}" for key, word in ENDED.items() if fit.ended[key])
-    return f"{sum(fit.ended.values())} ({run}): {where}"
+    ran = sum(fit.ended.values())
+    if not _refitted(fit):
+        return f"{ran} ({run}): {where}"
+    given = fit.settings.get("starts", "?")
+    return f"{given} with independent noise ({run}), then {ran} with the discrepancy term: {where}"
+
+
+def _refitted(fit: "Fit") -> bool:
+    """Whether it was fitted once more, with a model discrepancy, from starts of its own: see `shared_errors.points`."""
+    return fit.alone is not None
+
+
+def _started(fit: "Fit") -> str:
+    """How many starts led to the fit, in words."""
+    return f"{sum(fit.ended.values())} starts{' with the discrepancy term' if _refitted(fit) else ''}"
 
 
 def minima(fit: "Fit") -> list[str]:
     """How many starts agree on the minimum, and whether another local minimum fits equally well."""
     best, total = fit.minima[0], sum(fit.ended.values()) or sum(minimum.count for minimum in fit.minima)
+    starts = _started(fit) if fit.ended else f"{total} starts"
     found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
-    sentences = [f"{best.count} of {total} starts reached the best minimum; {found}."]
+    sentences = [f"{best.count} of {starts} reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
     if fit.alternatives and describes(fit):

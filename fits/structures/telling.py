@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fits.reporting import tables
+from fits.reporting.agreement import noise_notes
 from fits.reporting.html import source_name
 from fits.reporting.pages import document, image, section, sentences
 from fits.reporting.plots.data import CYCLE, GREY, STYLE, as_png
@@ -49,7 +50,7 @@ def search_sentences(search: "Search") -> list[str]:
     unsure = [one.name for one in search.found if one.foresight and not one.foresight.evidence.reliable]
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
-    return words
+    return [*words, *noise_notes(best.fit.problem)]
 
 
 def search_picture(search: "Search") -> Figure:

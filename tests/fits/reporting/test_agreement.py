@@ -17,8 +17,9 @@ from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.reporting import verdicts
-from fits.reporting.agreement import agreement, explains, misdescribed
+from fits.reporting.agreement import agreement, explains, misdescribed, noise_notes
 from fits.reporting.diagnostics import bsdf, misfit, residual_structure, standardised
+from fits.reporting.html import page
 from fits.reporting.plots.model import curves_picture
 from tests.helpers.models import line
 
@@ -153,3 +154,38 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     drawn = np.interp(angle, *curves["model with discrepancy"].get_data())
     np.testing.assert_allclose(shown, (values - drawn) / (0.02 * values), atol=0.15)
     assert "discrepancy" in lower.get_ylabel()
+
+
+def test_a_noise_that_was_assumed_is_said_and_repeats_offer_another() -> None:
+    once = assumed(np.ones((len(GEOMETRY), 1)))
+    (told,) = noise_notes(replace(once, noise=Noise()))
+    assert told.startswith("Nothing is stated of the noise: 5 % of the model's value is assumed.")
+    assert "(assumed)" in verdicts.noise_in_words(replace(once, noise=Noise()))
+    for stated in (Noise(relative=0.05), Noise(floor=0.01)):
+        assert noise_notes(replace(once, noise=stated)) == []
+        assert "(assumed)" not in verdicts.noise_in_words(replace(once, noise=stated))
+    scattered = 1.0 + 0.0017 * np.random.default_rng(0).standard_normal((2 * len(GEOMETRY), 1))
+    wi, wo = (np.tile(w, (2, 1)) for w in (GEOMETRY.wi, GEOMETRY.wo))
+    twice = Measurements(wi, wo, scattered, None, np.ones(len(wi), bool), ("value",))
+    (told,) = noise_notes(Problem(STACK, twice, line, Noise()))
+    said = re.search(r"repeated readings scatter by about ([\d.]+) %: `relative = ([\d.]+)`", told)
+    assert said is not None
+    # the median of 164 differences: 8 % of itself
+    assert float(said[1]) == pytest.approx(0.17, rel=0.3)
+    assert float(said[2]) == pytest.approx(0.0017, rel=0.3)
+
+
+def test_relative_noise_beside_the_own_sigma_of_the_data_is_announced() -> None:
+    values = np.ones((len(GEOMETRY), 1))
+    data = replace(assumed(values).data, sigma=0.04 * values)
+    (told,) = noise_notes(Problem(STACK, data, line, Noise(relative=0.03)))
+    assert told.startswith("Noise: the data's own sigma, 4 % in the median, and relative = 0.03 beside it")
+    for noise in (Noise(), Noise(relative=0.03, use_sigma=False), Noise(relative=0.0)):
+        assert noise_notes(Problem(STACK, data, line, noise)) == []
+
+
+def test_what_was_fitted_lists_the_incidences_that_were(coat_fit: Fit) -> None:
+    data = coat_fit.problem.data
+    kept = data.where(np.isclose(data.theta_i, 10.0), "held out: incidence=50")
+    text = page(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)), None, {})
+    assert "<td>incidence</td><td>10°</td>" in text
