@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fits.inference.fit_result import ENDED
-from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
+from fits.inference.identifiability import OPEN_BEYOND, UNRESOLVED_BEYOND, Combination
 from fits.inference.limits import instrument_limits
 from fits.inference.resolution import ENOUGH
 from fits.reporting.agreement import (
@@ -32,11 +32,14 @@ STRONG = 0.95  # correlation from which two parameters are said to trade against
 
 
 def identifiability(fit: "Fit") -> dict[str, str]:
-    """For each parameter, in a few words, whether the data determines it; combinations count from 1, worst first."""
+    """For each parameter, in a few words, whether the data determines it; directions count from 1, worst first.
+
+    What counts is a parameter's own error along the directions that the data leave open, in units of its prior range: a
+    parameter with a small share in a badly known direction may be well known itself.
+    """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
     limits = instrument_limits(fit)
-    worst = {name: place for place in range(len(fit.unresolved), 0, -1) for name in fit.unresolved[place - 1].weights}
     words = {}
     for index, name in enumerate(names):
         width = float(fit.problem.high[index] - fit.problem.low[index])
@@ -48,15 +51,13 @@ def identifiability(fit: "Fit") -> dict[str, str]:
             words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
-        elif name in worst:
-            combination = fit.unresolved[worst[name] - 1]
-            kind = "OPEN" if combination.open else "LOOSE"
-            others = len(combination.weights) > 1
-            words[name] = f"{kind}: combination {worst[name]}" if others else f"{kind}: hardly seen"
+        elif math.hypot(*(own := [one.error_of(name) for one in fit.unresolved])) > UNRESOLVED_BEYOND:
+            kind = "unconstrained by the data" if math.hypot(*own) > OPEN_BEYOND else "weakly constrained"
+            words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
         elif not math.isfinite(error):
             words[name] = "not determined"
         elif error > 0.3 * width:
-            words[name] = "barely: error near the width of the bounds"
+            words[name] = "weakly constrained: error near the width of the bounds"
         elif abs(correlation[index, partner]) >= STRONG:
             words[name] = f"trades with {names[partner]} {correlation[index, partner]:+.2f}"
         else:
@@ -161,7 +162,8 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _not_separated(combination: Combination) -> str:
-    names = list(combination.weights)
+    error = {name: combination.error_of(name) for name in combination.weights}
+    names = [name for name in error if error[name] > UNRESOLVED_BEYOND] or [max(error, key=lambda name: error[name])]
     return f"The data do not {'separate' if len(names) > 1 else 'determine'} {listed(names)}"
 
 
@@ -174,17 +176,18 @@ def determines(fit: "Fit") -> list[str]:
         )
     if fit.unresolved:
         sentences.append(
-            f"The data alone know {len(fit.unresolved)} of {len(fit.vector)} combinations of parameters to no better "
-            f"than {UNRESOLVED_BEYOND:.0%} of their bounds: only bounds and priors hold them."
+            f"{len(fit.unresolved)} of {len(fit.vector)} principal directions of parameter space are constrained by "
+            f"the data to no better than {100.0 * UNRESOLVED_BEYOND:g} % of the prior range; there, priors dominate."
         )
     else:
         sentences.append(
-            f"The data alone know every combination of parameters to better than {UNRESOLVED_BEYOND:.0%} of its bounds."
+            "The data constrain every principal direction of parameter space to better than "
+            f"{100.0 * UNRESOLVED_BEYOND:g} % of the prior range."
         )
     if fit.at_bound:
         sentences.append(
-            f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it; it has no symmetric error, and "
-            "the errors of the others hold with it kept there."
+            f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
+            "standard error; the other errors are conditional on them being fixed there."
         )
     return sentences
 
