@@ -198,6 +198,12 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
         "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
+    parser.add_argument(
+        "--budget",
+        type=level,
+        metavar="MINUTES",
+        help="begin no stack after this time, and report what was found; the same command goes on (default: none)",
+    )
     add_searching(parser)
     parser.add_argument("--starts", type=count, default=8, metavar="N", help="of each fit (default: %(default)s)")
     parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")

@@ -60,7 +60,10 @@ def predict(arguments: Namespace) -> int:
         print_scores(found, at, f"Readings of {arguments.at}")
     if arguments.out is not None:
         write_text(arguments.out, prediction_csv(found), force=arguments.force)
-        print(f"{arguments.out}: predictions in 1/sr")
+        print(
+            f"{arguments.out}: in 1/sr, bsdf_* with the model discrepancy, reading_* of a new measurement, "
+            "model_* of the stack alone"
+        )
         if not found.reliable:
             print(UNRELIABLE)
     return DONE

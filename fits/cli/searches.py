@@ -28,7 +28,7 @@ def search(data: Measurements, arguments: Namespace) -> int:
     given = searching(arguments, arguments.starts)
     again = f"{directory} keeps what was fitted; the same command again goes on with it"
     with show_progress() as progress, hint(again):
-        found = search_into(directory, data, given, progress)
+        found = search_into(directory, data, given, progress, arguments.budget)
     tables.print_table(telling.search_table(found), sys.stdout)
     for sentence in telling.search_sentences(found):
         print(sentence)

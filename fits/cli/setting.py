@@ -1,11 +1,16 @@
 """How the commands use JAX."""
 
+import os
+
 LEAST_COMPILE = 0.2
 """Programs that took so many seconds to compile are kept."""
 
 
 def use_jax() -> None:
     """Double precision, all cores, and compiled programs kept in the user's cache folder from one run to the next."""
+    # XLA reads it as it is loaded: below 3 it prints an alarm, as an error, for every program that is slow to compile.
+    # What fails is raised all the same.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
     from fits.engines.compile_cache import keep_programs

@@ -42,6 +42,11 @@ class Agreement:
     signed: float
     z: float
 
+    @property
+    def noise(self) -> float:
+        """Relative standard deviation of one reading, were the differences random and Gaussian."""
+        return self.median / (0.6745 * 2.0**0.5)
+
 
 @dataclass(frozen=True)
 class Energy:

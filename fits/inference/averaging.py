@@ -47,7 +47,11 @@ class Average:
         means, scales, softness = (np.concatenate(same) for same in zip(*map(_logarithmic, parts), strict=True))
         values = np.concatenate([part.values for part in parts])
         freedom = first.degrees_of_freedom
-        found = banded(first.wi, first.wo, first.channels, levels, values, means, scales, softness, freedom, seed)
+        given = [np.zeros_like(part.means) if part.unknown is None else part.unknown for part in parts]
+        unknown = None if all(part.unknown is None for part in parts) else np.concatenate(given)
+        found = banded(
+            first.wi, first.wo, first.channels, levels, values, means, scales, softness, unknown, freedom, seed
+        )
         shape = float(np.fmax.reduce([part.shape for part in parts]))
         return replace(found, shape=shape, readings=first.readings)
 

@@ -67,7 +67,7 @@ class Fit:
         condition_number: of the information about the parameters, each scaled to unit length.
         unresolved: the combinations of parameters that the data alone do not separate, worst first.
         minima: the minima that starts reached, best first.
-        alternatives: those among `minima`, other than the best, that explain the data equally well.
+        alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
         without_influence: names of the parameters that the data say nothing about.
         settings: starts, seed and solver.
         ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
@@ -213,9 +213,10 @@ class Fit:
     def residuals(self) -> Floats:
         """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure.
 
-        With correlated noise, what is left of it beside the errors that readings share.
+        With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
+        assumed model they are independent standard normal; `chi_square` is the sum of their squares.
         """
-        return np.asarray(self.problem.call("unshared_at", self.vector, self.predicted), float)
+        return np.asarray(self.problem.call("independent_at", self.vector, self.predicted), float)
 
     @cached_property
     def chi_square(self) -> float:

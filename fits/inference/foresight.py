@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp, softmax
 
 from fits.inference.fit_result import Fit
-from fits.inference.left_out import LeftOut, leave_out, require_groups
+from fits.inference.left_out import Done, LeftOut, leave_out, require_groups
 from fits.inference.marginal_likelihood import Evidence, evidence_of, posterior_draws
 from fits.progress import Progress, named, silent
 
@@ -60,11 +60,14 @@ def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) 
     )
 
 
-def look_closely(fit: Fit, progress: Progress | None = None) -> tuple[LeftOut, Evidence]:
-    """What a fit foretells of each incidence without it, and its evidence: by draws of its posterior both."""
+def look_closely(fit: Fit, progress: Progress | None = None, done: Done | None = None) -> tuple[LeftOut, Evidence]:
+    """What a fit foretells of each incidence without it, and its evidence: by draws of its posterior both.
+
+    done: see `leave_out`.
+    """
     require_groups(fit)
     known = posterior_draws(fit)
-    return leave_out(fit, progress=progress, known=known), evidence_of(known)
+    return leave_out(fit, progress=progress, known=known, done=done), evidence_of(known)
 
 
 def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> dict[str, Foresight]:

@@ -37,6 +37,10 @@ class Combination:
     weights: dict[str, float]
     alone: dict[str, float]
 
+    def error_of(self, name: str) -> float:
+        """Standard error that one parameter has along it, in boxes; 0 where it is no member."""
+        return abs(self.weights[name]) * self.error if name in self.weights else 0.0
+
     def called(self, names: Mapping[str, str]) -> "Combination":
         """Of those of its members that have names elsewhere, under these."""
         weights, alone = (

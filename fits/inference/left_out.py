@@ -4,6 +4,7 @@ Readings of one incidence are alike, so that one of them, left out by itself, is
 stack is. What a stack is worth shows where a whole incidence is missing.
 """
 
+from collections.abc import MutableMapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,8 +61,18 @@ class LeftOut:
         return np.array([self.log_density[rows].size for rows in self.rows])
 
 
+Done = MutableMapping[str, tuple[Floats, bool]]
+"""By group: the log-density of its readings, (rows, C), and whether the fit without them converged."""
+
+
 def leave_out(
-    fit: Fit, *, draws: int = DRAWS, seed: int = 0, progress: Progress | None = None, known: Weighted | None = None
+    fit: Fit,
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
+    progress: Progress | None = None,
+    known: Weighted | None = None,
+    done: Done | None = None,
 ) -> LeftOut:
     """Fit anew without each incidence, from the best values on, and foretell its readings.
 
@@ -72,6 +83,7 @@ def leave_out(
         draws, seed: see `predict`.
         progress: called with ("left out", groups done, groups, name).
         known: draws for the posterior of the fit: those without an incidence are looked for about them.
+        done: groups that are there are not computed again; those that are computed are added as they are.
 
     Raises:
         ValueError: a fit of a named objective, or data of a single group; one of several measurements, or part of it.
@@ -79,14 +91,18 @@ def leave_out(
     groups, data = require_groups(fit), fit.problem.data.used()
     like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
+    done = {} if done is None else done
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
             progress("left out", number, len(groups), name)
-        chosen = np.zeros(len(data), bool)
-        chosen[rows] = True
-        found = refit(without(fit.problem, chosen), fit.vector)
-        density[rows] = foretold(found, data, draws=draws, seed=seed, like=like).log_density(data.values)[rows]
-        converged &= found.converged
+        if name not in done:
+            chosen = np.zeros(len(data), bool)
+            chosen[rows] = True
+            found = refit(without(fit.problem, chosen), fit.vector)
+            seen = foretold(found, data, draws=draws, seed=seed, like=like).log_density(data.values)[rows]
+            done[name] = seen, found.converged
+        density[rows], good = done[name]
+        converged &= good
     if progress is not None:
         progress("left out", len(groups), len(groups), "")
     return LeftOut(tuple(groups), tuple(groups.values()), density, converged)

@@ -1,4 +1,4 @@
-"""What readings elsewhere will be: the model with its uncertainty, what it lacks, and the noise of a reading."""
+"""What is measured elsewhere: the stack with its uncertainty, the model discrepancy, and the noise of a measurement."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from fits.data.geometry import Geometry
+import layerjax as lj
+from fits.data.geometry import Geometry, polar
 from fits.data.measurements import Measurements, Source
 from fits.data.totals import Totals
 from fits.inference.fit_result import Fit
@@ -23,6 +24,7 @@ from fits.problem.model import Model
 from fits.problem.nodes import places
 from fits.problem.problem import polar_angles
 from layerjax._checks import in_short, require_kind
+from layerjax.mixture import stacks_of
 
 if TYPE_CHECKING:
     from fits.inference.mixture import Mixture
@@ -52,12 +54,13 @@ def predict(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
-    """What the fitted stack is expected to reflect, and what would be read.
+    """The BSDF that the fit expects elsewhere, and what a new measurement of it would give.
 
     Args:
         of: a posterior, or a fit, of whose posterior draws are made by weights (see `fits.inference.importance`); or an
             average of some.
-        at: pairs of directions, above or below; of `Measurements` their used samples, with their own sigma.
+        at: pairs of directions, above, or below a stack that light passes; of `Measurements` their used samples, with
+            their own sigma.
         levels: of the quantiles, in (0, 1).
         draws: vectors of parameters, at least 2.
         seed: of these, and of the noise.
@@ -65,8 +68,8 @@ def predict(
     Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
 
     Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels, or
-            directions that the transport cannot answer.
+        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels,
+            directions below an opaque stack, or such that the transport cannot answer.
     """
     for level in levels:
         require_level(level)
@@ -99,10 +102,10 @@ def foretold(
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
     sigma = _own_sigma(fit, values, data.sigma)
-    means, scales, softness = _readings(fit, vectors, values, data, sigma)
+    parts = _readings(fit, vectors, values, data, sigma)
     noise = fit.problem.noise
     freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
-    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, means, scales, softness, freedom, seed)
+    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, *parts, freedom, seed)
     return replace(found, shape=shape, readings=at.used() if isinstance(at, Measurements) else None)
 
 
@@ -116,9 +119,24 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
                 f"the fit {', '.join(fit.problem.data.channels)}"
             )
         return at.used()
+    _require_visible(fit, at)
     count, channels = len(at), fit.problem.data.channels
     nothing = np.zeros((count, len(channels)))
     return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
+
+
+def _require_visible(fit: Fit, at: Geometry) -> None:
+    """Refuse directions in or below the surface of an opaque stack, whose BSDF is 0 there and has no logarithm."""
+    material = fit.problem.stack
+    if not isinstance(material, lj.Stack | lj.Mixture) or any(one.base is None for one in stacks_of(material)):
+        return
+    for name, w in (("light", at.wi), ("viewer", at.wo)):
+        lowest = float(polar(w).max(initial=0.0))
+        if lowest >= 90.0:
+            raise ValueError(
+                f"predict: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
+                "[0, 90) degrees"
+            )
 
 
 def _vectors(
@@ -136,6 +154,21 @@ def _vectors(
     return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
 
 
+def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:
+    """The BSDF of the best fit along other directions, (M, 3) each, where the stack alone has these values, (M, C)."""
+    if fit.problem.model.process is None:
+        return values
+    _, floor = (np.asarray(part, float) for part in fit.problem.call(_levels, fit.vector[None]))
+    softness = _softness(fit, np.hypot(_own_sigma(fit, values[None], None), floor))
+    lack = np.asarray(fit.problem.call("lack_at", fit.vector, fit.predicted, places(wi, wo))[0])
+    return softness * np.sinh(np.asarray(logarithm(values, softness)) + lack)
+
+
+def _softness(fit: Fit, additive: Floats) -> Floats:
+    typical = np.full(additive.shape, np.median(np.abs(fit.problem.data.used().values)))
+    return soft(typical, additive)
+
+
 def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
     """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
     used = fit.problem.data.used()
@@ -149,18 +182,19 @@ def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
 
 def _readings(
     fit: Fit, vectors: Floats, values: Floats, data: Measurements, sigma: Floats
-) -> tuple[Floats, Floats, Floats | None]:
-    """Means, scales and softness of readings (see `Prediction`), where the model has these values, (D, M, C)."""
+) -> tuple[Floats, Floats, Floats | None, Floats | None]:
+    """Means, scales, softness and what is unknown of the discrepancy (see `Prediction`), with these values of the
+    model, (D, M, C)."""
     relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
     relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
     if fit.problem.model.process is None:
-        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None
+        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
     lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
-    softness = soft(np.median(values, axis=0), np.hypot(sigma, np.median(floor)))
+    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
     means = np.asarray(logarithm(values, softness)) + lack
     corrected = softness * np.sinh(means)
     noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
-    return means, np.hypot(unknown, noise), softness
+    return means, np.hypot(unknown, noise), softness, unknown
 
 
 def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
@@ -172,4 +206,4 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
 
 
 def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
-    return jax.lax.map(lambda vector: model.lack_at(vector, where), vectors)
+    return jax.lax.map(lambda vector: model.lack_at(vector, model.predict(vector), where), vectors)

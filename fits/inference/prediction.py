@@ -1,4 +1,4 @@
-"""What readings elsewhere will be, as it was predicted: bands, quantiles and scores."""
+"""What is predicted elsewhere: the BSDF, a new measurement and the stack alone, with intervals and scores."""
 
 import math
 from collections.abc import Mapping
@@ -22,6 +22,9 @@ HELD = (0.5, 0.95)
 HALVINGS = 50
 """Of an interval that a quantile lies in."""
 
+NARROWEST = 1e-12
+"""Of the discrepancy's standard deviation: where the data leave nothing of it unknown, its law is still a function."""
+
 Floats = NDArray[np.float64]
 
 
@@ -42,11 +45,14 @@ class Prediction:
         wi, wo: directions, (M, 3).
         channels: their names.
         levels: of the quantiles.
-        model: of the stack's own value.
-        reading: of a new reading: that with what the model lacks, and with noise.
+        bsdf: of the BSDF: the stack's value with the model discrepancy. This is the best estimate.
+        reading: of a new measurement: the BSDF with noise.
+        model: of the stack alone, without the discrepancy.
         means, scales: of a reading with each of D vectors of parameters, (D, M, C), in 1/sr; given these it is
             Gaussian, or has Student-t tails. Where readings share errors, of its `logarithm`.
         softness: of that, (M, C) or (D, M, C), in 1/sr; else None.
+        unknown: standard deviation of the discrepancy with each vector, (D, M, C), about `means`, of the `logarithm`;
+            None where no discrepancy is modelled.
         values: of the stack itself, with each vector, (D, M, C), in 1/sr.
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
         shape: Pareto shape of the weights by which draws stand for the posterior of a fit (see `evidence`); NaN where
@@ -58,11 +64,13 @@ class Prediction:
     wo: Floats
     channels: tuple[str, ...]
     levels: tuple[float, ...]
-    model: Band
+    bsdf: Band
     reading: Band
+    model: Band
     means: Floats
     scales: Floats
     softness: Floats | None
+    unknown: Floats | None
     degrees_of_freedom: float
     values: Floats
     shape: float = math.nan
@@ -70,29 +78,34 @@ class Prediction:
 
     @property
     def mean(self) -> Floats:
-        """Of the stack's own value, (M, C), in 1/sr."""
-        return self.model.mean
+        """Of the BSDF, (M, C), in 1/sr."""
+        return self.bsdf.mean
 
     @property
     def sd(self) -> Floats:
-        """Standard deviation of the stack's own value, (M, C), in 1/sr."""
-        return self.model.sd
+        """Standard deviation of the BSDF, (M, C), in 1/sr."""
+        return self.bsdf.sd
 
     def quantile(self, level: float) -> Floats:
-        """Of the stack's own value, (M, C), in 1/sr; level in (0, 1)."""
+        """Of the BSDF, (M, C), in 1/sr; level in (0, 1)."""
         require_level(level)
-        return np.quantile(self.values, level, axis=0)
+        if self.unknown is None:
+            return np.quantile(self.values, level, axis=0)
+        return self._mixture_quantile(level, np.maximum(self.unknown, NARROWEST), stats.norm())
 
     def reading_quantile(self, level: float) -> Floats:
         """Of a new reading, (M, C), in 1/sr; level in (0, 1)."""
         require_level(level)
-        ends = self.means + self.scales * self._tails.ppf(level)
+        return self._mixture_quantile(level, self.scales, self._tails)
+
+    def _mixture_quantile(self, level: float, scales: Floats, law: "stats.rv_frozen") -> Floats:
+        ends = self.means + scales * law.ppf(level)
         if self.softness is not None:
             ends = self.softness * np.sinh(ends)
         low, high = ends.min(axis=0), ends.max(axis=0)  # a mixture's lies between those of its parts
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
-            below = self.rank(middle) < level
+            below = law.cdf(self._offsets(middle, scales)).mean(axis=0) < level
             low, high = np.where(below, middle, low), np.where(below, high, middle)
         return 0.5 * (low + high)
 
@@ -110,18 +123,18 @@ class Prediction:
 
     def log_density(self, values: Floats) -> Floats:
         """Log-density of readings (M, C), each by itself."""
-        density = self._tails.logpdf(self._offsets(values)) - np.log(self.scales)
+        density = self._tails.logpdf(self._offsets(values, self.scales)) - np.log(self.scales)
         if self.softness is not None:
             density = density - np.log(np.asarray(size(values, self.softness)))
         return logsumexp(density, axis=0) - math.log(len(density))
 
     def rank(self, values: Floats) -> Floats:
         """Probability of a reading below each of these, (M, C)."""
-        return self._tails.cdf(self._offsets(values)).mean(axis=0)
+        return self._tails.cdf(self._offsets(values, self.scales)).mean(axis=0)
 
-    def _offsets(self, values: Floats) -> Floats:
+    def _offsets(self, values: Floats, scales: Floats) -> Floats:
         measured = values if self.softness is None else np.asarray(logarithm(values, self.softness))
-        return (measured - self.means) / self.scales
+        return (measured - self.means) / scales
 
     @property
     def median(self) -> Floats:
@@ -143,6 +156,7 @@ def banded(
     means: Floats,
     scales: Floats,
     softness: Floats | None,
+    unknown: Floats | None,
     degrees_of_freedom: float,
     seed: int,
 ) -> Prediction:
@@ -150,19 +164,23 @@ def banded(
     generator, shape = np.random.default_rng(seed), (BESIDE, *means.shape)
     gaussian = math.isinf(degrees_of_freedom)
     drawn = generator.standard_normal(shape) if gaussian else generator.standard_t(degrees_of_freedom, shape)
-    readings = means + scales * drawn
-    if softness is not None:
-        readings = softness * np.sinh(readings)
+    model = _band(values, levels)
+    reading = _drawn_band(means + scales * drawn, softness, levels)
+    bsdf = model
+    if unknown is not None:
+        bsdf = _drawn_band(means + unknown * generator.standard_normal(shape), softness, levels)
     return Prediction(
         wi=wi,
         wo=wo,
         channels=channels,
         levels=levels,
-        model=_band(values, levels),
-        reading=_band(readings.reshape(-1, *means.shape[1:]), levels),
+        bsdf=bsdf,
+        reading=reading,
+        model=model,
         means=means,
         scales=scales,
         softness=softness,
+        unknown=unknown,
         degrees_of_freedom=degrees_of_freedom,
         values=values,
     )
@@ -216,6 +234,12 @@ def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool
 def require_level(level: float) -> None:
     if not 0.0 < level < 1.0:
         raise ValueError(f"level is {level}; it must be in (0, 1)")
+
+
+def _drawn_band(draws: Floats, softness: Floats | None, levels: tuple[float, ...]) -> Band:
+    """Of draws (..., D, M, C), of the `logarithm` where there is a softness."""
+    values = draws if softness is None else softness * np.sinh(draws)
+    return _band(values.reshape(-1, *values.shape[-2:]), levels)
 
 
 def _band(values: Floats, levels: tuple[float, ...]) -> Band:

@@ -39,9 +39,16 @@ class Searching:
 
 
 def search_into(
-    directory: str | Path, data: Measurements, given: Searching, progress: Progress | None = None
+    directory: str | Path,
+    data: Measurements,
+    given: Searching,
+    progress: Progress | None = None,
+    budget: float | None = None,
 ) -> Search:
-    """Look for the stack behind data, in a directory that keeps what was fitted, and write the report there."""
+    """Look for the stack behind data, in a directory that keeps what was fitted, and write the report there.
+
+    budget: minutes, see `fits.search`.
+    """
     sd = given.calibration
     # far enough for four standard deviations
     scale = Free(1.0, float(np.exp(-4.0 * sd)), float(np.exp(4.0 * sd)), LogNormal(1.0, sd)) if sd > 0.0 else None
@@ -56,6 +63,7 @@ def search_into(
         seed=given.seed,
         progress=progress,
         directory=directory,
+        budget=budget,
     )
     picture = as_png(telling.search_picture(found))
     write_together(Path(directory), {PICTURE: picture, REPORT: telling.search_page(found).encode()})

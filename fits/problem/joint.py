@@ -94,6 +94,10 @@ class JointModel(Density):
         """See `Model.unshared_at`."""
         return self._each("unshared_at", vector, predicted)
 
+    def independent_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Model.independent_at`."""
+        return self._each("independent_at", vector, predicted)
+
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
         """Normalised log-density of each reading; where readings share errors, given all others."""
         return self._each("log_likelihood_per_datum_at", vector, predicted)

@@ -51,12 +51,17 @@ class Levels(NamedTuple):
         return process.gram_of(size(values, self.softness(values)) / sigma)
 
 
+def is_assumed(noise: Noise, used: Measurements) -> bool:
+    """Whether nothing is stated of the noise, neither by the data nor by `Noise`, so that `DEFAULT_RELATIVE` holds."""
+    return noise.relative is None and noise.floor is None and (used.sigma is None or not noise.use_sigma)
+
+
 def noise_levels(noise: Noise, used: Measurements) -> Levels:
     """The levels that `Noise` leaves out, filled in as it says."""
     sigma = used.sigma if noise.use_sigma else None
     relative, floor = noise.relative, noise.floor
     if relative is None:
-        relative = DEFAULT_RELATIVE if sigma is None and floor is None else 0.0
+        relative = DEFAULT_RELATIVE if is_assumed(noise, used) else 0.0
     if floor is None:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))

@@ -67,8 +67,6 @@ class Parts(NamedTuple):
 class Model(Density):
     """Pure functions of the physical vector (P,): predictions, residuals and log-densities over the used samples.
 
-    Arrays are traced by `jax.jit`, the rest is static.
-
     Attributes:
         template: the stack, scale and noise levels without their free parameters.
         box: bounds and priors of the P parameters.
@@ -124,10 +122,6 @@ class Model(Density):
             found = parts.scale * self.optics.seen(values, cast(Setting, parts.instrument), len(self.wi))
         return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
-    def sigma(self, vector: Array) -> Array:
-        """Scale of the noise, (N, C), in 1/sr."""
-        return self.sigma_at(vector, self.predict(vector))
-
     def sigma_at(self, vector: Array, predicted: Array) -> Array:
         """Scale of the noise, (N, C), in 1/sr, with these parameters and what they predict, (N, C)."""
         parts = self.build(vector)
@@ -151,6 +145,13 @@ class Model(Density):
             return self.standardised_at(vector, predicted)
         return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
 
+    def independent_at(self, vector: Array, predicted: Array) -> Array:
+        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        if self.process is None:
+            return self.standardised_at(vector, predicted)
+        scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
+        return -self.process.independent(*scaled, self._correlation(vector))
+
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
         """z'S^-1 z of `offsets_at` z, with S their covariance: 1 where readings share no errors."""
         if self.process is None:
@@ -166,13 +167,11 @@ class Model(Density):
         assert self.process is not None
         return self.process.whitened(*self._logarithmic(predicted, noise), self._correlation(vector, shared))
 
-    def lack_at(self, vector: Array, places: Array) -> tuple[Array, Array]:
+    def lack_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
         """What the model's logarithm lacks at other `places`, as far as the data say: mean and sd, (M, C)."""
-        predicted = self.predict(vector)
-        noise = self._noise_at(vector, predicted)
         at = self._correlation(vector)
         assert self.process is not None
-        z, relative = self._logarithmic(predicted, noise)
+        z, relative = self._logarithmic(predicted, self._noise_at(vector, predicted))
         return self.process.elsewhere(self.process.whitened(z, relative, at), relative, places, at)
 
     @property

@@ -25,7 +25,7 @@ from fits.names import Objective
 from fits.problem.compiled import Static, run
 from fits.problem.correlated import Correlated, numbers_of
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.levels import Levels, noise_levels
+from fits.problem.levels import Levels, is_assumed, noise_levels
 from fits.problem.likelihood import Noise
 from fits.problem.model import Model, Parts, Side, Transport
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
@@ -93,6 +93,11 @@ class Problem(Posed):
     def units(self) -> dict[str, str]:
         """Unit of each parameter; "1" for plain ratios."""
         return {name: unit(name) for name in self.names}
+
+    @property
+    def noise_is_assumed(self) -> bool:
+        """Whether neither the data nor `noise` nor the instrument say how large the noise is: see `Noise`."""
+        return is_assumed(with_floor(self.noise, self.instrument), self.data)
 
     @property
     def problems(self) -> "dict[str, Problem]":

@@ -71,6 +71,22 @@ class Process(eqx.Module):
         roots = roots_of(vector_of(at, len(white)), self.where, len(white))
         return at.amplitude * self.weights @ whitening.on_nodes(roots, white.reshape(-1)).T
 
+    def independent(self, z: Array, relative: Array, at: Correlation) -> Array:
+        """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + A A'.
+
+        Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. What is left
+        of z beside what the process explains (`whitened`) is neither: the process follows each datum, so that it is
+        smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`given_others`) have
+        variance 1, but are correlated, too.
+        """
+        gram = self.gram_of(relative) if self.gram is None else self.gram
+        roots = roots_of(vector_of(at, z.shape[-1]), self.where, z.shape[-1])
+        spread, axes = jnp.linalg.eigh(at.amplitude**2 * whitening.unit_square(roots, gram))  # of A'A
+        root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
+        told = at.amplitude * whitening.from_nodes(roots, (self.weights.T @ (relative * z)).T)
+        white = -(axes @ ((axes.T @ told) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
+        return z + relative * (self.weights @ (at.amplitude * whitening.on_nodes(roots, white)).T)
+
     def given_others(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
         """Of each reading its weighted residual and precision, (N, C): given all others it has mean residual /
         precision and variance 1 / precision, in units of the noise.

@@ -95,7 +95,7 @@ def _symmetry(found: Agreement | None) -> str:
 def _repeats(found: Agreement | None) -> str:
     if found is None:
         return "Repeats: no reading was taken twice; the noise has to come from the file's sigma or from the fit."
-    noise = 100.0 * found.median / (0.6745 * math.sqrt(2.0))
+    noise = 100.0 * found.noise
     return f"Repeats: {found.count:,} readings were taken again; {_apart(found)}: a noise of about {noise:.2g} %."
 
 

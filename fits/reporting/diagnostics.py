@@ -1,7 +1,8 @@
 """What structure the residuals of a fit have left along the angles of its measurements.
 
-White residuals are what the error bars assume. Here is the evidence: per incidence their mean and size, and over all of
-them the correlation of neighbours in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
+White residuals are what the error bars assume, where a model discrepancy is fitted once they are whitened by its
+covariance. Here is the evidence: per incidence their mean and size, and over all of them the correlation of neighbours
+in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
 """
 
 from dataclasses import dataclass
@@ -62,17 +63,46 @@ def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
 
 
 def standardised(fit: "Fit") -> np.ndarray:
-    """Residuals of every row in units of the noise, (N, C), NaN in rows that were not used.
+    """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
 
-    A named objective has no noise model: there the unit is the scatter that the fit has left.
+    They are in units of the noise; with a model discrepancy, whitened by the covariance of both. A named objective has
+    no noise model: there the unit is the scatter that the fit has left.
     """
-    unit = 1.0 if fit.is_posterior else np.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1))
-    return over_all_rows(fit, fit.residuals / unit)
+    return over_all_rows(fit, fit.residuals / _unit(fit))
 
 
 def residual_label(fit: "Fit") -> str:
     """What `standardised` residuals are, for an axis of a picture."""
-    return r"(data $-$ model) / $\sigma$" if fit.is_posterior else f"residual of {fit.problem.objective} / its scatter"
+    return "whitened residual" if fit.problem.noise.correlated else misfit_label(fit)
+
+
+def bsdf(fit: "Fit") -> np.ndarray:
+    """What the fit says of the BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
+    from fits.inference.predicting import with_discrepancy
+
+    used = fit.problem.data.used()
+    return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
+
+
+def misfit(fit: "Fit") -> np.ndarray:
+    """What every reading is off the `bsdf` by, in units of the noise, (N, C); NaN in rows that were not used.
+
+    With a model discrepancy these are smaller than the noise, since it follows the readings: `standardised` are not.
+    """
+    left = np.asarray(fit.problem.call("unshared_at", fit.vector, fit.predicted), float)
+    return over_all_rows(fit, left / _unit(fit))
+
+
+def misfit_label(fit: "Fit") -> str:
+    """What a `misfit` is, for an axis of a picture."""
+    if not fit.is_posterior:
+        return f"residual of {fit.problem.objective} / its scatter"
+    which = "with discrepancy" if fit.problem.noise.correlated else "model"
+    return rf"(data $-$ {which}) / $\sigma$"
+
+
+def _unit(fit: "Fit") -> float:
+    return 1.0 if fit.is_posterior else float(np.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1)))
 
 
 def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualStructure:

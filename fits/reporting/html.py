@@ -11,6 +11,7 @@ from fits.data.scans import incidences
 from fits.data.totals import Totals
 from fits.maps.fitted_map import FittedMap
 from fits.reporting import tables, verdicts
+from fits.reporting.agreement import explains
 from fits.reporting.data_tables import came_as
 from fits.reporting.diagnostics import ResidualStructure, residual_label, residual_structure, standardised
 from fits.reporting.maps.page import report as write_map_page
@@ -148,7 +149,7 @@ def page(
         section(
             "Data and model",
             image(images, "totals", "Shares of the light, with one sigma, and those of the fit."),
-            image(images, "model", "In the plane of incidence. Grey: one sigma as the noise model assumes it."),
+            image(images, "model", _curves_caption(fit)),
             image(
                 images,
                 "maps",
@@ -158,9 +159,9 @@ def page(
         "" if foretold is None else _held_out(foretold, images),
         section(
             "How well the model explains the data",
-            sentences(verdicts.explains(fit, structure)),
+            sentences(explains(fit, structure)),
             tables.html_table(tables.incidence_table(structure)),
-            image(images, "residuals", "What independent noise of the stated size would not show."),
+            image(images, "residuals", "Departures from independent noise of the stated size."),
         ),
         section(
             "What the data cannot tell",
@@ -237,7 +238,7 @@ def _fitted(fit: "Fit") -> str:
         ("values came as", came_as(data)),
         ("channels", ", ".join(data.channels)),
         ("readings", f"{int(data.mask.sum())} of {len(data.mask)} used, {int((~data.mask).sum())} masked"),
-        ("incidence", _incidence_words([group.theta for group in incidences(data)])),
+        ("incidence", _incidence_words([group.theta for group in incidences(data.used())])),
         ("noise", verdicts.noise_in_words(problem)),
         ("objective", problem.objective),
         ("common scale", verdicts.scale_in_words(problem)),
@@ -248,6 +249,13 @@ def _fitted(fit: "Fit") -> str:
         *((("attribution", data.source.attribution),) if data.source.attribution else ()),
     ]
     return section("What was fitted", tables.html_table(tables.Table("", ("", ""), tuple(rows))))
+
+
+def _curves_caption(fit: "Fit") -> str:
+    caption = "In the plane of incidence. Grey: one sigma as the noise model assumes it."
+    if fit.problem.noise.correlated:
+        caption += " Residuals are of the curve with the discrepancy, which follows the readings."
+    return caption
 
 
 def _incidence_words(angles: Sequence[float]) -> str:

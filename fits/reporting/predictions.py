@@ -1,4 +1,4 @@
-"""Predictions as a table of text, and how well they foretold readings."""
+"""Predictions as a table of text, and how well they agree with held-out readings."""
 
 import csv
 import io
@@ -16,26 +16,30 @@ if TYPE_CHECKING:
     from fits.inference.prediction import Prediction, Scores
 
 UNRELIABLE = (
-    "The posterior is unlike what was drawn from, and a part of it may be missing: bands may be too narrow, those of a "
-    "chain are to be preferred (sample)."
+    "The importance-sampling approximation of the posterior is poor (Pareto k above 0.7): intervals may be too narrow. "
+    "Sample the posterior instead (`layerjax sample`)."
 )
 
 
 def prediction_csv(prediction: "Prediction") -> str:
-    """A row for each pair of directions and channel: angles in degrees, all else in 1/sr."""
-    levels = [f"{100.0 * level:g}" for level in prediction.levels]
-    columns = [f"{what}_{part}" for what in ("model", "reading") for part in ("mean", "sd", *(f"q{q}" for q in levels))]
+    """A row for each pair of directions and channel: angles in degrees, all else in 1/sr.
+
+    Columns `bsdf_...` are the best estimate, of the stack with the model discrepancy; `reading_...` are of a new
+    measurement; `model_...` of the stack without the discrepancy.
+    """
+    parts = {"bsdf": prediction.bsdf, "reading": prediction.reading, "model": prediction.model}
+    statistics = ("mean", "sd", *(f"q{100.0 * level:g}" for level in prediction.levels))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
+    columns = [f"{part}_{statistic}" for part in parts for statistic in statistics]
     writer.writerow(["theta_i", "phi_i", "theta_o", "phi_o", "channel", *columns])
     angles = [polar(prediction.wi), azimuth(prediction.wi), polar(prediction.wo), azimuth(prediction.wo)]
-    bands = (prediction.model, prediction.reading)
     for row in range(len(prediction.wi)):
         place = [f"{angle[row]:.10g}" for angle in angles]
         for index, channel in enumerate(prediction.channels):
             numbers = [
                 number
-                for band in bands
+                for band in parts.values()
                 for number in (band.mean[row, index], band.sd[row, index], *band.quantiles[:, row, index])
             ]
             writer.writerow([*place, channel, *(f"{number:.8g}" for number in numbers)])
@@ -50,8 +54,9 @@ def scores_table(prediction: "Prediction", readings: "Measurements", title: str)
     if len(every) > 1:
         rows.append(_row("all", scores(prediction, readings)))
     note = (
-        "error: of the prediction, |prediction / reading - 1|, its median and 95th percentile; of the stack alone, the "
-        "median. Shares of readings inside the bands of 50 and 95 %. Score: mean log-density of a reading."
+        "error: |prediction / reading - 1|, its median and 95th percentile; stack alone: median error of the physical "
+        "model without the discrepancy term. In 50 %, in 95 %: share of the readings inside the prediction intervals. "
+        "Log score: mean log predictive density of a reading."
     )
     if not prediction.reliable:
         note = f"{note} {UNRELIABLE}"

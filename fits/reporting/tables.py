@@ -144,8 +144,8 @@ def alone_table(fit: "Fit") -> Table:
 def minima_table(fit: "Fit") -> Table:
     """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
     shown = fit.minima[:MOST_MINIMA]
-    as_good = {id(minimum) for minimum in fit.alternatives}
-    heads = ["best", *("as good" if id(minimum) in as_good else "worse" for minimum in shown[1:])]
+    equal = {id(minimum) for minimum in fit.alternatives}
+    heads = ["best", *("same cost" if id(minimum) in equal else "higher cost" for minimum in shown[1:])]
     rows = [
         ("starts", *(str(minimum.count) for minimum in shown)),
         ("cost", *(f"{minimum.cost:.6g}" for minimum in shown)),
@@ -157,20 +157,21 @@ def minima_table(fit: "Fit") -> Table:
 
 
 def unresolved_table(fit: "Fit") -> Table:
-    """Combinations of parameters that the data do not resolve: how badly, and what they would know of each alone."""
+    """Directions of parameter space that the data do not constrain: how badly, and what they know of each by itself."""
     rows = []
     for place, combination in enumerate(fit.unresolved, 1):
         weights, alone = combination.weights, combination.alone
         size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
         mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
         known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
-        rows.append((str(place), size, "OPEN" if combination.open else "LOOSE", mixture, known))
+        rows.append((str(place), size, "unconstrained" if combination.open else "weak", mixture, known))
     note = (
-        "In widths of the bounds, from the data alone; along what is OPEN only bounds and priors decide. The last "
-        "column is the standard error that the data would give each parameter if all others were known."
+        "Standard errors from the likelihood only, in units of the prior range; where they exceed it, only bounds and "
+        "priors decide. A parameter's own error along a direction is its weight times that. Last column: the error of "
+        "each parameter with the others fixed, in its own unit."
     )
-    columns = ("no.", "error", "", "along", "each alone")
-    return Table("Combinations that the data do not resolve", columns, tuple(rows), note if rows else "")
+    columns = ("direction", "error", "", "along", "each with the others fixed")
+    return Table("Directions that the data do not constrain", columns, tuple(rows), note if rows else "")
 
 
 def posterior_table(posterior: "Posterior") -> Table:

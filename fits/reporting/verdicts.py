@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fits.inference.fit_result import ENDED
-from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
+from fits.inference.identifiability import OPEN_BEYOND, UNRESOLVED_BEYOND, Combination
 from fits.inference.limits import instrument_limits
 from fits.inference.resolution import ENOUGH
+from fits.reporting.agreement import (
+    MISFIT_SIGMAS,
+    agreement,
+    describes,
+    discrepancy,
+    excess,
+    misdescribed,
+    noise_notes,
+    without_discrepancy,
+)
 from fits.reporting.diagnostics import ResidualStructure
 
 if TYPE_CHECKING:
@@ -19,15 +29,17 @@ if TYPE_CHECKING:
     from fits.problem.problem import Problem
 
 STRONG = 0.95  # correlation from which two parameters are said to trade against each other
-MISFIT_SIGMAS = 3.0  # chi-square this many of its own standard deviations away from its expectation is not chance
 
 
 def identifiability(fit: "Fit") -> dict[str, str]:
-    """For each parameter, in a few words, whether the data determines it; combinations count from 1, worst first."""
+    """For each parameter, in a few words, whether the data determines it; directions count from 1, worst first.
+
+    What counts is a parameter's own error along the directions that the data leave open, in units of its prior range: a
+    parameter with a small share in a badly known direction may be well known itself.
+    """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
     limits = instrument_limits(fit)
-    worst = {name: place for place in range(len(fit.unresolved), 0, -1) for name in fit.unresolved[place - 1].weights}
     words = {}
     for index, name in enumerate(names):
         width = float(fit.problem.high[index] - fit.problem.low[index])
@@ -39,15 +51,13 @@ def identifiability(fit: "Fit") -> dict[str, str]:
             words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
-        elif name in worst:
-            combination = fit.unresolved[worst[name] - 1]
-            kind = "OPEN" if combination.open else "LOOSE"
-            others = len(combination.weights) > 1
-            words[name] = f"{kind}: combination {worst[name]}" if others else f"{kind}: hardly seen"
+        elif math.hypot(*(own := [one.error_of(name) for one in fit.unresolved])) > UNRESOLVED_BEYOND:
+            kind = "unconstrained by the data" if math.hypot(*own) > OPEN_BEYOND else "weakly constrained"
+            words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
         elif not math.isfinite(error):
             words[name] = "not determined"
         elif error > 0.3 * width:
-            words[name] = "barely: error near the width of the bounds"
+            words[name] = "weakly constrained: error near the width of the bounds"
         elif abs(correlation[index, partner]) >= STRONG:
             words[name] = f"trades with {names[partner]} {correlation[index, partner]:+.2f}"
         else:
@@ -55,44 +65,13 @@ def identifiability(fit: "Fit") -> dict[str, str]:
     return words
 
 
-def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
-    """Whether the residuals are what the noise model says they should be, and what follows for the quoted errors."""
-    if not fit.is_posterior:
-        return [
-            "This fit minimised a named residual, not a likelihood: its cost has no absolute scale, so that chi-square "
-            "says nothing about the noise. Errors are scaled by the scatter that is left, and are no posterior; "
-            "in what follows, sigma stands for that scatter.",
-            *_structure(structure),
-        ]
-    ratio, freedom = fit.reduced_chi_square, fit.degrees_of_freedom
-    sentences = [
-        *shared_errors(fit),
-        f"Chi-square per degree of freedom is {ratio:.3g} ({fit.chi_square:.5g} over {freedom}); the right model with "
-        f"the right noise gives 1 ± {math.sqrt(2.0 / max(freedom, 1)):.2g}.",
-    ]
-    if _excess(fit) > MISFIT_SIGMAS:
-        sentences.append(
-            "The model does not explain the data to within the stated noise. The quoted errors assume that it does, so "
-            f"they are too small: scaling them to the scatter that is there multiplies them by {math.sqrt(ratio):.2g}, "
-            "and even that does not account for what a wrong model does to the values themselves."
-        )
-    elif _excess(fit) < -MISFIT_SIGMAS:
-        sentences.append(
-            "The data scatters less than the stated noise: sigma is too large, or holds an error that all readings "
-            f"share. For what is random, the quoted errors are too large by {1.0 / math.sqrt(ratio):.2g}."
-        )
-    else:
-        sentences.append("The overall size of the residuals is what the stated noise predicts.")
-    return sentences + _structure(structure)
-
-
 def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]:
     """The verdict in a few sentences, and whether it is without reservation."""
     sentences = [] if fit.converged else ["The fit did not converge: these are the best values seen, not a minimum."]
-    close = agreement(fit)
+    close, undescribed, notes = agreement(fit), misdescribed(fit), noise_notes(fit.problem)
     if not fit.is_posterior:
         sentences.append("Fitted with a named residual, not a likelihood: the errors are only indicative.")
-    elif _excess(fit) > MISFIT_SIGMAS:
+    elif excess(fit.chi_square, fit.degrees_of_freedom) > MISFIT_SIGMAS:
         sentences.append(
             f"The model does not explain the data to within its noise (chi-square per degree of freedom "
             f"{fit.reduced_chi_square:.3g}): the quoted errors are too small."
@@ -101,7 +80,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
-    sentences += shared_errors(fit)
+    sentences += discrepancy(fit)
     if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     for name, least in instrument_limits(fit).items():
@@ -112,61 +91,27 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(f"Without influence on the data: {', '.join(fit.without_influence)}.")
     for combination in fit.unresolved[:1]:
         sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
-    if fit.alternatives:
-        sentences.append("Another stack explains the data equally well.")
-    if sentences:
-        return [*close, *sentences], False
-    return [*close, "The model explains the data to within its noise, and the data resolve every parameter."], True
-
-
-def agreement(fit: "Fit") -> list[str]:
-    """How close the model comes to the readings, whatever their noise; nothing, where none is above zero."""
-    values = fit.problem.data.used().values
-    lit = values > 0.0
-    if not lit.any():
-        return []
-    half, most = np.quantile(100.0 * np.abs(fit.predicted[lit] / values[lit] - 1.0), [0.5, 0.95])
-    count = f"{values.size:,} readings"
-    return [f"Half of the {count} are within {half:.2g} % of the model, 95 % of them within {most:.2g} %."]
-
-
-def shared_errors(fit: "Fit") -> list[str]:
-    """How large the errors of the model are that neighbouring readings share, and how far they reach; none, nothing."""
-    at = fit.problem.build(fit.vector).correlation
-    if at is None:
-        return []
-    scatter = float(np.sum(np.square(fit.problem.call("offsets_at", fit.vector, fit.predicted))))
-    share = 1.0 - float(np.sum(fit.residuals**2)) / scatter if scatter > 0.0 else 0.0
-    reach = f"{float(at.half):.2g} degrees of the half vector and {float(at.difference):.2g} of the difference"
-    along = 100.0 * float(at.amplitude)
-    grazing = f" along the normal and {along * 2.0 ** float(at.growth):.2g} % at 60 degrees" if at.growth > 0.0 else ""
+    if fit.alternatives and not undescribed:
+        sentences.append("Another local minimum of the same model fits equally well.")
+    if undescribed or sentences:
+        return [*undescribed, *close, *notes, *sentences], False
     return [
-        f"Neighbouring readings share errors of the model of {along:.2g} % of its value{grazing}, alike "
-        f"over {reach}: {100.0 * share:.3g} % of the scatter about it. The errors of the parameters, and the "
-        "bands of predictions, count them.",
-        *_without_them(fit),
-    ]
-
-
-def _without_them(fit: "Fit") -> list[str]:
-    """Why the fit counts what readings share, where it was left to the residuals."""
-    if fit.alone is None:
-        return []
-    ratio = fit.alone.chi_square / fit.alone.degrees_of_freedom if fit.alone.degrees_of_freedom > 0 else math.nan
-    return [
-        "They are counted since without them residuals of neighbours in angle are correlated by "
-        f"{fit.alone.alike:+.2f} ({fit.alone.pairs} pairs; chi-square per degree of freedom {ratio:.3g}); "
-        "correlated = false leaves them out."
-    ]
+        *close,
+        *notes,
+        "The model explains the data to within its noise, and the data resolve every parameter.",
+    ], True
 
 
 def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
     """A few lines for the terminal: the verdict, how good, how sure, and what the data leave open."""
     lines, _ = in_short(fit, structure)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    starts = f"{fit.minima[0].count} of {sum(fit.ended.values())} starts ended here"
+    if fit.problem.noise.correlated:
+        good = f"{good} with the discrepancy term, {without_discrepancy(fit):.4g} without"
+    starts = f"{fit.minima[0].count} of {_started(fit)} ended here"
+    others = f", other local minima that fit equally well: {len(fit.alternatives)}" if describes(fit) else ""
     accurate = f"; numerical error of the model: {numerical_error(fit)}" if fit.resolution else ""
-    return [*lines, f"{good}; {starts}, others as good: {len(fit.alternatives)}{accurate}"]
+    return [*lines, f"{good}; {starts}{others}{accurate}"]
 
 
 def noise_in_words(problem: "Problem") -> str:
@@ -179,7 +124,8 @@ def noise_in_words(problem: "Problem") -> str:
         if f"noise.{level}" in problem.names:
             parts.append(f"a fitted {level} part")
         elif value > 0.0:
-            parts.append(f"{value:.3g} {unit}")
+            assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
+            parts.append(f"{value:.3g} {unit}{assumed}")
     if noise.correlated:
         parts.append("errors that neighbouring readings share")
     tails = (
@@ -216,42 +162,9 @@ def listed(names: Sequence[str]) -> str:
 
 
 def _not_separated(combination: Combination) -> str:
-    names = list(combination.weights)
+    error = {name: combination.error_of(name) for name in combination.weights}
+    names = [name for name in error if error[name] > UNRESOLVED_BEYOND] or [max(error, key=lambda name: error[name])]
     return f"The data do not {'separate' if len(names) > 1 else 'determine'} {listed(names)}"
-
-
-def _excess(fit: "Fit") -> float:
-    """Chi-square above its expectation, in its own standard deviations."""
-    freedom = fit.degrees_of_freedom
-    return (fit.reduced_chi_square - 1.0) / math.sqrt(2.0 / freedom) if freedom > 0 else math.nan
-
-
-def _structure(structure: ResidualStructure) -> list[str]:
-    sentences = []
-    if math.isfinite(structure.lag_one):
-        sentences.append(
-            f"Neighbours in angle have residuals correlated by {structure.lag_one:+.2f}, which is "
-            f"{structure.lag_one_sigma:+.1f} standard errors from the 0 of independent noise ({structure.pairs} pairs)."
-        )
-        if structure.lag_one_sigma > MISFIT_SIGMAS:
-            independent = max(1.0, structure.count * structure.independent_share)
-            sentences.append(
-                f"So the {structure.count} residuals are worth about {independent:.0f} independent ones, which alone "
-                f"makes the quoted errors too small by about {structure.independent_share**-0.5:.2g}. Such runs come "
-                "from structure that the model lacks, or from a calibration error that is smooth in angle."
-            )
-    if len(structure.by_incidence) > 1:
-        worst = structure.worst
-        sentences.append(
-            f"The worst incidence is {worst.theta:g}°: root mean square {worst.rms:.2f} sigma, mean "
-            f"{worst.mean:+.2f} sigma."
-        )
-    sentences.append(
-        f"{structure.beyond_three:.1%} of the residuals are beyond 3 sigma (a normal law has 0.3 %); their "
-        f"distribution is at most {structure.normal_distance:.2f} away from the unit normal one "
-        "(Kolmogorov-Smirnov distance)."
-    )
-    return sentences
 
 
 def determines(fit: "Fit") -> list[str]:
@@ -263,17 +176,18 @@ def determines(fit: "Fit") -> list[str]:
         )
     if fit.unresolved:
         sentences.append(
-            f"The data alone know {len(fit.unresolved)} of {len(fit.vector)} combinations of parameters to no better "
-            f"than {UNRESOLVED_BEYOND:.0%} of their bounds: only bounds and priors hold them."
+            f"{len(fit.unresolved)} of {len(fit.vector)} principal directions of parameter space are constrained by "
+            f"the data to no better than {100.0 * UNRESOLVED_BEYOND:g} % of the prior range; there, priors dominate."
         )
     else:
         sentences.append(
-            f"The data alone know every combination of parameters to better than {UNRESOLVED_BEYOND:.0%} of its bounds."
+            "The data constrain every principal direction of parameter space to better than "
+            f"{100.0 * UNRESOLVED_BEYOND:g} % of the prior range."
         )
     if fit.at_bound:
         sentences.append(
-            f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it; it has no symmetric error, and "
-            "the errors of the others hold with it kept there."
+            f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
+            "standard error; the other errors are conditional on them being fixed there."
         )
     return sentences
 
@@ -284,19 +198,34 @@ def starts_in_words(fit: "Fit") -> str:
         return "not recorded"
     run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
     where = ", ".join(f"{fit.ended[key]} {word}" for key, word in ENDED.items() if fit.ended[key])
-    return f"{sum(fit.ended.values())} ({run}): {where}"
+    ran = sum(fit.ended.values())
+    if not _refitted(fit):
+        return f"{ran} ({run}): {where}"
+    given = fit.settings.get("starts", "?")
+    return f"{given} with independent noise ({run}), then {ran} with the discrepancy term: {where}"
+
+
+def _refitted(fit: "Fit") -> bool:
+    """Whether it was fitted once more, with a model discrepancy, from starts of its own: see `shared_errors.points`."""
+    return fit.alone is not None
+
+
+def _started(fit: "Fit") -> str:
+    """How many starts led to the fit, in words."""
+    return f"{sum(fit.ended.values())} starts{' with the discrepancy term' if _refitted(fit) else ''}"
 
 
 def minima(fit: "Fit") -> list[str]:
-    """How many starts agree on the minimum, and whether another stack explains the data as well."""
+    """How many starts agree on the minimum, and whether another local minimum fits equally well."""
     best, total = fit.minima[0], sum(fit.ended.values()) or sum(minimum.count for minimum in fit.minima)
+    starts = _started(fit) if fit.ended else f"{total} starts"
     found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
-    sentences = [f"{best.count} of {total} starts reached the best minimum; {found}."]
+    sentences = [f"{best.count} of {starts} reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
-    if fit.alternatives:
+    if fit.alternatives and describes(fit):
         sentences.append(
-            f"Minima that explain the data equally well: {len(fit.alternatives)}. It cannot tell them apart."
+            f"Other local minima of the same model that fit equally well: {len(fit.alternatives)} (same chi-square)."
         )
     return sentences
 

@@ -3,6 +3,7 @@
 search.json     which search it is
 STRUCTURE/      a fit with noise alone, and STRUCTURE+closer/ one as it was looked at, as `save_fit` writes them
 STRUCTURE.json  what was left out, and the evidence
+.STRUCTURE.json the incidences that were left out so far, until all of them were
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fits._files import locked, named, read_json, write_json
 from fits.data.measurements import Measurements
@@ -22,7 +24,32 @@ from fits.reporting.results import load_fit, save_fit
 from fits.reporting.stored import stored_array, stored_number
 from fits.structures.library import Structure
 
+Floats = NDArray[np.float64]
+
 IDENTITY, LOCK = "search.json", "search.lock"
+
+
+class Groups(dict[str, tuple[Floats, bool]]):
+    """What a fit foretold of the groups that were left out of it so far, in a file: see `fits.inference.left_out.Done`.
+
+    A file of another fit is not looked at. ValueError for one that is damaged.
+    """
+
+    def __init__(self, path: Path, fit: Fit):
+        super().__init__()
+        self._path, self._of = path, fit.vector.tolist()
+        content = read_json(path) if path.is_file() else {}
+        if content.get("of") == self._of:
+            for name, one in content["groups"].items():
+                super().__setitem__(name, (stored_array(one["log_density"], *one["shape"]), bool(one["converged"])))
+
+    def __setitem__(self, name: str, found: tuple[Floats, bool]) -> None:
+        super().__setitem__(name, found)
+        groups = {
+            name: {"log_density": density, "shape": density.shape, "converged": converged}
+            for name, (density, converged) in self.items()
+        }
+        write_json(self._path, {"of": self._of, "groups": groups}, force=True)
 
 
 class Kept:
@@ -96,9 +123,17 @@ class Kept:
             "evidence": {"log": evidence.log, "error": evidence.error, "shape": evidence.shape},
         }
         write_json(self._look(structure), content, force=True)
+        self._groups(structure).unlink(missing_ok=True)
+
+    def groups(self, structure: Structure, fit: Fit) -> Groups:
+        """What a closer look at this fit has found so far."""
+        return Groups(self._groups(structure), fit)
 
     def _place(self, structure: Structure, closer: bool) -> Path:
         return self.directory / (_slug(structure) + ("+closer" if closer else ""))
+
+    def _groups(self, structure: Structure) -> Path:
+        return self.directory / f".{_slug(structure)}.json"
 
     def _look(self, structure: Structure) -> Path:
         return self.directory / f"{_slug(structure)}.json"

@@ -9,6 +9,8 @@ chance would nor has a clearly lower criterion: with errors that readings share,
 foretell as well as one that lacks one.
 """
 
+import math
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -75,11 +77,12 @@ class Found:
 class Search:
     """Structures that were fitted, best first: by what they foretell, then by the information criterion.
 
-    alike: names of those that the data cannot tell from the best.
+    alike: names of those that the data cannot tell from the best. stopped: its budget ended it before it was done.
     """
 
     found: tuple[Found, ...]
     alike: tuple[str, ...]
+    stopped: bool = False
 
     @property
     def best(self) -> Found:
@@ -115,6 +118,7 @@ def search(
     seed: int = 0,
     progress: Progress | None = None,
     directory: str | Path | None = None,
+    budget: float | None = None,
 ) -> Search:
     """Look for the stack behind the data among those that a library's layers and bases make.
 
@@ -127,38 +131,55 @@ def search(
         progress: called with (what is done, structures done, structures of this level, note).
         directory: where each structure is kept as it is fitted: a search that was killed takes those for done. Of
             another search it is refused.
+        budget: minutes after which no structure is begun any more, but those that a result needs; what was begun is
+            finished. With the same `directory` another call goes on.
 
     Raises:
-        ValueError: layers out of range; another search's directory; or as `fit` and `leave_out`.
+        ValueError: layers or budget out of range; another search's directory; or as `fit` and `leave_out`.
     """
     require_kind("data", data, Measurements)
     require_kind("library", library, Library, None)
     require_kind("noise", noise, Noise, None)
     if not (isinstance(layers, int) and 0 <= layers <= 6):
         raise ValueError(f"layers is {in_short(layers)}; it must be in [0, 6]")
+    if budget is not None and not (math.isfinite(budget) and budget >= 0.0):
+        raise ValueError(f"budget is {budget}; it must be a number of minutes of at least 0")
+    until = math.inf if budget is None else time.monotonic() + 60.0 * budget
     library = default_library(len(data.channels)) if library is None else library
     noise = Noise() if noise is None else noise
     # without an instrument it is the same search as before there were any
     settings = (library, noise, scale, transport, starts, seed, *([] if instrument is None else [instrument]))
     with nullcontext() if directory is None else Kept(directory, data, *settings) as kept:
         run = _Fitting(data, library, transport, noise, scale, instrument, starts, seed, kept)
-        return _searched(run, _Looked(kept), layers, progress)
+        return _searched(run, _Looked(kept), layers, progress, until)
 
 
-def _searched(run: "_Fitting", looked: "_Looked", layers: int, progress: Progress | None) -> Search:
-    """Level by level, as long as a level foretells more than those before, or fits better by more than it costs."""
-    library = run.library
+def _searched(
+    run: "_Fitting", looked: "_Looked", layers: int, progress: Progress | None, until: float = math.inf
+) -> Search:
+    """Level by level, as long as a level foretells more than those before, or fits better by more than it costs.
+
+    until: of the monotonic clock, in seconds, after which nothing more is begun.
+    """
+    library, stopped = run.library, False
     level: list[Structure] = [(base,) for base in library.bases]
     while level:
         before, lowest = looked.best(), looked.lowest()
-        _screen(level, run, looked, progress)
-        closer = sorted(level, key=looked.bic)[:CLOSER]
-        _look_closer(closer, run, looked, progress)
+        stopped = before is not None and time.monotonic() > until
+        if stopped:
+            break
+        _screen(level, run, looked, progress, until)
+        fitted = [one for one in level if one in looked.plain]
+        closer = sorted(fitted, key=looked.bic)[:CLOSER]
+        _look_closer(closer, run, looked, progress, until)
+        stopped = len(fitted) < len(level) or any(one not in looked.left for one in closer)
+        if stopped:
+            break
         if before is not None and not looked.ahead(before) and not looked.lowest() < lowest - STRONG:
             break
         level = _next(looked, library, layers)
     _report(progress, "closer look", 1, 1, None)
-    return looked.result()
+    return replace(looked.result(), stopped=stopped)
 
 
 @dataclass(frozen=True)
@@ -195,26 +216,35 @@ class _Fitting:
         return fit_problem(problem, starts=self.starts, seed=self.seed, refine=plain is not None)
 
 
-def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
+def _screen(level: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None, until: float) -> None:
     """Fit structures with noise alone, some at a time: to compile one keeps a single core busy."""
     _report(progress, f"{len(level[0]) - 1} layers", 0, len(level), level[0])
-    for done, (structure, found) in enumerate(_at_a_time(run, level), 1):
+    for done, (structure, found) in enumerate(_at_a_time(run, level, until), 1):
         looked.plain[structure] = found
         _report(progress, f"{len(level[0]) - 1} layers", done, len(level), structure)
 
 
-def _look_closer(closer: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None) -> None:
+def _look_closer(
+    closer: list[Structure], run: _Fitting, looked: "_Looked", progress: Progress | None, until: float
+) -> None:
     """At some structures of a level at a time, as they are screened."""
     _report(progress, "closer look", 0, len(closer), closer[0])
-    for done, (structure, _) in enumerate(_at_a_time(lambda one: looked.look(one, run), closer), 1):
+    for done, (structure, _) in enumerate(_at_a_time(lambda one: looked.look(one, run), closer, until), 1):
         _report(progress, "closer look", done, len(closer), structure)
 
 
-def _at_a_time(call: Callable[[Structure], Result], structures: list[Structure]) -> Iterator[tuple[Structure, Result]]:
-    """Structures with what the call gives of them, some on all cores at a time, and none runs while programs go."""
+def _at_a_time(
+    call: Callable[[Structure], Result], structures: list[Structure], until: float
+) -> Iterator[tuple[Structure, Result]]:
+    """Structures with what the call gives of them, some on all cores at a time, and none runs while programs go.
+
+    The first of them whatever the time, others until then.
+    """
     together = min(cores(), TOGETHER)
     with ThreadPoolExecutor(together) as pool:
         for first in range(0, len(structures), together):
+            if first and time.monotonic() > until:
+                return
             make_room()
             some = structures[first : first + together]
             yield from zip(some, pool.map(call, some), strict=True)
@@ -259,7 +289,7 @@ class _Looked:
         found = self.fits[structure] = run(structure, self.plain[structure])
         stored = self.kept.look(structure) if self.kept is not None else None
         if stored is None:
-            stored = look_closely(found)
+            stored = look_closely(found, done=None if self.kept is None else self.kept.groups(structure, found))
             if self.kept is not None:
                 self.kept.keep_look(structure, *stored)
         self.left[structure], self.evidences[structure] = stored

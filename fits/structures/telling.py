@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fits.reporting import tables
+from fits.reporting.agreement import misdescribed, noise_notes, without_discrepancy
 from fits.reporting.html import source_name
 from fits.reporting.pages import document, image, section, sentences
 from fits.reporting.plots.data import CYCLE, GREY, STYLE, as_png
@@ -28,28 +29,48 @@ def search_table(search: "Search", most: int | None = SHOWN) -> tables.Table:
     rows = tuple(_row(one) for one in search.found[:most])
     hidden = len(search.found) - len(rows)
     note = (
-        "Structures that were looked at closely, by what they foretell of incidences that are left out, then the "
-        "others by BIC with noise alone." + (f" {hidden} more are in the report." if hidden else "")
+        "First the models that were looked at closely, by predictive score (the sum of log predictive densities of "
+        "readings left out of the fit); then the others, by BIC with independent noise."
+        + (f" {hidden} more are in the report." if hidden else "")
     )
     heads = ("from the top", "parameters", "chi2/dof", "BIC - best", "score", "behind best", "weight", "probability")
     return tables.Table("Stacks", heads, rows, note)
 
 
 def search_sentences(search: "Search") -> list[str]:
-    """What the data say of the structures."""
+    """What the data say of the structures: one verdict, by the predictive score, and what is to be known of it."""
     best = search.best
     assert best.foresight is not None
-    words = [f"{best.name} foretells incidences that are left out best, of {len(search.found)} structures."]
-    if search.alike:
-        words.append(f"The data do not tell it from {listed(search.alike)}.")
-    else:
-        words.append("The data tell it from all others that were looked at closely.")
-    if best.fit.problem.noise.correlated:
-        words.append("It does not explain the data to within noise: it counts errors of the model that readings share.")
+    words = [
+        *misdescribed(best.fit),
+        f"Of {len(search.found)} models, {best.name} has the best cross-validated predictive score. {_others(search)}",
+    ]
+    term = best.fit.problem.build(best.fit.vector).correlation
+    if term is not None:
+        words.append(
+            f"Even the best model needs a correlated discrepancy term of {100.0 * float(term.amplitude):.2g} %; "
+            f"chi2/dof without it is {without_discrepancy(best.fit):.3g}."
+        )
     unsure = [one.name for one in search.found if one.foresight and not one.foresight.evidence.reliable]
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
-    return words
+    if search.stopped:
+        words.append("The time budget ended the search before all models were tried. The same command goes on with it.")
+    return [*words, *noise_notes(best.fit.problem)]
+
+
+def _others(search: "Search") -> str:
+    """Which others the score does not tell from the best; and that nothing else in the table does."""
+    gaps = {one.name: one.foresight for one in search.found if one.foresight is not None}
+    if not search.alike:
+        alone = "no other was looked at closely" if len(gaps) == 1 else "every other score is clearly lower"
+        return f"This identifies it among them: {alone}."
+    near = listed([f"{name} ({gaps[name].behind:.2g} ± {gaps[name].behind_error:.2g})" for name in search.alike])
+    return (
+        f"It is statistically indistinguishable from {near}: these score differences are within two standard errors. "
+        "BIC, weight and probability do not overrule this: BIC takes residuals to be independent, the weight has no "
+        "error, and the probability holds if one of these models is right."
+    )
 
 
 def search_picture(search: "Search") -> Figure:

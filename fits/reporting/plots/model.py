@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, incidences, signed_angle
-from fits.reporting.diagnostics import over_all_rows, residual_label, standardised
+from fits.inference.predicting import with_discrepancy
+from fits.reporting.diagnostics import bsdf, misfit, misfit_label, over_all_rows
 from fits.reporting.plots.data import (
     ANGLE_LABEL,
     CYCLE,
@@ -41,18 +42,24 @@ FEWEST_IN_PLANE = 3  # readings that make a panel
 
 @dataclass(frozen=True)
 class _Curve:
-    """The model along one incidence: viewing angles (M,), values (M, C), and the band's two edges (2, M, C) or None."""
+    """The model along one incidence: viewing angles (M,), values (M, C), and the band's two edges (2, M, C) or None.
+
+    alone: (M, C), of the stack without the model discrepancy, whose the band is; None where there is no discrepancy.
+    """
 
     angle: Floats
     values: Floats
+    alone: Floats | None
     band: Floats | None
 
 
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
     """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
 
+    With a model discrepancy there are two curves, with it and of the stack alone; residuals are of the first.
+
     fits: one or more fits of the same data by name; the points and their errors are those of the first one.
-    posterior: adds the band that holds 95 % of its draws of the model (not of new readings) around the first.
+    posterior: adds the band that holds 95 % of its draws of the stack alone (not of new readings) around the first.
     Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
     None where no incidence has at least three readings in the plane of incidence.
     """
@@ -84,13 +91,16 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
             upper.set_title(incidence.label)
             upper.tick_params(labelbottom=False)
-            lower.set_ylabel(
-                (r"residual / $\sigma$" if first.is_posterior else "residual / scatter") if column == 0 else ""
-            )
+            lower.set_ylabel(_residual_label(first) if column == 0 else "")
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
+
+
+def _residual_label(fit: "Fit") -> str:
+    words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
+    return f"{words}\nwith discrepancy" if fit.problem.noise.correlated else words
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
@@ -100,8 +110,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
     if not shown:
         return None
     values = np.where(data.mask, data.values[:, channel], np.nan)
-    predicted = over_all_rows(fit, fit.predicted)[:, channel]
-    residuals = standardised(fit)[:, channel]
+    predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
     norm = value_norm(values[data.mask])
     reach = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
     with mpl.rc_context(STYLE):
@@ -112,11 +121,12 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
             image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
             hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
             signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-reach, reach), "PuOr")
-            for axes, what in zip(row, ("data", "model", "residual"), strict=True):
+            model = "with discrepancy" if fit.problem.noise.correlated else "model"
+            for axes, what in zip(row, ("data", model, "residual"), strict=True):
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
         figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=residual_label(fit), extend="both", **bar)
+        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=misfit_label(fit), extend="both", **bar)
     return figure
 
 
@@ -137,10 +147,15 @@ def _lines(axes: Axes, curve: _Curve, channels: tuple[str, ...], name: str | Non
     for channel, channel_name in enumerate(channels):
         own = len(channels) > 1 and name is None
         colour = channel_colour(channel_name, channel) if own else CYCLE[place % len(CYCLE)]
-        label = (name or "model") if channel == 0 else None
+        what = name or "model" if curve.alone is None else f"{name or 'model'} with discrepancy"
+        label = what if channel == 0 else None
         axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=label, zorder=3)
+        which = ""
+        if curve.alone is not None:
+            label, which = ("stack alone" if channel == 0 and place == 0 else None), ", stack alone"
+            axes.plot(curve.angle, curve.alone[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
         if curve.band is not None:
-            label = "95 % of the posterior" if channel == 0 else None
+            label = f"95 % of the posterior{which}" if channel == 0 else None
             low, high = curve.band[:, :, channel]
             axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=label, zorder=2.5)
 
@@ -149,7 +164,7 @@ def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
     axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
     axes.axhline(0.0, color=INK, linewidth=0.6)
     for place, fit in enumerate(fits.values()):
-        data, residuals = fit.problem.data, standardised(fit)
+        data, residuals = fit.problem.data, misfit(fit)
         for channel, name in enumerate(data.channels):
             own = len(data.channels) > 1 and len(fits) == 1
             colour = channel_colour(name, channel) if own else CYCLE[place % len(CYCLE)]
@@ -180,11 +195,15 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
-    values = np.asarray(fit.problem.predict_at(vectors, np.concatenate(wi), np.concatenate(wo)))
+    towards = np.concatenate(wi), np.concatenate(wo)
+    values = np.asarray(fit.problem.predict_at(vectors, *towards))
     values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
     band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
+    best = with_discrepancy(fit, *towards, values[0])
     ends = np.cumsum([len(angle) for angle in angles])
-    return [
-        _Curve(angle, values[0, end - len(angle) : end], None if band is None else band[:, end - len(angle) : end])
-        for angle, end in zip(angles, ends, strict=True)
-    ]
+    curves = []
+    for angle, end in zip(angles, ends, strict=True):
+        own = slice(end - len(angle), end)
+        alone = values[0, own] if fit.problem.noise.correlated else None
+        curves.append(_Curve(angle, best[own], alone, None if band is None else band[:, own]))
+    return curves

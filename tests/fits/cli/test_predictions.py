@@ -42,9 +42,12 @@ def test_predictions_are_written(work: Path, capsys: pytest.CaptureFixture[str],
     assert {row["theta_i"] for row in rows} == {"20", "30", "70"}
     assert len(rows) == 3 * 35
     for row in rows:
-        bands = {name: float(row[name]) for name in row if name.startswith(("model", "reading"))}
-        assert bands["reading_q2.5"] < bands["model_q50"] < bands["reading_q97.5"]
-        assert 0.0 < bands["model_sd"] < bands["reading_sd"]
+        bands = {name: float(row[name]) for name in row if name.startswith(("bsdf", "model", "reading"))}
+        assert bands["reading_q2.5"] < bands["bsdf_q50"] < bands["reading_q97.5"]
+        assert 0.0 < bands["bsdf_sd"] < bands["reading_sd"]
+        assert bands["bsdf_mean"] == bands["model_mean"]  # no discrepancy is modelled
+    names = [name.partition("_")[0] for name in rows[0]][5:]
+    assert sorted(set(names), key=names.index) == ["bsdf", "reading", "model"]
     capsys.readouterr()
     assert "--force" in refused(words, capsys, work)
     assert main([*words, "--force"]) == 0
@@ -67,6 +70,7 @@ def test_predictions_are_written(work: Path, capsys: pytest.CaptureFixture[str],
         ([*ALONG, "--only", "plane=0"], "--only is given without --at"),
         ([*ALONG, "--all"], "--all is given without --at"),
         (["predict", "result", "--at", "data.csv", "--azimuth", "90"], "--azimuth is given without --incidence"),
+        (["predict", "result", "--incidence", "95", "--out", "new.csv"], "a light at 95 degrees sees nothing"),
         (["predict", "nowhere", "--incidence", "30", "--out", "new.csv"], "nowhere"),
         (["predict", "result", "--at", "nowhere.csv"], "nowhere.csv"),
         (["predict", "result", "--at", "data.csv", "--only", "incidence=40"], "incidence 40 is not in the data"),

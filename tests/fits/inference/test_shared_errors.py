@@ -21,6 +21,7 @@ from fits.problem.parameters import Free
 from fits.problem.posed import Posed
 from fits.problem.problem import Problem
 from fits.reporting import tables, verdicts
+from fits.reporting.agreement import discrepancy
 from fits.reporting.results import load_fit, save_fit
 from tests.helpers.models import line
 
@@ -95,12 +96,25 @@ def test_where_they_cannot_be_counted_they_are_not(noise: Noise) -> None:
 
 
 def test_both_are_told(wrong: Fit) -> None:
-    words = " ".join(verdicts.shared_errors(wrong))
-    assert "residuals of neighbours in angle are correlated by +0." in words
-    assert "correlated = false leaves them out" in words
+    words = " ".join(discrepancy(wrong))
+    assert "neighbouring residuals correlate by +0." in words
+    assert "Set `correlated = false` to disable it" in words
+    assert f"deviation of {100.0 * wrong.values['noise.correlated.amplitude']:.2g} % of the BRDF" in words
     table = tables.alone_table(wrong)
     assert [row[0] for row in table.rows] == ["['a']", "['b']"]
     assert len(table.rows[0]) == len(table.columns)
+
+
+def test_starts_are_those_that_were_asked_for(wrong: Fit) -> None:
+    """Two with independent noise, then one from each of their minima and two more with the discrepancy."""
+    again = sum(wrong.ended.values())
+    assert again > 2
+    words = verdicts.starts_in_words(wrong)
+    assert words.startswith("2 with independent noise (seed 0, solver least_squares), then ")
+    assert f"then {again} with the discrepancy term: " in words
+    plain = replace(wrong, alone=None, ended={**wrong.ended, "this minimum": 2, "other minima": 0})
+    assert verdicts.starts_in_words(plain).startswith("2 (seed 0, solver least_squares): ")
+    assert f"{wrong.minima[0].count} of {again} starts with the discrepancy term" in verdicts.minima(wrong)[0]
 
 
 def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: pytest.MonkeyPatch) -> None:

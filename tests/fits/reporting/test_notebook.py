@@ -53,7 +53,7 @@ def test_what_is_open_is_told(result: Fit) -> None:
     combination = fits.Combination(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
     loose = replace(result, unresolved=(combination,))._repr_html_()
     assert f"The data do not separate {A} and {B}" in text(loose)
-    assert any(row[2:4] == ["OPEN", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
+    assert any(row[2:4] == ["unconstrained", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
 
 
 def test_a_joint_fit_is_shown_by_measurement_and_names_are_no_html() -> None:

@@ -19,6 +19,7 @@ from fits.inference.optimise import fit
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting import tables, verdicts
+from fits.reporting.agreement import explains
 from fits.reporting.diagnostics import residual_structure, standardised
 from fits.reporting.html import report
 from fits.reporting.plots import data as pictures
@@ -141,12 +142,12 @@ class Altered:
 
 def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
     data, residuals = coat_fit.problem.data, standardised(coat_fit)
-    good = " ".join(verdicts.explains(coat_fit, residual_structure(data, residuals)))
+    good = " ".join(explains(coat_fit, residual_structure(data, residuals)))
     assert "what the stated noise predicts" in good
     assert "too small" not in good
     bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
-    words = " ".join(verdicts.explains(bad, residual_structure(data, 3 * residuals)))
-    assert "multiplies them by 3" in words
+    words = " ".join(explains(bad, residual_structure(data, 3 * residuals)))
+    assert "too small by a factor of about 3 (3 for the size of the residuals)" in words
     sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
     assert fine
     values = data.used().values
@@ -162,10 +163,10 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     together = Combination(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
     undecided = Altered(coat_fit, unresolved=(together,), at_bound=(second,))
     words = " ".join(verdicts.determines(undecided))
-    assert "The data alone know 1 of 2 combinations of parameters to no better than" in words
+    assert "1 of 2 principal directions of parameter space are constrained by the data to no better than 10 %" in words
     assert f"At a bound: {second}" in words
     (row,) = tables.unresolved_table(undecided).rows
-    assert row == ("1", "0.3", "LOOSE", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
+    assert row == ("1", "0.3", "weak", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
     structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
     (line,) = (line for line in verdicts.outcome(undecided, structure) if line.startswith("The data"))
     assert line == f"The data do not separate {first} and {second}."
@@ -175,14 +176,34 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     short, fine = verdicts.in_short(undecided, structure)
     assert f"The data do not separate {first} and {second}." in short
     assert not fine
-    assert verdicts.identifiability(undecided)[first] == "LOOSE: combination 1"
+    assert verdicts.identifiability(undecided)[first] == "weakly constrained: see direction 1"
     assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
     apart = Altered(coat_fit, correlation=np.eye(2))
     assert verdicts.identifiability(apart)[first] == "yes"
     unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
     assert f"The data do not determine {first}." in verdicts.outcome(unseen, structure)
-    assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "OPEN")
-    assert verdicts.identifiability(unseen)[first] == "OPEN: hardly seen"
+    assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "unconstrained")
+    assert verdicts.identifiability(unseen)[first] == "unconstrained by the data: see direction 1"
+
+
+def test_a_small_share_in_a_loose_direction_does_not_make_a_parameter_loose(coat_fit: Fit) -> None:
+    """alpha 0.284 +- 0.017 was called loose for a weight of 0.028: it is known to 2 % of its range."""
+    first, second = coat_fit.problem.names
+    mostly = Combination(0.6, {first: 0.9996, second: 0.028}, {first: 0.01, second: 0.02})
+    apart = Altered(coat_fit, unresolved=(mostly,), correlation=np.eye(2))
+    assert verdicts.identifiability(apart) == {first: "weakly constrained: see direction 1", second: "yes"}
+    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
+    assert f"The data do not determine {first}." in verdicts.in_short(apart, structure)[0]
+    # of two directions, the one that a parameter owes more of its variance
+    other = Combination(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
+    both = Altered(coat_fit, unresolved=(mostly, other), correlation=np.eye(2))
+    words = verdicts.identifiability(both)
+    assert words == {first: "weakly constrained: see direction 1", second: "weakly constrained: see direction 2"}
+    # a box and a half across, of which a parameter has a third
+    wide = Combination(1.5, {first: 0.94, second: 0.34}, {first: 0.01, second: 0.02})
+    words = verdicts.identifiability(Altered(coat_fit, unresolved=(wide,), correlation=np.eye(2)))
+    assert words[first].startswith("unconstrained by the data")
+    assert words[second].startswith("weakly constrained")
 
 
 def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:

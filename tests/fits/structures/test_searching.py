@@ -1,5 +1,6 @@
 """The search for the stack behind data, by transports that are known and cheap."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 import fits
 import layerjax as lj
 from fits._files import locked
+from fits.inference import left_out
+from fits.inference.fit_result import Fit
+from fits.problem.compiled import cores
 from fits.problem.likelihood import Noise
 from fits.problem.parameters import Free
 from fits.reporting.plots.data import as_png
@@ -87,6 +91,60 @@ def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path,
     assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
 
 
+def test_a_closer_look_goes_on_at_the_incidence_where_it_was(
+    data: fits.Measurements, directory: Path, found: fits.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three incidences are left out: killed at the third, the next run fits without that one alone."""
+    look, groups = directory / "interface+diffuse.json", directory / ".interface+diffuse.json"
+    whole = look.read_text()
+    look.unlink()
+    left: list[str] = []
+    refit = left_out.refit
+
+    def counted(*arguments: object) -> Fit:
+        if len(left) == 2:
+            raise KeyboardInterrupt
+        left.append("one")
+        return refit(*arguments)
+
+    settings = {"layers": 1, "transport": lj.Statistical(), "noise": NOISE, "starts": 2, "directory": directory}
+    monkeypatch.setattr(left_out, "refit", counted)
+    with pytest.raises(KeyboardInterrupt):
+        search(data, LIBRARY, **settings)
+    assert groups.is_file()
+    del left[:-1]  # one more is let through
+    again = search(data, LIBRARY, **settings)
+    assert len(left) == 2
+    assert not groups.exists()
+    assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
+    assert look.read_text() == whole
+
+
+def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Measurements, tmp_path: Path) -> None:
+    many = Library(LIBRARY.layers, {f"diffuse {k}": LIBRARY.bases["diffuse"] for k in range(2 * cores())})
+    settings = {"layers": 0, "transport": lj.Statistical(), "noise": NOISE, "starts": 1, "directory": tmp_path / "it"}
+    short = search(data, many, budget=0.0, **settings)
+    assert short.stopped
+    assert 0 < len(short.found) < len(many.bases)
+    assert short.best.foresight is not None
+    assert "The time budget ended the search" in " ".join(telling.search_sentences(short))
+    longer = search(data, many, budget=60.0, **settings)
+    assert not longer.stopped
+    assert len(longer.found) == len(many.bases)
+    with pytest.raises(ValueError, match=r"budget is -1.0; it must be a number of minutes of at least 0"):
+        search(data, many, budget=-1.0, **settings)
+
+
+def test_there_is_one_verdict(found: fits.Search) -> None:
+    """BIC, weight and probability had said one thing, and the score another."""
+    near = replace(found, alike=("metal",))
+    words = telling.search_sentences(near)
+    (verdict,) = (line for line in words if "has the best" in line)
+    assert "It is statistically indistinguishable from metal (" in verdict
+    assert "BIC, weight and probability do not overrule this" in verdict
+    assert not any("identifies" in line for line in words)
+
+
 def test_every_structure_is_seen_by_the_instrument(data: fits.Measurements, tmp_path: Path) -> None:
     seen = fits.Instrument(detector=2.0, gain_per_incidence=0.02)
     given = {"layers": 0, "transport": lj.Statistical(), "noise": NOISE, "starts": 1, "directory": tmp_path / "seen"}
@@ -133,8 +191,9 @@ def test_it_is_told_in_words_and_pictures(found: fits.Search) -> None:
     assert table.rows[0][0] == "interface / diffuse"
     assert all(len(row) == len(table.columns) for row in table.rows)
     words = " ".join(telling.search_sentences(found))
-    assert "interface / diffuse foretells incidences that are left out best, of 4 structures" in words
-    assert "The data tell it from all others" in words
+    assert "Of 4 models, interface / diffuse has the best cross-validated predictive score." in words
+    assert "This identifies it among them" in words
+    assert "indistinguishable" not in words
     assert as_png(telling.search_picture(found)).startswith(b"\x89PNG")
     page = telling.search_page(found)
     assert "interface / metal" in page
