@@ -9,7 +9,7 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
-from fits.inference.limits import instrument_limits
+from fits.inference.limits import instrument_limits, limited_with
 from fits.inference.resolution import ENOUGH
 from fits.reporting.diagnostics import ResidualStructure
 
@@ -26,7 +26,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
     """For each parameter, in a few words, whether the data determines it; combinations count from 1, worst first."""
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
-    limits = instrument_limits(fit)
+    limits, limited = instrument_limits(fit), limited_with(fit)
     worst = {name: place for place in range(len(fit.unresolved), 0, -1) for name in fit.unresolved[place - 1].weights}
     words = {}
     for index, name in enumerate(names):
@@ -39,6 +39,8 @@ def identifiability(fit: "Fit") -> dict[str, str]:
             words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
+        elif name in limited:
+            words[name] = f"LIMITED by the instrument: moves with {limited[name][0]}"
         elif name in worst:
             combination = fit.unresolved[worst[name] - 1]
             kind = "OPEN" if combination.open else "LOOSE"
@@ -106,6 +108,11 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     for name, least in instrument_limits(fit).items():
         sentences.append(f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved.")
+    for name, (roughness, errors) in limited_with(fit).items():
+        sentences.append(
+            f"{name} is limited by the instrument with {roughness}: up to that width it moves by {errors:.2g} of its "
+            "standard errors."
+        )
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
     if fit.without_influence:
