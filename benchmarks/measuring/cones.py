@@ -29,11 +29,11 @@ def mean_over_cones(
     detector: float,
     transport: lj.Transport = SINGLE,
 ) -> np.ndarray:
-    """Readings (N, C), each by some thousand pairs of directions; less than a hundred where one of the two is none."""
-    found = []
+    """Readings (N, C), each by hundreds of pairs of directions and more."""
+    found, count = [], 6 if source and detector else 12
     for i, o in zip(wi, wo, strict=True):
         (lights, a), (views, b) = (
-            disc(w, width, 6) if width else (w[None], np.ones(1)) for w, width in ((i, source), (o, detector))
+            disc(w, width, count) if width else (w[None], np.ones(1)) for w, width in ((i, source), (o, detector))
         )
         values = np.asarray(lj.evaluate(stack, lights[:, None], views[None], transport))
         cosines = np.abs(lights[:, None, 2] * views[None, :, 2]) / abs(i[2] * o[2])

@@ -73,8 +73,9 @@ class Fit:
         ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
-            from a coarser one, which is more than it. None for a transport without a resolution.
-        resolution: of the transport, in words; None where it has none. `problem` holds it.
+            from a coarser one, which is more than it; that of the rays for an instrument's cones is added. None where
+            there is neither a resolution nor a cone.
+        resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
         alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
             that rule (see `Noise`); else None.
         alone_parts: of a `Joint`, the same by the names of measurements.

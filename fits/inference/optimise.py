@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
+from fits.inference import apertures
 from fits.inference.descent import PROMISE, ROUGHLY
 from fits.inference.fit_result import ENDED, Alone, Fit, Minimum
 from fits.inference.identifiability import OPEN_BEYOND
@@ -182,13 +183,15 @@ def _found(
 ) -> Fit:
     """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
     known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
+    open_rays = {name for name, one in problem.problems.items() if apertures.leaves_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
+    problem = problem.with_problems({name: apertures.for_starts(problem.problems[name]) for name in open_rays})
     racing = not refine and solver == "least_squares"
     ends = race(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
     best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
-    if known and refine:
-        best, accuracy = refined(best, known, solver, progress)
+    if refine and (known or any(map(apertures.has_rays, problem.problems.values()))):
+        best, accuracy = refined(best, known, open_rays, solver, progress)
     return _fit_of(best, accuracy, settings, without)
 
 

@@ -4,17 +4,19 @@ Programs of a finer resolution take seconds to compile: which one is needed is f
 minima that may be the best or as good as it are fitted again.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 import layerjax as lj
+from fits.inference import apertures
 from fits.inference.optimum import EQUALLY_WELL, Optimum, optimum
 from fits.inference.resolution import ENOUGH, Resolutions, Values
 from fits.inference.starts import End, Solver, bounded_end, rough_end, unit_of
 from fits.problem.posed import Posed
+from fits.problem.problem import Problem
 from fits.progress import Progress
 
 ALIKE = 0.01
@@ -36,28 +38,38 @@ class Accuracy(NamedTuple):
 
 
 def refined(
-    at: Optimum, known: Mapping[str, Resolutions], solver: Solver, progress: Progress
+    at: Optimum, known: Mapping[str, Resolutions], open_rays: Set[str], solver: Solver, progress: Progress
 ) -> tuple[Optimum, Accuracy]:
     """The optimum at the resolution that the noise of each measurement asks for; at the given one where one is given.
 
-    known: of those measurements whose transport has one, by name.
+    known: of those measurements whose transport has one, by name. open_rays: names of those whose instrument leaves
+    open how many rays stand for its cones.
     """
     own = {name: at.problem.problems[name].transport if one.open else one.chosen for name, one in known.items()}
     while True:
         shares, needed, found = at.problem.shares(at.predicted), dict(own), {}
-        for name, one in known.items():
-            vector = at.lowest.vector[list(at.problem.places(name))]
-            values = Values(at.problem.problems[name], own[name], vector, shares[name])
-            needed[name], error, finest = _needed(one, own[name], values, progress)
-            found[name] = _accuracy(one, own[name], error, finest)
-        if needed == own:
+        changed: dict[str, Problem] = {}
+        for name, problem in at.problem.problems.items():
+            vector, parts = at.lowest.vector[list(at.problem.places(name))], []
+            if name in known:
+                one = known[name]
+                values = Values(problem, own[name], vector, shares[name])
+                needed[name], error, finest = _needed(one, own[name], values, progress)
+                parts.append(_accuracy(one.in_words(own[name]), error, finest, one.open))
+                if needed[name] != own[name] and one.open:
+                    changed[name] = replace(problem, transport=needed[name])
+            if apertures.has_rays(problem):
+                rays = apertures.needed(problem, vector, shares[name], name in open_rays, progress)
+                parts.append(_accuracy(apertures.in_words(rays.rings), rays.error, False, name in open_rays))
+                if rays.rings != apertures.rings_of(problem):
+                    changed[name] = apertures.with_rings(changed.get(name, problem), rays.rings)
+            if parts:
+                found[name] = _of_both(parts)
+        if not changed:
             return at, _together(found)
         own = needed
-        changed = {
-            name: replace(at.problem.problems[name], transport=own[name]) for name, one in known.items() if one.open
-        }
         problem = at.problem.with_problems(changed)
-        words = _listed({name: one.in_words(own[name]) for name, one in known.items()})
+        words = _listed({name: resolution_in_words(problem.problems[name], known.get(name)) for name in found})
         ends = _fitted_again(at, problem, solver, words, progress)
         again = optimum(problem, ends, solver, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
@@ -72,6 +84,18 @@ def _together(found: Mapping[str, Accuracy]) -> Accuracy:
 
 def _listed(words: Mapping[str, str]) -> str:
     return "; ".join(f"{name}: {one}" if name else one for name, one in words.items())
+
+
+def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
+    """The resolution of a problem whose transport may have one."""
+    parts = []
+    if known is not None:
+        own = problem.transport if known.open else known.chosen
+        assert isinstance(own, lj.AddingDoubling)
+        parts.append(known.in_words(own))
+    if apertures.has_rays(problem):
+        parts.append(apertures.in_words(apertures.rings_of(problem)))
+    return ", ".join(parts)
 
 
 def _needed(
@@ -98,14 +122,20 @@ def _needed(
     return own, found, False
 
 
-def _accuracy(known: Resolutions, own: lj.AddingDoubling, error: float, finest: bool) -> Accuracy:
-    resolution = known.in_words(own)
+def _accuracy(resolution: str, error: float, finest: bool, is_open: bool) -> Accuracy:
     if not np.isfinite(error):
         words = f"not known at {resolution}"
     elif finest:
-        words = f"up to {error:.2g} sigma at {resolution}{', the finest tried' if known.open else ''}"
+        words = f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
     else:
-        words = f"{error:.2g} sigma at most at {resolution}{'' if known.open else ', as given'}"
+        words = f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
+    return Accuracy(resolution, error, words)
+
+
+def _of_both(parts: Sequence[Accuracy]) -> Accuracy:
+    """What is said of one measurement whose transport has a resolution and whose instrument has rays: errors add up."""
+    resolution, words = (", ".join(getattr(one, of) for one in parts) for of in ("resolution", "words"))
+    error = float(np.sum([one.error for one in parts]))
     return Accuracy(resolution, error, f"numerical error of the model: {words}")
 
 

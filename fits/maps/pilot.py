@@ -8,7 +8,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from fits.inference import apertures
 from fits.inference.optimise import fit_problem
+from fits.inference.refinement import resolution_in_words
 from fits.inference.resolution import ENOUGH, Resolutions, resolutions
 from fits.inference.starts import start_points
 from fits.maps.searching import Ends, Starts, all_predicted, reduced_chi_square, search, starts_at
@@ -51,10 +53,10 @@ class Pilot:
 def resolved(problem: Problem, starts: int, seed: int, progress: Progress | None) -> tuple[Problem, Resolutions | None]:
     """The problem at the resolution that a fit of its own readings ends with, and the resolutions that there are."""
     known = resolutions(problem)
-    if known is None or not known.open:
+    if not (apertures.leaves_open(problem) or (known is not None and known.open)):
         return problem, known
-    found = fit_problem(problem, starts=starts, seed=seed, progress=progress)
-    return replace(problem, transport=found.problem.transport), known
+    found = fit_problem(problem, starts=starts, seed=seed, progress=progress).problem
+    return replace(problem, transport=found.transport, instrument=found.instrument), known
 
 
 def fly(
@@ -78,14 +80,20 @@ def fly(
     while True:
         ready = prepare(problem)
         pilot = _fitted(ready, sample, starts, seed, size)
-        if known is None or sample.wi is not None:
+        if (known is None and not apertures.has_rays(problem)) or sample.wi is not None:
             return pilot
-        error, finer = _numerical_error(problem, ready, known, pilot.ends, sample)
-        words = known.in_words(problem.transport)  # type: ignore[arg-type]
-        pilot = replace(pilot, numerical_error=error, resolution=words)
-        if not (known.open and finer is not None and error > ENOUGH):
+        finer = None if known is None else known.finer(problem.transport)  # type: ignore[arg-type]
+        fine = None if finer is None else replace(problem, transport=finer)
+        error = 0.0 if fine is None else _numerical_error(ready, fine, pilot.ends, sample)
+        rays = (
+            _numerical_error(ready, problem.with_other_rays(), pilot.ends, sample)
+            if apertures.has_rays(problem)
+            else 0.0
+        )
+        pilot = replace(pilot, numerical_error=error + rays, resolution=resolution_in_words(problem, known))
+        if not (known is not None and known.open and fine is not None and error > ENOUGH):
             return pilot
-        problem = finer
+        problem = fine
 
 
 def _fitted(problem: Problem, sample: Texels, starts: int, seed: int, size: int) -> Pilot:
@@ -125,21 +133,17 @@ def distinct(found: Found) -> Floats:
     return np.unique(vectors, axis=0)
 
 
-def _numerical_error(
-    problem: Problem, ready: Problem, known: Resolutions, ends: Ends, sample: Texels
-) -> tuple[float, Problem | None]:
-    """Of the sample, in standard deviations, at most, and the problem at the next finer resolution if that differs."""
-    finer = known.finer(problem.transport)  # type: ignore[arg-type]
+def _numerical_error(ready: Problem, fine: Problem, ends: Ends, sample: Texels) -> float:
+    """Of the sample, in standard deviations, at most, as a finer problem tells."""
     good = np.isfinite(ends.found.cost)
     vectors = ends.found.vector[good]
-    if finer is None or not len(vectors):
-        return 0.0, None
-    fine = replace(problem, transport=finer)
+    if not len(vectors):
+        return 0.0
     exact = all_predicted(fine, vectors)
     sigma = np.asarray(ready.call(_sigmas, vectors, exact), float)
     of_readings = np.where(sample.used[good], np.sqrt(sample.variance[good]), 0.0)
     error = np.abs(ends.found.predicted[good] - exact) / np.hypot(sigma, of_readings)
-    return float(np.max(np.where(sample.used[good], error, 0.0))), fine
+    return float(np.max(np.where(sample.used[good], error, 0.0)))
 
 
 def _sigmas(model: Model, vectors: Array, predicted: Array) -> Array:

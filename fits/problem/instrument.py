@@ -1,9 +1,7 @@
 """What stands between a BSDF and its readings: apertures, a sample that leans, gains, a floor.
 
-A reading is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. For small
-cones that takes four pairs of directions: on rings that have the second moments of the discs, the detector's a quarter
-of a turn behind the source's. Second derivatives by either direction, and by both in functions of the half vector or
-in the plane of incidence of what is its own mirror image, are exact then.
+A reading is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. How many pairs
+of directions that takes follows from how wide the cones are beside the lobes of the stack: see `rays`.
 """
 
 import math
@@ -18,8 +16,9 @@ from numpy.typing import NDArray
 
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
 from fits.data.scans import SAME_ANGLE
-from fits.problem.narrowness import needs_cone
+from fits.problem.narrowness import Spread, spread_over_lobes
 from fits.problem.parameters import Free, LogNormal
+from fits.problem.rays import MOST_RINGS, ray_counts, rays
 from fits.problem.values import shown
 from layerjax.transport.known_directions import KnownDirections, known_directions
 
@@ -31,21 +30,22 @@ WIDEST, LEANS_MOST, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
 GAINS_END = 6.0
 """Standard deviations of their logarithm at which gains are bounded."""
 
-POINTS = 4
-"""Pairs of directions that stand for cones."""
-
 
 @dataclass(frozen=True)
 class Instrument:
     """An instrument by which readings were taken. Angles in degrees.
 
     source, detector: full angles of the cones, in [0, 30]; a reading is the mean over them, which costs four times as
-    much where a lobe may be narrow, and nothing elsewhere.
+    much where a lobe may be narrow, more where one is narrower than the cones, and nothing elsewhere.
     offset: how far the sample's normal leans towards the mirror side of the plane of incidence, in [-10, 10]; a number,
     `Free`, or None for 0.
     gain_per_incidence: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
+    rings: of rays that stand for a cone where a lobe is narrowest, in [1, 8]; n of them keep the error below a
+    thousandth of the peak where the cones together are as wide as 0.64 n - 0.25 lobes at half maximum (two cones: a
+    sixth less). None: as many as the narrowest lobe asks for that the bounds of the stack allow; for a fit, as many as
+    the lobe asks for that it finds.
     """
 
     source: float = 0.0
@@ -53,6 +53,7 @@ class Instrument:
     offset: float | Free | None = None
     gain_per_incidence: float | None = None
     floor: float | Free | None = None
+    rings: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("source", "detector"):
@@ -66,6 +67,8 @@ class Instrument:
             _require("offset", self.offset, -LEANS_MOST, LEANS_MOST)
         if self.gain_per_incidence is not None:
             _require("gain_per_incidence", self.gain_per_incidence, *GAIN_SPREADS)
+        if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
+            raise ValueError(f"Instrument.rings is {shown(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
 
     @property
     def has_cones(self) -> bool:
@@ -121,10 +124,19 @@ def setting_of(instrument: Instrument, incidences: Floats) -> Setting:
     return Setting(instrument.offset if isinstance(instrument.offset, Free) else None, gains)
 
 
-def optics_of(instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incidences: Floats, follow: bool) -> Optics:
+def optics_of(
+    instrument: Instrument,
+    stack: Any,
+    wi: Floats,
+    wo: Floats,
+    incidences: Floats,
+    follow: bool,
+    other: bool = False,
+) -> Optics:
     """What stands for readings along these directions, (N, 3) each, of a stack, `Free` or not.
 
-    incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use.
+    incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
+    other numbers of rays, see `ray_counts`.
     """
     gain = None if instrument.gain_per_incidence is None else _which(wi, incidences)
     free, lean = isinstance(instrument.offset, Free), 0.0
@@ -136,8 +148,11 @@ def optics_of(instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incide
         forward = None
     row = share = None
     pairs, widths = (wi, wo), (instrument.source, instrument.detector)
-    if instrument.has_cones and (narrow := needs_cone(*widths, stack, wi, wo, lean)).any():
-        pairs, row, share = _cones(instrument, wi, wo, narrow)
+    if (
+        instrument.has_cones
+        and (spread := spread_over_lobes(*widths, stack, wi, wo, lean, instrument.rings)).matters.any()
+    ):
+        pairs, row, share = _cones(instrument, wi, wo, spread, other)
         forward = None if forward is None else forward[row]  # a sample leans one way, whichever ray of a cone it meets
     return Optics(
         wi=jnp.asarray(pairs[0]),
@@ -148,6 +163,15 @@ def optics_of(instrument: Instrument, stack: Any, wi: Floats, wo: Floats, incide
         incidence=None if gain is None else jnp.asarray(gain),
         known=known_directions(*pairs) if follow and not free else None,
     )
+
+
+def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
+    """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
+    lean = 0.0 if setting.offset is None else abs(float(setting.offset))
+    spread = spread_over_lobes(instrument.source, instrument.detector, stack, wi, wo, lean)
+    if not spread.matters.any():
+        return 1
+    return int(np.max(ray_counts(spread.source[spread.matters], spread.detector[spread.matters])[:, :2]))
 
 
 def gain_unknown(instrument: Instrument | None, wi: Floats, incidences: Floats) -> Floats:
@@ -164,25 +188,41 @@ def _which(wi: Floats, incidences: Floats) -> NDArray[np.int64]:
 
 
 def _cones(
-    instrument: Instrument, wi: Floats, wo: Floats, narrow: NDArray[np.bool_]
+    instrument: Instrument, wi: Floats, wo: Floats, spread: Spread, other: bool
 ) -> tuple[tuple[Floats, Floats], NDArray[np.int64], Floats]:
     """Pairs (K, 3) each, the rows they belong to, (K,), and their shares, (K,)."""
-    parts = []
-    turns = 0.5 * np.pi * np.arange(POINTS)
-    for w, width, late in ((wi, instrument.source, 0.0), (wo, instrument.detector, 0.5 * np.pi)):
-        ring = math.radians(0.5 * width) / math.sqrt(2.0)
-        first, second = _across(w[narrow])
-        side = np.cos(turns + late)[:, None, None] * first + np.sin(turns + late)[:, None, None] * second
-        parts.append(math.cos(ring) * w[narrow] + math.sin(ring) * side)
-    # light that would come or go below the horizon is not there
-    cosines = [np.maximum(w[..., 2] * np.sign(v[narrow][:, 2]), 0.0) for w, v in zip(parts, (wi, wo), strict=True)]
-    share = cosines[0] * cosines[1] / (POINTS * np.abs(wi[narrow][:, 2] * wo[narrow][:, 2]))
-    parts = [np.where(share[..., None] > 0.0, w, v[narrow]) for w, v in zip(parts, (wi, wo), strict=True)]
-    rows = np.flatnonzero(narrow)
-    wide = np.flatnonzero(~narrow)
-    pairs = tuple(np.concatenate([v[wide], w.reshape(-1, 3)]) for w, v in zip(parts, (wi, wo), strict=True))
-    row = np.concatenate([wide, np.tile(rows, POINTS)])
-    return (pairs[0], pairs[1]), row, np.concatenate([np.ones(len(wide)), share.ravel()])
+    wide = np.flatnonzero(~spread.matters)
+    narrow = np.flatnonzero(spread.matters)
+    lights, views, row, share = [wi[wide]], [wo[wide]], [wide], [np.ones(len(wide))]
+    counts = ray_counts(spread.source[narrow], spread.detector[narrow], other)
+    for kind in np.unique(counts, axis=0):
+        rows = narrow[np.all(counts == kind, axis=1)]
+        discs = rays(tuple(kind.tolist()))
+        parts, cosines = [], []
+        for w, width, disc in (
+            (wi[rows], instrument.source, discs.source),
+            (wo[rows], instrument.detector, discs.detector),
+        ):
+            rays_of_cone = _over_disc(w, math.radians(0.5 * width), disc)
+            # light that would come or go below the horizon is not there
+            cosines.append(np.maximum(rays_of_cone[..., 2] * np.sign(w[:, 2]), 0.0) / np.abs(w[:, 2]))
+            parts.append(rays_of_cone)
+        weights = discs.weights[:, None] * cosines[0] * cosines[1]
+        for found, part, w in ((lights, parts[0], wi[rows]), (views, parts[1], wo[rows])):
+            found.append(np.where(weights[..., None] > 0.0, part, w).reshape(-1, 3))
+        row.append(np.tile(rows, len(weights)))
+        share.append(weights.ravel())
+    return (np.concatenate(lights), np.concatenate(views)), np.concatenate(row), np.concatenate(share)
+
+
+def _over_disc(w: Floats, radius: float, disc: Floats) -> Floats:
+    """Directions (K, M, 3) of a cone about w (M, 3), as places (K, 2) on the unit disc: areas become solid angles."""
+    square = np.sum(disc**2, axis=-1)
+    cosine = 1.0 - (1.0 - math.cos(radius)) * square
+    sine = np.sqrt((1.0 - cosine) * (1.0 + cosine))
+    across = disc * (sine / np.where(square > 0.0, np.sqrt(square), 1.0))[:, None]
+    first, second = _across(w)
+    return cosine[:, None, None] * w + across[:, :1, None] * first + across[:, 1:, None] * second
 
 
 def _across(w: Floats) -> tuple[Floats, Floats]:

@@ -1,6 +1,6 @@
-"""Where a reading has to be the mean over a cone of directions, by what a stack may hold: see `needs_cone`."""
+"""Where a reading has to be the mean over a cone of directions, by what a stack may hold: see `spread_over_lobes`."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.data.geometry import TANGENT_COSINE
 from fits.problem.parameters import is_free
+from fits.problem.rays import both_wide, resolved_radius
 from layerjax.mixture import stacks_of
 
 SHIFT = 1e-3
@@ -20,13 +21,31 @@ STEEPEST = np.radians(85.0)
 LEAST = 1e-6
 """Of the squared sum of two directions."""
 
+SOONER = 0.6
+"""Share of the distance from the peak that counts for how steep a lobe is beside its own value."""
+
+PASSING = 2.0
+"""Degrees by which glass has to tilt to turn light that passes by one; half as many turn what it reflects."""
+
 Floats = NDArray[np.float64]
 
 
-def needs_cone(
-    source: float, detector: float, stack: Any, wi: Floats, wo: Floats, lean: float = 0.0
-) -> NDArray[np.bool_]:
-    """Readings (N,) whose mean over the cones may differ from their middle by more than `SHIFT`.
+class Spread(NamedTuple):
+    """How the cones of an instrument lie to the lobes of a stack, at N readings.
+
+    matters: (N,), whether the mean over the cones may differ from their middle by more than `SHIFT`. source, detector:
+    (N,), radii of the cones in widths of the lobe there.
+    """
+
+    matters: NDArray[np.bool_]
+    source: Floats
+    detector: Floats
+
+
+def spread_over_lobes(
+    source: float, detector: float, stack: Any, wi: Floats, wo: Floats, lean: float = 0.0, rings: int | None = None
+) -> Spread:
+    """See `Spread`.
 
     GGX facets of width alpha whose half vector lies at tangent t change by at most 2 r^2 / (t^2 + alpha^2) over a disc
     of radius r, half of that of the cones over the cosine of the difference angle; what faces elsewhere (particles,
@@ -38,19 +57,34 @@ def needs_cone(
         stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks all may be narrow.
         wi, wo: (N, 3).
         lean: degrees by which the sample may lean, besides.
+        rings: lobes count as no narrower than what so many resolve; None: as they are.
     """
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
-    if not isinstance(stack, lj.Stack | lj.Mixture):
-        return seen
     radii = np.radians(0.5 * source), np.radians(0.5 * detector)
+    most = np.inf if rings is None else resolved_radius(rings) / both_wide(source, detector)
+    if not isinstance(stack, lj.Stack | lj.Mixture):
+        # nothing is known of it: one ring, or what was asked for
+        return _spread(seen, np.full(len(wi), resolved_radius(rings or 1) / both_wide(source, detector)), radii)
     facets, others = _narrowest(stack)
     half = wi + wo
+    passing = wi[:, 2] * wo[:, 2] < 0.0
     square = (radii[0] ** 2 + radii[1] ** 2) / np.maximum(np.sum(half**2, axis=-1), LEAST)
     tilt = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2])) - np.radians(lean)
     nearest = np.maximum(np.tan(np.minimum(tilt, STEEPEST)) - np.sqrt(square), 0.0)
     lobe = 2.0 * square / (nearest**2 + facets**2) + 2.0 * square / others**2
     steep = [0.25 * (r / np.maximum(np.abs(w[:, 2]), r)) ** 2 for r, w in zip(radii, (wi, wo), strict=True) if r > 0.0]
-    return seen & ((np.maximum(lobe, sum(steep)) > SHIFT) | (wi[:, 2] * wo[:, 2] < 0.0))
+    matters = seen & ((np.maximum(lobe, sum(steep)) > SHIFT) | passing)
+    through = PASSING * np.hypot(*radii) / min(facets, others)
+    met = np.where(passing, through, np.sqrt(square) / others)
+    across = np.sqrt(square / ((SOONER * nearest) ** 2 + np.maximum(facets**2, square / most**2)))
+    return _spread(matters, np.maximum(np.where(passing, 0.0, across), np.minimum(met, most)), radii)
+
+
+def _spread(matters: NDArray[np.bool_], both: Floats, radii: tuple[float, float]) -> Spread:
+    """Of cones that are so wide together, (N,), in widths of the lobe, and have these radii."""
+    whole = max(float(np.hypot(*radii)), np.finfo(float).tiny)
+    both = np.maximum(both, LEAST)  # where cosines alone matter there are cones nonetheless
+    return Spread(matters, both * radii[0] / whole, both * radii[1] / whole)
 
 
 def _narrowest(material: lj.Stack | lj.Mixture) -> tuple[float, float]:

@@ -127,6 +127,15 @@ class Problem(Posed):
         arrays, static = eqx.partition(model, eqx.is_array)
         return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
 
+    def with_other_rays(self) -> "Problem":
+        """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
+        used, optics = self.data.used(), self.model.optics
+        assert self.instrument is not None
+        assert optics is not None
+        incidences, follow = polar_angles(self.data), optics.known is not None
+        other = optics_of(self.instrument, self.stack, used.wi, used.wo, incidences, follow, other=True)
+        return self.with_model(replace(self.model, optics=other))
+
     def with_model(self, model: Model) -> "Problem":
         """The problem with other arrays in its model."""
         other = replace(self)

@@ -22,7 +22,7 @@
                                                # correlated: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
-    [instrument]                               # optional: source, detector, offset, gain_per_incidence, floor
+    [instrument]                               # optional: source, detector, offset, gain_per_incidence, floor, rings
 
 Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
 ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.

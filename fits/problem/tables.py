@@ -244,7 +244,10 @@ def instrument_from_dict(table: Any) -> Instrument:
     given: dict[str, Any] = {
         key: _free(f"instrument.{key}", value) if isinstance(value, dict) else one_number(f"instrument.{key}", value)
         for key, value in table.items()
+        if key != "rings"
     }
+    if "rings" in table:
+        given["rings"] = whole_number("instrument.rings", table["rings"])
     try:
         return Instrument(**given)
     except ValueError as error:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import OPEN_BEYOND, UNRESOLVED_BEYOND, Combination
-from fits.inference.limits import instrument_limits
+from fits.inference.limits import instrument_limits, limited_with
 from fits.inference.resolution import ENOUGH
 from fits.reporting.agreement import (
     MISFIT_SIGMAS,
@@ -39,7 +39,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
     """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
-    limits = instrument_limits(fit)
+    limits, limited = instrument_limits(fit), limited_with(fit)
     words = {}
     for index, name in enumerate(names):
         width = float(fit.problem.high[index] - fit.problem.low[index])
@@ -51,6 +51,8 @@ def identifiability(fit: "Fit") -> dict[str, str]:
             words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
             words[name] = "AT BOUND"
+        elif name in limited:
+            words[name] = f"LIMITED by the instrument: moves with {limited[name][0]}"
         elif math.hypot(*(own := [one.error_of(name) for one in fit.unresolved])) > UNRESOLVED_BEYOND:
             kind = "unconstrained by the data" if math.hypot(*own) > OPEN_BEYOND else "weakly constrained"
             words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
@@ -85,6 +87,11 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     for name, least in instrument_limits(fit).items():
         sentences.append(f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved.")
+    for name, (roughness, errors) in limited_with(fit).items():
+        sentences.append(
+            f"{name} is limited by the instrument with {roughness}: up to that width it moves by {errors:.2g} of its "
+            "standard errors."
+        )
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
     if fit.without_influence:

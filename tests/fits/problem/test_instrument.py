@@ -1,5 +1,6 @@
 """Instruments: means over cones beside dense quadrature, samples that lean, gains, and what they cost."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -41,28 +42,26 @@ def test_readings_are_means_over_cones(source: float, detector: float, alpha: fl
     of = problem(Instrument(source, detector))
     found = np.asarray(of.predict([alpha]))
     expected = mean_over_cones(metal(alpha), GEOMETRY.wi, GEOMETRY.wo, source, detector)
-    # the first term that the ring misses is of fourth order in the half vector's disc; 1e-3 is allowed for each of lobe
-    # and cosines where no mean is taken
-    radius = np.radians(0.5 * np.hypot(source, detector)) / np.linalg.norm(GEOMETRY.wi + GEOMETRY.wo, axis=-1)
-    allowed = 2e-3 + (radius / alpha) ** 4
+    # 1e-3 is allowed for each of lobe and cosines where no mean is taken
     inside = np.abs(GEOMETRY.wo[:, 2]) > np.cos(np.radians(78.0))
-    assert np.all((np.abs(found / expected - 1.0)[:, 0] < allowed)[inside])
+    assert np.all((np.abs(found / expected - 1.0)[:, 0] < 2e-3)[inside])
 
 
 def test_means_are_taken_only_where_a_lobe_may_be_narrow() -> None:
-    """By directions: four for each reading near the mirror, one for what no bound lets be narrow."""
+    """By directions: more for each reading near the mirror, one for what no bound lets be narrow."""
     count = len(GEOMETRY)
     kinds = (Instrument(), 0.02), (Instrument(detector=1.0), 0.2), (Instrument(detector=1.0), 0.02)
     plain, wide, narrow = (problem(*kind).model.optics for kind in kinds)
     assert plain.row is None
-    assert len(wide.wi) < len(narrow.wi) <= 4 * count
+    assert len(wide.wi) < len(narrow.wi) <= 14 * count
     half = GEOMETRY.wi + GEOMETRY.wo
     tilt = np.degrees(np.arctan2(np.hypot(half[:, 0], half[:, 1]), half[:, 2]))
     steep = GEOMETRY.wo[:, 2] < 0.5
     counts = [np.bincount(np.asarray(one.row), minlength=count) for one in (wide, narrow)]
-    assert set(np.concatenate(counts)) == {1, 4}
+    assert set(counts[0]) == {1, 4}
+    assert set(counts[1]) == {1, 4, 14}
     assert np.all(counts[0][(readings().theta_i < 11.0) & ~steep] == 1)
-    assert np.all(counts[1][tilt < 5.0] == 4)
+    assert np.all(counts[1][tilt < 5.0] >= 4)
     assert np.all(counts[1][(tilt > 30.0) & ~steep] == 1)
 
 
@@ -74,7 +73,7 @@ def test_means_cost_four_readings_where_a_lobe_is_narrow_and_nothing_where_it_is
         lowered = jax.jit(lambda vector: of.model.predict(vector)).lower(of.start)
         return float(lowered.cost_analysis()["flops"])
 
-    assert operations(Instrument(detector=3.0), 0.02) < 4.2 * operations(None, 0.02)
+    assert operations(Instrument(detector=3.0), 0.06) < 4.2 * operations(None, 0.06)
     assert operations(Instrument(detector=0.5), 0.5) == operations(None, 0.5)
 
 
@@ -192,7 +191,7 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
     found = fits.fit(stack, data, transport=SINGLE, starts=1, instrument=given)
     fits.save_fit(found, tmp_path / "result")
     loaded = fits.load_fit(tmp_path / "result")
-    assert loaded.problem.instrument == given
+    assert loaded.problem.instrument == found.problem.instrument == replace(given, rings=1)
     assert loaded.chi_square == pytest.approx(found.chi_square, rel=1e-9)
 
 
@@ -204,6 +203,8 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
         ({"source": Free(1.0, 0.0, 2.0)}, r"Instrument.source is Free.*; it must be a number in \[0, 30\]"),
         ({"offset": Free(0.0, -20.0, 5.0)}, r"Instrument.offset.low is -20.0; it must be a number in \[-10, 10\]"),
         ({"gain_per_incidence": 0.0}, r"Instrument.gain_per_incidence is 0.0; it must be a number in \[0.0001, 1\]"),
+        ({"rings": 9}, r"Instrument.rings is 9; it must be an integer in \[1, 8\]"),
+        ({"rings": 1.5}, r"Instrument.rings is 1.5; it must be an integer in \[1, 8\]"),
         ({"gain_per_incidence": True}, "Instrument.gain_per_incidence is True"),
     ],
 )
@@ -218,6 +219,7 @@ def test_bad_tables_are_refused(tmp_path: Path) -> None:
     whole = path.read_text()
     for table, message in (
         ("detector = 31.0", r"instrument.detector is 31.0; it must be a number in \[0, 30\]"),
+        ("rings = 0", r"instrument.rings is 0; it must be an integer in \[1, 8\]"),
         ("aperture = 1.0", "instrument has an unknown key 'aperture'"),
         ("offset = { start = 0.0, low = -1.0 }", "instrument.offset has no high"),
     ):

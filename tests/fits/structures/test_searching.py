@@ -151,7 +151,7 @@ def test_every_structure_is_seen_by_the_instrument(data: fits.Measurements, tmp_
     found = search(data, LIBRARY, instrument=seen, **given)
     assert len(found.found) == 2
     for one in found.found:
-        assert one.fit.problem.instrument == seen
+        assert replace(one.fit.problem.instrument, rings=None) == seen
         assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3
     for other in (None, fits.Instrument(detector=1.0, gain_per_incidence=0.02)):
         with pytest.raises(ValueError, match="holds a search of other data, or with another library or settings"):
