@@ -293,7 +293,7 @@ class Statistical(DeterministicTransport):
 @eqx.filter_jit
 @exact_products
 def _closed_form(stack: Stack) -> DiffusePart:
-    """The diffuse part from tables and streams, in one program: loops that run by themselves are compiled every time."""
+    """The diffuse part from tables and streams, in one program: loops alone are compiled every time."""
     make = make_coated if is_coated(stack) else make_streamed if is_streamed(stack) else make_hazy
     return make(stack)
 
