@@ -22,6 +22,7 @@ from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Scalars, element
+from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import interface_layer
@@ -58,8 +59,11 @@ def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) ->
     return Plan(resolution.nodes, resolution.modes, None, steps, _ranks(stack), microfacets)
 
 
-def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tuple[Grid, Layer, Layer]:
-    """The grid, the whole stack as one layer, and that less what is known in closed form, see `straight`.
+def solve(
+    stack: Stack, plan: Plan, asked: KnownDirections | None = None
+) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+    """The grid, the whole stack as one layer, that less what is known in closed form, see `straight`, and its outer
+    faces, see `outer_faces`.
 
     asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
     light passes it, ends) with an interface.
@@ -88,7 +92,8 @@ def solve(stack: Stack, plan: Plan, asked: KnownDirections | None = None) -> tup
         if tilted and not is_expanded:
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
-    return grid, whole, without_straight(stack, [found for found, _ in solved], whole)
+    layers = [found for found, _ in solved]
+    return grid, whole, without_straight(stack, layers, whole), outer_faces(stack, layers)
 
 
 def _dtype(stack: Stack) -> Any:

@@ -18,6 +18,7 @@ from jax import Array
 from layerjax._numerics import horizon, not_negative, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
+from layerjax.transport.adding_doubling.energies import Face, node_shares
 from layerjax.transport.adding_doubling.grid import Grid, Region, stencil, table_matrix
 from layerjax.transport.adding_doubling.interpolate import Axis, look_up
 from layerjax.transport.adding_doubling.operators import Layer, Operator, turned
@@ -37,14 +38,14 @@ class Tables(eqx.Module):
     with ordinates and with one mode; quadrants: above to above, and with a stack that transmits below to below, and
     above to below. `steps`: of the azimuth from 0 to pi, with one more point beyond either end.
 
-    near and far: energy scattered to the same side and the other, as a share of what meets an event: a row for light
-    from above and one for light from below, per channel, for each direction in.
+    energies: a row for light from above and one for light from below, per channel, for each direction in. Where there
+    are interfaces, the four shares of `node_shares`; else what is scattered to the same side and the other, as a share
+    of what meets an event.
     """
 
     grid: Grid
     values: tuple[Array, ...] | None
-    near: Array
-    far: Array
+    energies: tuple[Array, ...]
     opaque: bool = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
     steps: int | None = eqx.field(static=True)
@@ -64,6 +65,7 @@ def make_tables(
     azimuths: int | None,
     opaque: bool,
     interaction_probability: Callable[[Vector], Channels | None],
+    faces: tuple[Face | None, Face | None] | None,
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -74,23 +76,27 @@ def make_tables(
         azimuths: ordinates in azimuth; None: Fourier modes.
         opaque: only light from above, and what is reflected.
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
+        faces: see `outer_faces`; None, if there are no interfaces.
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
     top, bottom = (_End(region, _lift(grid, region, modes, azimuths)) for region in (grid.regions[0], grid.regions[-1]))
     values = _values(rest, top, bottom, azimuths, steps, opaque)
 
-    lit = [(top, whole.reflect_top, whole.transmit_down, 1.0)]
+    lit = [(top, Face(whole.reflect_top, whole.transmit_down), 1.0)]
     if not opaque:
-        lit.append((bottom, whole.reflect_bottom, whole.transmit_up, -1.0))
-    near, far = [], []
-    for end, reflect, transmit, side in lit:
-        share = interaction_probability(_node_directions(end.region, azimuths, side))
-        near.append(_energy(reflect.total, share, end))
-        far.append(_energy(transmit.total, share, end))
-    shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])
-    near, far = ([jnp.broadcast_to(row, shape) for row in rows] for rows in (near, far))
-    return Tables(grid, values, jnp.stack(near), jnp.stack(far), opaque, azimuths, steps)
+        lit.append((bottom, Face(whole.reflect_bottom, whole.transmit_up), -1.0))
+    rows = []
+    for (end, found, side), face in zip(lit, faces or (None, None), strict=False):
+        if faces is not None:
+            weight = jnp.repeat(end.region.weight, azimuths or 1)
+            rows.append(list(node_shares(found, face, weight) @ end.lift[0].T))
+        else:
+            share = interaction_probability(_node_directions(end.region, azimuths, side))
+            rows.append([_energy(flux.total, share, end) for flux in (found.reflect, found.transmit)])
+    shape = (max(energy.shape[0] for row in rows for energy in row), rows[0][0].shape[-1])
+    energies = tuple(jnp.stack([jnp.broadcast_to(e, shape) for e in each]) for each in zip(*rows, strict=True))
+    return Tables(grid, values, energies, opaque, azimuths, steps)
 
 
 def _values(
@@ -182,8 +188,8 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side, sign: float = 
     return tuple(factor * not_negative(sign * value) for value in found)
 
 
-def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
-    """Energy scattered to wi's side and to the other, all orders, from what the nodes scatter."""
+def read_energies(tables: Tables, wi: Vector) -> list[Channels]:
+    """`Tables.energies` for light along wi."""
     above = wi[2] > 0
     valid = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if tables.opaque:
@@ -191,18 +197,8 @@ def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:
     row = jnp.where(above | tables.opaque, 0, 1)
     ior = jnp.where(above, tables.grid.regions[0].ior, tables.grid.regions[-1].ior)
     axes = _points(tables, _inside(wi, valid), ior, np.pi, 1)
-    near, far = (
-        look_up(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in (tables.near, tables.far)
-    )
-    energies = [_shared(*pair) for pair in zip(near, far, strict=True)]
-    sides = (tuple(jnp.where(valid, energy[side], 0.0) for energy in energies) for side in range(2))
-    return next(sides), next(sides)
-
-
-def _shared(near: Array, far: Array) -> tuple[Array, Array]:
-    """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
-    kept = not_negative(near), not_negative(far)
-    return not_negative(kept[0] + (far - kept[1])), not_negative(kept[1] + (near - kept[0]))
+    found = [look_up(tuple(jnp.moveaxis(table, 1, 0)), row * table.shape[-1], axes) for table in tables.energies]
+    return [tuple(jnp.where(valid, energy, 0.0) for energy in energies) for energies in found]
 
 
 def _node_directions(region: Region, azimuths: int | None, side: float) -> Vector:

@@ -29,6 +29,7 @@ from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
+from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import (
     ORDINATES_LADDER,
@@ -41,7 +42,7 @@ from layerjax.transport.adding_doubling.resolution import (
 )
 from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
-from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
+from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
 from layerjax.transport.known_directions import Known, KnownDirections, known_directions
@@ -234,13 +235,17 @@ class AddingDoubling(DeterministicTransport):
         return proposal_density(state.first, wi, wo)
 
     def albedo(self, state: Solved, wi: Vector, nodes: int) -> tuple[Channels, Channels]:
-        """From the flux at the nodes, as a share of what meets an event at all: lossless stacks lose nothing.
+        """What the first face does by quadrature with `nodes` points, and of the rest what the nodes scatter: lossless
+        stacks lose nothing. Of media alone all is from the nodes, as a share of what meets an event at all.
 
-        Of single orders by quadrature with `nodes` points, where no interface is.
+        Of single orders by quadrature, where no interface is.
         """
         if state.tables is not None and self.orders == "all":
+            energies = read_energies(state.tables, wi)
+            if state.first.layered:
+                return directional_albedo(state.first, energies, wi, nodes)
             met = interaction_probability(state.first, wi)
-            near, far = read_energy(state.tables, wi)
+            near, far = none_negative(*energies)
             return (near, far) if met is None else (times(near, met), times(far, met))
         if state.first.layered:
             raise ValueError(
@@ -327,15 +332,15 @@ def _is_traced(tree: Any) -> bool:
 @eqx.filter_jit
 @exact_products
 def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
-    grid, whole, rest = solve(stack, plan)
+    grid, whole, rest, faces = solve(stack, plan)
     met = partial(interaction_probability, first)
-    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met)
+    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, faces if first.layered else None)
 
 
 @eqx.filter_jit
 @exact_products
 def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
-    grid, _, rest = solve(stack, plan, known)
+    grid, _, rest, _ = solve(stack, plan, known)
     return between(rest, known, grid.regions[-1].ior, stack.base is not None)
 
 

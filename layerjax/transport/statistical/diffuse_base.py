@@ -89,7 +89,7 @@ def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> Diffu
 @eqx.filter_jit
 @exact_products
 def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseBase:
-    grid, whole, _ = solve(bare, plan)
+    grid, whole, *_ = solve(bare, plan)
     top, bottom = grid.regions[0], grid.regions[-1]
     if isinstance(base, Lambertian):
         albedo = jnp.stack(per_channel(jnp.asarray(base.albedo)))

@@ -15,6 +15,7 @@ from jax import Array
 
 from layerjax import channels
 from layerjax._checks import require_choice
+from layerjax._devices import exact_products
 from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax._parameters import is_placeholder
 from layerjax.channels import Channels
@@ -147,8 +148,7 @@ class Statistical(DeterministicTransport):
             elif self._solves(stack):
                 diffuse = make_diffuse(stack, stack.base, self.microfacets)
             else:
-                make = make_coated if is_coated(stack) else make_streamed if is_streamed(stack) else make_hazy
-                diffuse = make(stack)
+                diffuse = _closed_form(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
 
     def evaluate(self, state: Lit, wi: Vector, wo: Vector, side: Side) -> Channels:
@@ -291,6 +291,14 @@ class Statistical(DeterministicTransport):
             lobe = self._transmissions(state, turned(wi), turned(unfolded(b, exit)))[j]
             far.append(tuple(jnp.sum(share * value, axis=-1) for value in lobe))
         return channels.total(near), channels.total(far)
+
+
+@eqx.filter_jit
+@exact_products
+def _closed_form(stack: Stack) -> DiffusePart:
+    """The diffuse part from tables and streams, in one program: loops alone are compiled every time."""
+    make = make_coated if is_coated(stack) else make_streamed if is_streamed(stack) else make_hazy
+    return make(stack)
 
 
 def _is_diffuse(base: Surface | None) -> bool:

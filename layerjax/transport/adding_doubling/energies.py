@@ -1,0 +1,122 @@
+"""Directional albedo of stacks with interfaces: what the first face does in closed form, the rest from the nodes.
+
+The energy that a face reflects or loses to masking changes within a cosine of the order of alpha, which polynomials
+between nodes do not follow: they would carry the error over to all other directions. Both are integrated over the
+facets instead. The nodes give what becomes of the light that goes on, and of the light that masking takes, as shares of
+these, which vary slowly; shares add up to 1 where nothing is lost, and so does the albedo, however coarse the nodes.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from layerjax._numerics import at_least, horizon, not_negative
+from layerjax.channels import Channels, each, total
+from layerjax.directions import Vector, flip
+from layerjax.stack import Interface, Stack
+from layerjax.transport.adding_doubling.asked import asked_region
+from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
+from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
+from layerjax.transport.first_order import FirstOrder, ReflectingInterface
+from layerjax.transport.single_scattering import Media, SingleScattering
+
+LEAST_SHARED = 5e-5
+"""Energy below which shares of it are those of light from all directions."""
+
+
+class Face(NamedTuple):
+    """What the layer that light meets first reflects and transmits."""
+
+    reflect: Parts
+    transmit: Parts
+
+
+def outer_faces(stack: Stack, layers: list[Layer]) -> tuple[Face | None, Face | None]:
+    """The layer that light from above meets first, and from below, where they are interfaces."""
+    parts = (*stack.layers, stack.base)
+    first, last = layers[0], layers[-1]
+    above = Face(first.reflect_top, first.transmit_down) if isinstance(parts[0], Interface) else None
+    leaves = stack.base is None and isinstance(stack.layers[-1], Interface)
+    return above, Face(last.reflect_bottom, last.transmit_up) if leaves else None
+
+
+def node_shares(whole: Face, face: Face | None, weight: Array) -> Array:
+    """For light along every node, (4, channels or 1, directions): of what masking takes at the first face, what comes
+    back and what does not enter; of what enters, what leaves on the same side and on the other.
+
+    Where the first layer is a medium all enters that no single event sends back.
+    """
+
+    def energy(flux: Operator) -> Array:
+        if flux is None:
+            return jnp.zeros((1, weight.size), weight.dtype)
+        leaving = jnp.sum(flux[:, 0], axis=-2)
+        return jnp.repeat(leaving, weight.size // leaving.shape[-1], axis=-1)
+
+    once, again, far = energy(whole.reflect.first), energy(whole.reflect.rest), energy(whole.transmit.total)
+    if face is None:
+        nothing = jnp.zeros_like(once)
+        rows = [nothing, nothing, _share(again, 1.0 - once, weight), _share(far, 1.0 - once, weight)]
+    else:
+        back, entered = energy(face.reflect.rest), energy(face.transmit.total)
+        lost = 1.0 - once - energy(face.transmit.first)
+        rows = [_share(back, lost, weight), _share(1.0 - once - entered, lost, weight)]
+        rows += [_share(again - back, entered, weight), _share(far, entered, weight)]
+    channels = max(row.shape[0] for row in rows)
+    return jnp.stack([jnp.broadcast_to(row, (channels, weight.size)) for row in rows])
+
+
+def _share(part: Array, whole: Array, weight: Array) -> Array:
+    """part / whole, where there is little of the whole the mean over directions."""
+    mean = jnp.sum(part * weight, axis=-1, keepdims=True) / at_least(
+        jnp.sum(whole * weight, axis=-1, keepdims=True), LEAST_SHARED**2 * jnp.sum(weight)
+    )
+    return (part * whole + LEAST_SHARED**2 * jnp.clip(mean, 0.0, 1.0)) / (whole * whole + LEAST_SHARED**2)
+
+
+def directional_albedo(first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int) -> tuple[Channels, Channels]:
+    """Energy that leaves on wi's side and on the other; shares: the four of `node_shares` along wi."""
+    single = SingleScattering()
+    sides = [(first.upper, wi)] + ([] if first.lower is None else [(first.lower, flip(wi))])
+    once = total([single.albedo(media, w, nodes)[0] for media, w in sides])
+    lost = total([(_lost(media, w, once[0], nodes),) for media, w in sides])
+    back, out, near, far = shares
+
+    def entered(once: Array, lost: Array, out: Array) -> Array:
+        return at_least(1.0 - once - lost * out, 0.0)
+
+    inside = each(entered, once, lost, out)
+    near, far = none_negative(near, far)
+    same = each(
+        lambda once, lost, back, inside, near: once + lost * back + inside * near, once, lost, back, inside, near
+    )
+    visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
+    if first.lower is None:
+        visible = visible & (wi[2] > 0)
+    return _where(visible, same), _where(visible, each(jnp.multiply, inside, far))
+
+
+def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
+    """Energy that masking takes at a face which is the first that light along w meets; else 0."""
+    face = media.base
+    if media.media or not isinstance(face, ReflectingInterface):
+        return jnp.zeros_like(w[2])
+    above = w[2] > horizon(w[2].dtype)
+    region = asked_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
+    _, passed = refracted_rays(region, face.ior, Normals(face.alpha, face.distribution), (nodes, max(2, nodes // 2)))
+    refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
+    return jnp.where(above, at_least(1.0 - reflected - refracted, 0.0), 0.0)
+
+
+def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
+    """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
+
+    def kept(one: Array, other: Array) -> Array:
+        return not_negative(not_negative(one) + (other - not_negative(other)))
+
+    return each(kept, near, far), each(kept, far, near)
+
+
+def _where(visible: Array, energies: Channels) -> Channels:
+    return tuple(jnp.where(visible, energy, 0.0) for energy in energies)
