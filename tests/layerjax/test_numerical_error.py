@@ -6,7 +6,7 @@ import pytest
 
 import layerjax as lj
 from layerjax.numerical_error import neighbours
-from tests.layerjax.transport.adding_doubling.test_traced_stacks import STRUCTURES, drawn
+from tests.helpers.random_stacks import STRUCTURES, drawn
 
 POLAR, AZIMUTH = np.radians([5.0, 30.0, 55.0, 75.0]), np.radians([0.0, 60.0, 150.0, 180.0])
 WI, WO = np.broadcast_arrays(

@@ -1,0 +1,61 @@
+"""Random stacks of many structures, each a function of a vector of numbers."""
+
+import jax.numpy as jnp
+import numpy as np
+
+import layerjax as lj
+from layerjax.phase import HenyeyGreenstein
+
+
+def uniform(low, high):
+    return lambda random: random.uniform(low, high)
+
+
+def logarithmic(low, high):
+    return lambda random: np.exp(random.uniform(np.log(low), np.log(high)))
+
+
+INDEX, ROUGH, DEPTH, ALBEDO, G = (
+    uniform(1.2, 1.9), logarithmic(0.05, 0.8), logarithmic(0.1, 8.0), uniform(0.3, 1.0), uniform(-0.5, 0.9),
+)  # fmt: skip
+INNER, METAL, PAINT = logarithmic(0.12, 0.8), (uniform(0.2, 2.0), uniform(1.5, 5.0)), uniform(0.1, 0.95)
+
+STRUCTURES = {
+    "coated metal": (
+        (INDEX, ROUGH, *METAL, INNER),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1])], lj.Conductor(p[2], p[3], p[4])),
+    ),
+    "varnish": ((INDEX, ROUGH, PAINT), lambda p: lj.Stack([lj.Interface(p[0], p[1])], lj.Lambertian(p[2]))),
+    "hazy coat": (
+        (INDEX, ROUGH, DEPTH, ALBEDO, G, PAINT),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], HenyeyGreenstein(p[4]))], lj.Lambertian(p[5])
+        ),
+    ),
+    "flakes in a coat": (
+        (INDEX, ROUGH, DEPTH, ALBEDO, INNER, PAINT),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], lj.SGGX("surface", p[4]))], lj.Lambertian(p[5])
+        ),
+    ),
+    "flakes": (
+        (DEPTH, ALBEDO, logarithmic(0.2, 0.8), PAINT),
+        lambda p: lj.Stack([lj.Medium(p[0], p[1], lj.SGGX("surface", p[2]))], lj.Lambertian(p[3])),
+    ),
+    "haze on metal": (
+        (DEPTH, ALBEDO, G, *METAL, INNER),
+        lambda p: lj.Stack([lj.Medium(p[0], p[1], HenyeyGreenstein(p[2]))], lj.Conductor(p[3], p[4], p[5])),
+    ),
+    "slab": (
+        (INDEX, logarithmic(0.2, 0.8), DEPTH, ALBEDO, G, logarithmic(0.2, 0.8)),
+        lambda p: lj.Stack(
+            [lj.Interface(p[0], p[1]), lj.Medium(p[2], p[3], HenyeyGreenstein(p[4])), lj.Interface(1.0, p[5])]
+        ),
+    ),
+}
+"""Name: how each number is drawn, and the stack of them."""
+
+
+def drawn(kind, seed):
+    random = np.random.default_rng([seed, len(kind)])
+    return jnp.asarray([draw(random) for draw in STRUCTURES[kind][0]])
