@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from fits.data.measurements import Measurements
 
 MOST_CHANNELS = 6
-"""That have a column each; of more, the range over all of them."""
+"""Of totals, that have a column each; of more, the range."""
 
 NAMED = 12
-"""Channels that are named one by one."""
+"""Channels that are named one by one, and have a column each; of more, the range over all of them."""
 
 
 def source_table(data: "Measurements") -> Table:
@@ -71,7 +71,7 @@ def data_table(data: "Measurements") -> Table:
     rows = []
     for incidence in incidences(data):
         theta, values = data.theta_o[incidence.rows], data.values[incidence.rows]
-        columns = values.T if values.shape[1] <= MOST_CHANNELS else values[None]
+        columns = values.T if values.shape[1] <= NAMED else values[None]
         ranges = [f"{own.min():.3g} to {own.max():.3g}" for own in columns]
         counts = (
             len(incidence.rows),
@@ -80,7 +80,7 @@ def data_table(data: "Measurements") -> Table:
         )
         angles = (degrees(incidence.theta), degrees(incidence.phi), f"{degrees(theta.min())} to {degrees(theta.max())}")
         rows.append((*angles, *map(str, counts), *ranges))
-    few = len(data.channels) <= MOST_CHANNELS
+    few = len(data.channels) <= NAMED
     heads = tuple(f"BRDF {channel}" for channel in data.channels) if few else ("BRDF",)
     names = ("theta_i", "phi_i", "theta_o", "readings", "used", "in plane", *heads)
     return Table("Angles, and BRDF in 1/sr", names, tuple(shortened(rows, 40)), keys=2)

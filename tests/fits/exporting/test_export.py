@@ -72,6 +72,29 @@ def test_an_rgl_file_holds_the_stack(tmp_path: Path, stack: lj.Stack, transport:
     assert any("in the median" in note for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("phase", "median", "most"),
+    [
+        (lj.SGGX("fiber", 0.3, (1.0, 0.4, 0.0)), 0.002, 0.023),
+        (lj.SGGX("fiber", 0.1, (1.0, 0.4, 0.0)), 0.009, 0.18),
+        (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085),
+    ],
+    ids=["fibers 0.3", "fibers 0.1", "haze"],
+)
+def test_narrow_lobes_are_held_as_well_as_the_page_says(
+    tmp_path: Path, phase: lj.PhaseFunction, median: float, most: float
+) -> None:
+    """Of lobes that are not about the mirror direction: the figures of docs/formats.md, to what they are rounded to."""
+    stack = lj.Stack([lj.Medium(1.0, 0.9, phase)])
+    path, _ = written(stack, tmp_path, "rgl", transport=lj.SingleScattering())
+    wi, wo = pairs()
+    read = fits.read(path, geometry=fits.Geometry(wi, wo)).values[:, 0]
+    true = np.asarray(lj.evaluate(stack, wi, wo, lj.SingleScattering()))[:, 0]
+    error = np.abs(read / true - 1.0)
+    assert np.median(error) < 1.05 * median
+    assert 0.5 * most < np.quantile(error, 0.99) < 1.05 * most
+
+
 def test_azimuths_are_held_as_far_as_the_stack_needs_them(tmp_path: Path) -> None:
     turns = []
     for stack in (METAL, FIBERS, TILTED):
