@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from layerjax import transport as transports
 from layerjax._checks import in_short
+from layerjax._numerics import broadcasting
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
 from layerjax.mixture import Mixture, require_material, stacks_of
@@ -32,6 +33,7 @@ class Prepared(eqx.Module):
 def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Prepared: ...
 @overload
 def prepare(stack: Mixture, transport: Transport | Literal["auto"] = "auto") -> Mixture: ...
+@broadcasting
 def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Prepared | Mixture:
     """Do all the work that no direction is needed for, once.
 
@@ -65,6 +67,7 @@ def choose_transport(stack: Stack | Mixture, transport: Transport | Literal["aut
     return transport_for(stack, transport, None)
 
 
+@broadcasting
 def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
     """`choose_transport` for directions of which this is known; None: they are many, or not known."""
     require_material(stack)
