@@ -6,8 +6,8 @@ selects: a clamp or a ``where`` after the fact still gives NaN gradients.
 
 import functools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,24 @@ from jax import Array
 
 SERIES_LIMIT = 0.3
 """Below this argument `exprel` and `one_minus_exp` use a Taylor series."""
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def broadcasting(function: Callable[P, T]) -> Callable[P, T]:
+    """The function with arrays of different ranks broadcast, as this package writes them.
+
+    Where a user forbids that of their own code (``jax_numpy_rank_promotion``), what is traced here is not theirs.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        with jax.numpy_rank_promotion("allow"):
+            return function(*arguments, **options)
+
+    return call
 
 
 def safe_sqrt(x: Array) -> Array:

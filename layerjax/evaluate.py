@@ -18,7 +18,7 @@ from layerjax import maps
 from layerjax._batching import in_chunks
 from layerjax._checks import require_choice, require_count, require_key
 from layerjax._devices import compiled
-from layerjax._numerics import horizon, safe_div
+from layerjax._numerics import broadcasting, horizon, safe_div
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
@@ -70,6 +70,7 @@ def evaluate(
     return evaluate_known(stack, wi, wo, transport, side=side, key=key)
 
 
+@broadcasting
 def evaluate_known(
     stack: Any,
     wi: ArrayLike,
@@ -104,6 +105,7 @@ def evaluate_known(
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
+@broadcasting
 def evaluate_with_error(
     stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
@@ -140,6 +142,7 @@ def evaluate_with_error(
     return values, errors
 
 
+@broadcasting
 def sample(
     stack: Stack | Mixture | Prepared, wi: ArrayLike, key: Array, transport: Transport | Literal["auto"] = "auto"
 ) -> tuple[Array, Array, Array]:
@@ -161,6 +164,7 @@ def sample(
     return _sample(prepared_at(stack, transport, wi.dtype), wi, key)
 
 
+@broadcasting
 def pdf(
     stack: Stack | Mixture | Prepared, wi: ArrayLike, wo: ArrayLike, transport: Transport | Literal["auto"] = "auto"
 ) -> Array:
@@ -178,6 +182,7 @@ def pdf(
     return _pdf(prepared_at(stack, transport, wi.dtype), wi, wo)
 
 
+@broadcasting
 def albedo(
     stack: Stack | Mixture | Prepared,
     wi: ArrayLike,
@@ -207,6 +212,7 @@ def albedo(
     return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
 
+@broadcasting
 def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     """Share of radiance along wi that passes straight through the stack without a collision, shape ``(..., C)``.
 

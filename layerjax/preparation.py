@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 from layerjax import transport as transports
 from layerjax._checks import in_short
+from layerjax._numerics import broadcasting
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions
@@ -34,6 +35,7 @@ class Prepared(eqx.Module):
 def prepare(stack: Stack, transport: Transport | Literal["auto"] = "auto") -> Prepared: ...
 @overload
 def prepare(stack: Mixture, transport: Transport | Literal["auto"] = "auto") -> Mixture: ...
+@broadcasting
 def prepare(stack: Stack | Mixture, transport: Transport | Literal["auto"] = "auto") -> Prepared | Mixture:
     """Do all the work that no direction is needed for, once.
 
@@ -82,6 +84,7 @@ def choose_transport(
     return transport_for(stack, transport, known_directions(*read_directions(wi=wi, wo=wo)))
 
 
+@broadcasting
 def transport_for(stack: Stack | Mixture, transport: Any, known: KnownDirections | None) -> Transport:
     """`choose_transport` for directions of which this is known; None: they are many, or not known."""
     require_material(stack)

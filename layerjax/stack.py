@@ -39,6 +39,11 @@ class Interface(Shown):
     distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (carried by `ENDF`, and, with
                         "vmf"              ``microfacets="single"``, `AddingDoubling`, `RandomWalk`)
     ============ ====== ========== ======= ==========================================================================
+
+    Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1 + 1e-9
+    and alpha 0.3 a passage at 75 degrees loses 20 %, and a base that is lit and seen at 75 degrees is 36 % darker.
+    Transports with ``microfacets="multiple"`` carry on what facets block; where the index does not change, leave the
+    interface out (one of exactly the index above it is left out by itself).
     """
 
     ior: Parameter = parameter("Interface.ior")

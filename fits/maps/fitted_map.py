@@ -165,7 +165,7 @@ class FittedMap:
         """A whole array. A damaged chunk is a ValueError that names it; zarr would tell of it in many words."""
         array, (dtype, _) = self[name], self._every[name]
         if not _is_plain(array):  # somebody wrote it anew, compressed
-            return np.asarray(array[...])
+            return chunk_files.checked(array)
         whole = np.full(self.shape, array.fill_value, dtype)
         for place in chunk_files.grid(self.shape, array.chunks):
             values = chunk_files.read(self.path / name, place, dtype, array.chunks)
@@ -200,9 +200,9 @@ def _is_plain(array: "zarr.Array[Any]") -> bool:
     """Whether its chunks are files as `fits.maps.chunk_files` has them."""
     described: Any = array.metadata.to_dict()
     codecs = [dict(codec) for codec in described.get("codecs", ())]
-    little = [codec["name"] for codec in codecs] == ["bytes"] and _configured(codecs[0], "endian", "little") == "little"
-    keys = described.get("chunk_key_encoding", {})
-    return little and keys.get("name") == "default" and _configured(keys, "separator", "/") == "/"
+    names, keys = [codec["name"] for codec in codecs], described.get("chunk_key_encoding", {})
+    plain = names == ["bytes", "crc32c"] and _configured(codecs[0], "endian", "little") == "little"
+    return plain and keys.get("name") == "default" and _configured(keys, "separator", "/") == "/"
 
 
 def _configured(described: Mapping[str, Any], what: str, default: str) -> Any:

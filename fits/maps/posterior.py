@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.inference.optimise import refit
 from fits.inference.sampling import sample
+from fits.maps import chunk_files
 from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.inputs import Readings
 from fits.maps.job import Part, part_of, rows_of
@@ -46,9 +47,9 @@ def sample_texels(
     if progress is not None:
         progress("posterior", len(places), len(places))
     group = root.create_group(GROUP)
-    group.create_array("places", data=places.astype(np.int64), compressors=None)
+    group.create_array("places", data=places.astype(np.int64), compressors=chunk_files.codecs())
     for name, arrays in zip(("mean", "sd", "quantiles", "converged"), zip(*rows, strict=True), strict=True):
-        group.create_array(name, data=np.stack(arrays), compressors=None)
+        group.create_array(name, data=np.stack(arrays), compressors=chunk_files.codecs())
     group.attrs.update({"names": list(fitted.names), "quantiles": list(QUANTILES), "seed": seed, "texels": len(places)})
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits._files import plain
 from fits.data.measurements import Measurements, channel_names
+from fits.maps import chunk_files
 from fits.maps.inputs import Readings
 from fits.maps.job import completed, part_of
 from fits.maps.pilot import fly, resolved
@@ -230,7 +231,7 @@ def save(prepared: Prepared, root: "zarr.Group") -> None:
         arrays |= {f"table/{name}": np.asarray(getattr(table, name)) for name in _arrays_of_table()}
     group = root.create_group(GROUP)
     for name, array in arrays.items():
-        group.create_array(name, data=np.ascontiguousarray(array), compressors=None)
+        group.create_array(name, data=np.ascontiguousarray(array), compressors=chunk_files.codecs())
     shared = prepared.shared
     group.attrs.update(  # last: with them it is whole
         {
@@ -261,7 +262,7 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     """What `save` kept, for the same arguments as those of `prototype`."""
     group: Any = root[GROUP]
     about = dict(group.attrs)
-    array = {name: np.asarray(group[name][...]) for name in about["arrays"]}
+    array = {name: chunk_files.checked(group[name]) for name in about["arrays"]}
     given = Noise() if noise is None else noise
     levels = {
         name: getattr(given, name) if is_free(getattr(given, name)) and value is None else value

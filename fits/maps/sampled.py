@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fits.maps import chunk_files
+
 if TYPE_CHECKING:
     import zarr
 
@@ -50,7 +52,7 @@ def sampled_in(
         return None
     group: Any = root[GROUP]
     places, mean, sd, quantiles, converged = (
-        np.asarray(group[name][...]) for name in ("places", "mean", "sd", "quantiles", "converged")
+        chunk_files.checked(group[name]) for name in ("places", "mean", "sd", "quantiles", "converged")
     )
     at = tuple(places.T)
     fitted, width = (np.stack([of[name][at] for name in names], axis=1) for of in (values, errors))

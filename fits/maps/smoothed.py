@@ -58,7 +58,7 @@ def write(map: FittedMap, name: str, arrays: Mapping[str, Floats], about: Mappin
                     chunks=map.chunk,
                     dtype=NUMBER,
                     fill_value=np.nan,
-                    compressors=None,
+                    compressors=chunk_files.codecs(),
                     dimension_names=dimensions(len(map.shape)),
                     attributes={"units": map.units[parameter], "long_name": f"{parameter}, {GIVEN[kind]}"},
                 )

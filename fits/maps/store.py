@@ -3,7 +3,7 @@
 A directory of zarr version 3 with the arrays ``values/NAME``, ``errors/NAME``, ``reduced_chi_square``, ``flags``,
 ``start``, ``at_bound``, ``readings`` and, where the transport has one, ``numerical_error``, all of the map's shape and
 in chunks of the same texels. The flags of a chunk are written last: a texel whose flags are 0 is not there yet. Chunks
-are not compressed (see `fits.maps.chunk_files`), and the same numbers are the same bytes.
+are not compressed and carry checksums (see `fits.maps.chunk_files`), and the same numbers are the same bytes.
 """
 
 import os
@@ -24,7 +24,7 @@ from fits.maps.chunk_files import PARTIAL, Block, block_at, grid
 if TYPE_CHECKING:
     import zarr
 
-KEY, KIND, FORMAT = "layerjax", "fitted map", 1
+KEY, KIND, FORMAT = "layerjax", "fitted map", 2
 FLAGS = {
     "fitted": 1,
     "converged": 2,
@@ -101,7 +101,7 @@ def create(
                     chunks=chunk,
                     dtype=dtype,
                     fill_value=fill,
-                    compressors=None,
+                    compressors=chunk_files.codecs(),
                     dimension_names=dimensions(len(chunk)),
                     attributes=_described(name, units),
                 )
@@ -193,7 +193,7 @@ def left(group: "zarr.Group") -> list[Block]:
 
 
 def flags_of(group: "zarr.Group", block: Block) -> NDArray[np.uint16] | None:
-    """The flags of a chunk; None if it is not there whole: a flag is 0, or a file of an array lacks or is too short."""
+    """The flags of a chunk; None if it is not there whole: a flag is 0, or a file of an array lacks or is damaged."""
     root, arrays, _, chunk = _layout(group)
     place = tuple(one.start // side for one, side in zip(block, chunk, strict=True))
     if not all(chunk_files.is_whole(root / name, place, dtype, chunk) for name, (dtype, _) in arrays.items()):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horner, unstacked
+from layerjax._numerics import at_least, at_most, broadcasting, horner, unstacked
 
 BASIS = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 """Weights of the four coefficients that count at a place: of each the polynomial in how far it is beyond the first."""
@@ -88,6 +88,7 @@ def _reader(axes: int, columns: int, apart: int) -> Callable[..., Array]:
         return _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=False)[0]
 
     @value.defjvp
+    @broadcasting
     def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
         flat, start, *rest = primals
         found, *slopes = _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=True)

@@ -108,6 +108,7 @@ def make(p):
 
 PARAMETERS = {"thickness": 0.8, "albedo": 0.6, "alpha": 0.3, "f0": 0.1, "g": 0.4, "k": 2.5}
 PARAMETERS = {name: jnp.asarray(value) for name, value in PARAMETERS.items()} | {"axis": jnp.array([0.2, 0.1, 0.9])}
+W = np.deg2rad(75.0)
 WI, WO = lj.direction(0.6, 0.2), lj.direction(0.9, 2.4)
 
 
@@ -179,3 +180,13 @@ def test_interfaces_of_traced_index_are_kept():
     assert value(1.0) == 0.0
     assert jax.jit(jax.grad(jax.grad(value)))(1.0) > 0.0
     assert counts == [0, 2]
+
+
+def test_masking_takes_light_where_no_index_changes():
+    """Smith's G1 of GGX, for the way in and the way out."""
+    stack = lj.Stack([lj.Interface(1.0 + 1e-9, 0.3)], lj.Lambertian(0.5))
+    wi, wo = lj.direction(W, 0.0), lj.direction(W, np.pi)
+    value = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=8, modes=4))
+    kept = (2.0 / (1.0 + np.sqrt(1.0 + (0.3 * np.tan(W)) ** 2))) ** 2
+    np.testing.assert_allclose(value * np.pi / 0.5, kept, rtol=2e-3)
+    assert round(1.0 - kept, 2) == 0.36

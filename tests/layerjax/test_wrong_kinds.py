@@ -26,7 +26,16 @@ FUNCTIONS = {
     "unscattered": LIT,
     "prepare": {"stack": STACK, **SINGLE},
     "choose_transport": {"stack": STACK, **SINGLE},
-    "goniophotometer": {**LIT, "key": KEY, "paths": 64, "polar": 1, "azimuth": 1, "orders": 2, "lanes": 64},
+    "goniophotometer": {
+        **LIT,
+        "key": KEY,
+        "paths": 64,
+        "polar": 1,
+        "azimuth": 1,
+        "orders": 2,
+        "lanes": 64,
+        "microfacets": "single",
+    },
 }
 
 CLASSES = {

@@ -37,7 +37,7 @@ def in_short(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
         words.append(f"At a bound: {share(bounded, found.fitted)} of the fitted texels{which}.")
     else:
         words.append("No texel is at a bound.")
-    words.append(_poor(found, map))
+    words.append(_poor(found, map, too_far=not explains and found.reduced_chi_square[1] > 1.0))
     if found.counts["unresolved"]:
         unresolved = share(found.counts["unresolved"], found.fitted)
         words.append(f"In {unresolved} of the fitted texels the readings do not resolve every parameter.")
@@ -88,10 +88,17 @@ def degrees_of_freedom(readings: Any, map: FittedMap) -> Any:
     return readings - sum(name not in shared for name in map.names)
 
 
-def _poor(found: Summary, map: FittedMap) -> str:
+def _poor(found: Summary, map: FittedMap, too_far: bool) -> str:
+    """too_far: chi-square is not explained in the median texel, nor then in the pilot by which the flag is set."""
     poor, above = found.counts["poor"], (map.attributes.get("pilot") or {}).get("poor_above")
-    if not poor:
+    if not poor and not too_far:
         return "No texel is poor: chi-square is nowhere above what noise and the pilot explain."
+    if not poor:
+        limit = "" if above is None else f"above {float(above):.3g}, "
+        return (
+            f"No texel stands out: chi-square is nowhere {limit}more than the pilot leads to expect, whose texels the "
+            "model does not explain either."
+        )
     limit = "" if above is None else f"above {float(above):.3g}, "
     return (
         f"Poor: {share(poor, found.fitted)} of the fitted texels, whose chi-square is {limit}more than noise and the "

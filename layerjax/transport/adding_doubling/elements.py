@@ -16,6 +16,8 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
+from layerjax._numerics import broadcasting
+
 Scalars = tuple[Array, ...]
 
 MOST_SCALARS = 10
@@ -83,6 +85,7 @@ def _of_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, const
     return function(scalars, constants)
 
 
+@broadcasting
 def _jvp(function: Callable[[Scalars, Any], Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
     scalars, constants = primals
     value, slope = _by_scalars(function, scalars, constants, tangents[0])

@@ -20,7 +20,7 @@ from jax import Array
 from jax.custom_batching import sequential_vmap
 
 from layerjax._batching import room
-from layerjax._numerics import at_least, horner
+from layerjax._numerics import at_least, broadcasting, horner
 from layerjax.transport.adding_doubling.inverse import inverse
 
 SMALL, TINY = 0.2, 1e-4
@@ -60,6 +60,7 @@ def slab(p: Array, q: Array, half: Array) -> tuple[Array, Array]:
 
 
 @slab.defjvp
+@broadcasting
 def _slab_jvp(
     primals: tuple[Array, Array, Array], tangents: tuple[Array, Array, Array]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:

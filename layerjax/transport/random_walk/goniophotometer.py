@@ -14,7 +14,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from layerjax._checks import require_choice, require_count, require_key
-from layerjax._numerics import horizon
+from layerjax._numerics import broadcasting, horizon
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
@@ -58,6 +58,7 @@ class Goniogram(eqx.Module):
     azimuths: Array
 
 
+@broadcasting
 def goniophotometer(
     stack: Stack,
     wi: ArrayLike,

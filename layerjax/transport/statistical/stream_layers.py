@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax._numerics import broadcasting
 from layerjax.channels import per_channel
 from layerjax.stack import Interface, Medium, is_known
 from layerjax.transport.statistical.streams import DIFFUSE, NODES, STREAMS, WEIGHTS, Face, dot, face, matmul, times
@@ -224,6 +225,7 @@ def inverse(matrix: Array) -> Array:
 
 
 @inverse.defjvp
+@broadcasting
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     result = inverse(*primals)
     return result, -matmul(result, matmul(tangents[0], result))

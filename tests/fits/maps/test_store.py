@@ -135,13 +135,13 @@ def test_flags_are_written_last_and_go_first(tmp_path: Path, monkeypatch: pytest
 def test_a_chunk_with_a_damaged_file_is_left(size: int | None, tmp_path: Path) -> None:
     map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
     file = map.path / "values" / NAMES[0] / "c" / "1" / "0"
-    assert file.stat().st_size == 4 * 4 * 8
+    assert file.stat().st_size == 4 * 4 * 8 + 4
     if size is None:
         file.unlink()
         assert np.isnan(map.values[NAMES[0]][4:, :4]).all()
     else:
         os.truncate(file, size)
-        with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: damaged, holds {size} bytes, must be 128$"):
+        with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: damaged, holds {size} bytes, must be 132$"):
             map.values[NAMES[0]]
     assert left(zarr.open_group(map.path)) == [BLOCKS[3]]
 
@@ -238,7 +238,7 @@ def _root(path: Path, change: Any) -> None:
         (lambda path: (path / "zarr.json").write_text("[]"), "is no group of zarr arrays"),
         (lambda path: _root(path, lambda root: root["attributes"].clear()), "is a zarr group that is not ours"),
         (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(kind="x")), "holds a x, must be"),
-        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(format=2)), "is version 2 of the"),
+        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(format=1)), "is version 1 of the"),
         (
             lambda path: _root(path, lambda root: root["attributes"]["layerjax"].pop("names")),
             "damaged, KeyError 'names'",
@@ -269,3 +269,30 @@ def test_names_that_are_not_there_are_told(tmp_path: Path) -> None:
     assert map.numerical_error is None
     assert repr(map).startswith("<FittedMap of 7 x 10 texels, 100 % done: layers[0].thickness, ")
     assert len(map.values) == 3
+
+
+@pytest.mark.parametrize("at", [0, 40, 130])
+def test_flipped_bytes_are_damage_and_done_again(at: int, tmp_path: Path) -> None:
+    """Of the numbers and of the checksum; zarr by itself sees it as well."""
+    map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
+    file = map.path / "values" / NAMES[0] / "c" / "1" / "0"
+    content = bytearray(file.read_bytes())
+    content[at : at + 16] = bytes(byte ^ 0x5A for byte in content[at : at + 16])
+    file.write_bytes(content)
+    with pytest.raises(
+        ValueError, match=rf"^{re.escape(str(file))}: damaged, its checksum is not that of its content$"
+    ):
+        map.values[NAMES[0]]
+    with pytest.raises(ValueError, match="checksum"):
+        map[f"values/{NAMES[0]}"][...]
+    assert left(zarr.open_group(map.path)) == [BLOCKS[3]]
+
+
+def test_what_is_written_is_what_zarr_reads_and_writes(tmp_path: Path) -> None:
+    found = numbers(SHAPE)
+    map = stored(tmp_path / "a.zarr", found, CHUNK)
+    name = f"values/{NAMES[0]}"
+    np.testing.assert_array_equal(map[name][...], found[name])
+    before = contents(map.path)
+    zarr.open_group(map.path, mode="r+")[name][...] = found[name]
+    assert contents(map.path) == before

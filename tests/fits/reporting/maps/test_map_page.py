@@ -193,7 +193,7 @@ def test_the_command_refuses_what_it_cannot_report(
     file = map.path / "errors" / "base.albedo" / "c" / "0" / "1"
     os.truncate(file, 3)
     told = refused(["report", "a.zarr"], capsys, tmp_path)
-    assert told.endswith("errors/base.albedo/c/0/1: damaged, holds 3 bytes, must be 384\n")
+    assert told.endswith("errors/base.albedo/c/0/1: damaged, holds 3 bytes, must be 388\n")
     (map.path / "zarr.json").write_text("{")
     assert "not valid JSON" in refused(["report", "a.zarr"], capsys, tmp_path)
     zarr.create_group(tmp_path / "other.zarr")

@@ -118,6 +118,8 @@ def test_chi_square_far_from_one_is_told(factor: float, sentence: str, tmp_path:
     found["reduced_chi_square"] *= factor
     words, fine = told(tmp_path, found)
     assert sentence in words
+    assert ("No texel is poor" in words) == (factor < 1.0)
+    assert ("No texel stands out" in words) == (factor > 1.0)
     assert not fine
 
 
