@@ -10,6 +10,7 @@ import numpy as np
 
 from fits.inference.limits import instrument_limits
 from fits.reporting.diagnostics import ResidualStructure
+from fits.reporting.modes import errors_of_one
 from fits.reporting.verdicts import identifiability
 
 if TYPE_CHECKING:
@@ -118,11 +119,10 @@ def parameter_table(fit: "Fit") -> Table:
         error = fit.standard_errors[name]
         number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
         rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
-    note = (
-        ""
-        if fit.is_posterior
-        else "The objective is a named residual, not a likelihood: the errors are only indicative."
-    )
+    notes = errors_of_one(fit)
+    if not fit.is_posterior:
+        notes.append("The objective is a named residual, not a likelihood: the errors are only indicative.")
+    note = " ".join(notes)
     return Table(
         "Fitted parameters", ("parameter", "value", "error", "unit", "bounds", "identified"), tuple(rows), note
     )
@@ -188,7 +188,8 @@ def posterior_table(posterior: "Posterior") -> Table:
         unit = posterior.fit.units[name]
         rows.append((name, *words, f"{deviation:.2g}", unit, f"{time[index]:.0f}", f"{effective[index]:.0f}"))
     columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "unit", "autocorr. steps", "effective samples")
-    return Table("Posterior", columns, tuple(rows))
+    note = f"Of all {len(posterior.modes)} modes together." if posterior.modes else ""
+    return Table("Posterior", columns, tuple(rows), note)
 
 
 def incidence_table(structure: ResidualStructure) -> Table:

@@ -9,9 +9,11 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import UNRESOLVED_BEYOND, Combination
+from fits.inference.length import MIXED
 from fits.inference.limits import instrument_limits, limited_with
 from fits.inference.resolution import ENOUGH
 from fits.reporting.diagnostics import ResidualStructure
+from fits.reporting.modes import errors_of_one, modes
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -119,8 +121,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(f"Without influence on the data: {', '.join(fit.without_influence)}.")
     for combination in fit.unresolved[:1]:
         sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
-    if fit.alternatives:
-        sentences.append("Another stack explains the data equally well.")
+    sentences += errors_of_one(fit)
     if sentences:
         return [*close, *sentences], False
     return [*close, "The model explains the data to within its noise, and the data resolve every parameter."], True
@@ -301,28 +302,26 @@ def minima(fit: "Fit") -> list[str]:
     sentences = [f"{best.count} of {total} starts reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
-    if fit.alternatives:
-        sentences.append(
-            f"Minima that explain the data equally well: {len(fit.alternatives)}. It cannot tell them apart."
-        )
-    return sentences
+    return [*sentences, *errors_of_one(fit)]
 
 
 def sampled(posterior: "Posterior") -> list[str]:
     """How long the chain is, and whether that is long enough for its estimates to mean anything."""
     steps, walkers = posterior.chain.shape[:2]
-    longest = float(np.max(posterior.autocorrelation_time))
+    longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
     sentences = [
         f"{walkers} walkers made {steps} steps; the first {posterior.burn_in} are left out, and the rest is "
         f"{(steps - posterior.burn_in) / longest:.0f} times the longest autocorrelation time of {longest:.0f} steps.",
         f"The effective sample size is at least {float(np.min(posterior.effective_samples)):.0f}; "
-        f"{posterior.acceptance:.0%} of the proposals were accepted.",
+        f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
+        *modes(posterior),
     ]
     if posterior.status:
         sentences.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
         sentences.append(
-            "The chain is too short (under 50 autocorrelation times, or these still change): "
+            "The chain is too short (under 50 autocorrelation times, or these still change), or walkers do not tell "
+            f"the same (R-hat above {MIXED:g}): "
             + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
         )
     return sentences

@@ -1,0 +1,37 @@
+"""What is said of a posterior with several modes, and of standard errors where a fit has several minima."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from fits.inference.fit_result import Fit
+    from fits.inference.posterior import Posterior
+
+SURE = 1.01
+"""R-hat above which walkers do not all tell the same yet."""
+
+
+def errors_of_one(fit: "Fit") -> list[str]:
+    """What standard errors are worth where several minima explain the data; nothing, where one does."""
+    count = len(fit.alternatives)
+    if not count:
+        return []
+    others = "Another minimum of the same stack explains" if count == 1 else f"{count} other minima explain"
+    return [
+        f"{others} the data equally well: standard errors are those of the best one alone, and sampling tells of all."
+    ]
+
+
+def modes(posterior: "Posterior") -> list[str]:
+    """Which modes the posterior has, and whether their shares are known; nothing, where one is known."""
+    if not posterior.modes:
+        return []
+    at = "; ".join(
+        f"{mode.share:.0%} at " + ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
+        for mode in posterior.modes
+    )
+    sentences = [f"The posterior has {len(posterior.modes)} modes: {at}. Estimates are of all of them together."]
+    if np.max(posterior.r_hat) > SURE:
+        sentences.append(f"R-hat above {SURE:g}: walkers seldom change between modes, whose shares are known roughly.")
+    return sentences
