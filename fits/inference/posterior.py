@@ -39,9 +39,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a posterior: the share of it, and the mean of the parameters there, by name."""
+    """A mode of a posterior: the share of it, its standard error as walkers scatter about it, and the mean of the
+    parameters there, by name."""
 
     share: float
+    error: float
     values: dict[str, float]
 
 
@@ -216,13 +218,14 @@ def _modes(fit: Fit, moves: dict[str, Any], positions: Floats, values: Floats) -
     if not Mixture.within(moves, MODES):
         return ()
     kept = slice(len(positions) // BURN_IN, None, max(1, len(positions) // LOOKED_AT))
-    positions, values = (part[kept].reshape(-1, part.shape[-1]) for part in (positions, values))
-    which = Mixture.from_arrays(moves, MODES).mode_of(positions)
-    found = [
-        Mode(float(np.mean(which == mode)), dict(zip(fit.problem.names, map(float, at), strict=True)))
-        for mode in np.unique(which)
-        for at in [values[which == mode].mean(axis=0)]
-    ]
+    positions, values = positions[kept], values[kept]
+    which = Mixture.from_arrays(moves, MODES).mode_of(positions.reshape(-1, positions.shape[-1]))
+    which = which.reshape(positions.shape[:2])
+    found = []
+    for mode in np.unique(which):
+        shares, at = np.mean(which == mode, axis=0), values[which == mode].mean(axis=0)
+        error = float(np.std(shares, ddof=1) / math.sqrt(len(shares)))
+        found.append(Mode(float(np.mean(shares)), error, dict(zip(fit.problem.names, map(float, at), strict=True))))
     return tuple(sorted(found, key=lambda mode: -mode.share))
 
 

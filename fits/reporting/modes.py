@@ -27,11 +27,13 @@ def modes(posterior: "Posterior") -> list[str]:
     """Which modes the posterior has, and whether their shares are known; nothing, where one is known."""
     if not posterior.modes:
         return []
-    at = "; ".join(
-        f"{mode.share:.0%} at " + ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
-        for mode in posterior.modes
-    )
-    sentences = [f"The posterior has {len(posterior.modes)} modes: {at}. Estimates are of all of them together."]
+    where = []
+    for mode in posterior.modes:
+        at = ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
+        where.append(f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at {at}")
+    sentences = [
+        f"The posterior has {len(posterior.modes)} modes: {'; '.join(where)}. Estimates are of all of them together."
+    ]
     if np.max(posterior.r_hat) > SURE:
-        sentences.append(f"R-hat above {SURE:g}: walkers seldom change between modes, whose shares are known roughly.")
+        sentences.append(f"R-hat is above {SURE:g}: walkers differ in how long they stay at each mode.")
     return sentences

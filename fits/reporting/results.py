@@ -250,7 +250,7 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "acceptance": posterior.acceptance,
         "status": posterior.status,
         "divergences": posterior.divergences,
-        "modes": [{"share": mode.share, "values": mode.values} for mode in posterior.modes],
+        "modes": [asdict(mode) for mode in posterior.modes],
         "parameters": [
             {
                 "name": name,

@@ -10,7 +10,6 @@ import numpy as np
 
 from fits.inference.limits import instrument_limits
 from fits.reporting.diagnostics import ResidualStructure
-from fits.reporting.modes import errors_of_one
 from fits.reporting.verdicts import identifiability
 
 if TYPE_CHECKING:
@@ -119,7 +118,7 @@ def parameter_table(fit: "Fit") -> Table:
         error = fit.standard_errors[name]
         number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
         rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
-    notes = errors_of_one(fit)
+    notes = ["Errors are those of the best minimum alone."] if fit.alternatives else []
     if not fit.is_posterior:
         notes.append("The objective is a named residual, not a likelihood: the errors are only indicative.")
     note = " ".join(notes)
