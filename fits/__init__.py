@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fits.inference.marginal_likelihood import Evidence as Evidence
     from fits.inference.marginal_likelihood import evidence as evidence
     from fits.inference.optimise import fit as fit
+    from fits.inference.posterior import Mode as Mode
     from fits.inference.posterior import Posterior as Posterior
     from fits.inference.predicting import predict as predict
     from fits.inference.prediction import Prediction as Prediction
@@ -106,6 +107,7 @@ _HOMES = {
     "LogUniform": "problem.parameters",
     "Normal": "problem.parameters",
     "Uniform": "problem.parameters",
+    "Mode": "inference.posterior",
     "Posterior": "inference.posterior",
     "Prediction": "inference.prediction",
     "Scores": "inference.prediction",

@@ -20,7 +20,7 @@ from fits.inference.design import Design, Kept, Walked
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.length import last_checks
-from fits.inference.mixture import Mixture
+from fits.inference.mixture import MODES, Mixture
 from fits.inference.surrogate import evaluate_many
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -47,6 +47,7 @@ class Ensemble:
     def decide(self, surrogate: bool, kept: Kept, progress: Progress | None) -> None:
         """Before the first step, and for all: whether proposals come from a surrogate, which is built if so."""
         moves: dict[str, Any] = {"surrogate": surrogate, "words": ""}
+        moves |= modes_of(self.initial)
         if surrogate:
             built = Design(self.problem, self.chain.shape[0], self.seed, kept, progress).build(self.initial)
             moves["words"] = built.words
@@ -55,6 +56,11 @@ class Ensemble:
         self.chain.decide(moves)
         self._read_moves()
         kept.remove()
+
+    @property
+    def has_modes(self) -> bool:
+        """Whether the posterior has several, between which walkers leap by the mixture of all."""
+        return bool(modes_of(self.initial))
 
     def _read_moves(self) -> None:
         walked = Walked.from_arrays(self.problem.model, self.chain.moves)
@@ -92,6 +98,12 @@ class Ensemble:
         generator = np.random.RandomState(self.seed)
         positions = first_positions(self.initial.draw, finite, self.chain.shape[0], generator)
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
+
+
+def modes_of(proposals: Proposals | None) -> dict[str, Any]:
+    """What a chain keeps of the modes of its posterior; nothing, where one is known."""
+    several = isinstance(proposals, Mixture) and proposals.mode_count > 1
+    return proposals.arrays(MODES) if isinstance(proposals, Mixture) and several else {}
 
 
 def adapted(chain: MemoryChain, initial: Proposals) -> Proposals:

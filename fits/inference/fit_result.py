@@ -68,6 +68,8 @@ class Fit:
         unresolved: the combinations of parameters that the data alone do not separate, worst first.
         minima: the minima that starts reached, best first.
         alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
+            `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
+            that hold a share of the posterior.
         without_influence: names of the parameters that the data say nothing about.
         settings: starts, seed and solver.
         ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".

@@ -1,6 +1,7 @@
 """Draws that are weighted so that they stand for the posterior of a fit, without a chain.
 
-They come from an approximation of the posterior: that of the fit, and where it will not do one along the fit's ridge.
+They come from an approximation of the posterior: that of the fit, and where it will not do one along the fit's ridge,
+or about all of its minima that hold a share of the posterior.
 How well they stand for it is told by the Pareto shape of the largest weights (Vehtari, Simpson, Gelman, Yao & Gabry
 2024, JMLR 25, 72). While weights are too uneven, a mixture is fitted to the draws as they are weighted, and drawn from
 too (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph. Stat. 13, 907); the draws of all approximations are weighted
@@ -16,6 +17,7 @@ from scipy.special import logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation
+from fits.inference.modes import other_minima
 from fits.problem.compiled import in_shares
 
 if TYPE_CHECKING:
@@ -86,11 +88,13 @@ def weighted(
 
     good: the shape that is enough.
     along_ridge: begin with a mixture along the fit's ridge, where it has one; that takes some hundred Jacobians. Else
-        it is asked for where the fit's own approximation will not do, nor what is like it.
+        it is asked for where the fit has minima that may be other modes, or its own approximation will not do, nor
+        what is like it.
     like: an approximation of a posterior that is like the fit's.
     """
     from fits.inference.mixture import Mixture
 
+    along_ridge = along_ridge or bool(other_minima(fit))  # one mode alone would be found good by itself
     ridge = Mixture.of(fit) if along_ridge else None
     pool = _Pool(fit, draws, generator)
     found = pool.add(ridge or Approximation.of(fit))

@@ -14,6 +14,7 @@ from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.inference.fit_result import Fit
 from fits.inference.importance import Weighted
+from fits.inference.modes import other_minima
 from fits.inference.optimise import refit
 from fits.inference.predicting import foretold
 from fits.problem.left_out import without
@@ -91,6 +92,7 @@ def leave_out(
     groups, data = require_groups(fit), fit.problem.data.used()
     like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
+    near = [fit.vector, *(np.array([one.values[name] for name in fit.problem.names]) for one in other_minima(fit))]
     done = {} if done is None else done
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
@@ -98,7 +100,7 @@ def leave_out(
         if name not in done:
             chosen = np.zeros(len(data), bool)
             chosen[rows] = True
-            found = refit(without(fit.problem, chosen), fit.vector)
+            found = refit(without(fit.problem, chosen), *near)
             seen = foretold(found, data, draws=draws, seed=seed, like=like).log_density(data.values)[rows]
             done[name] = seen, found.converged
         density[rows], good = done[name]

@@ -34,7 +34,7 @@ class Evidence:
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """The evidence of a fitted stack, with the priors that its parameters have within their bounds.
 
-    Of a posterior with several minima that of the best one, and of what lies near it.
+    Of a posterior with several modes that of all which the starts of the fit found.
 
     Args:
         fit: of a likelihood.

@@ -1,9 +1,9 @@
-"""The posterior along a ridge: a mixture of heavy-tailed densities in the box, to draw proposals from.
+"""The posterior along a ridge, or about several minima: a mixture of heavy-tailed densities in the box, to draw from.
 
 In the box, not in log-odds: there a posterior has no long tails towards its bounds. What is drawn outside is refused.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -17,8 +17,10 @@ from scipy.special import expit, logit, logsumexp
 
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import DEGREES_OF_FREEDOM, slope_at_bounds, student, student_draws, student_peak
+from fits.inference.modes import WITHIN, places
 from fits.inference.ridge import open_directions, ridge
 from fits.inference.uncertainty import local_information
+from fits.problem.problem import Problem
 
 LEAST_PART = 0.01  # of the squared length of an open direction
 LOOSE = 10.0  # in the log-posterior, a box
@@ -28,8 +30,10 @@ REFINEMENTS = 10
 MOST_SAMPLES = 4000
 OWN_SAMPLES = 2.0  # that a component counts as
 KEPT = 0.1  # of a mixture that is refined
-MIXTURE = "mixture_"
+MIXTURE, MODES = "mixture_", "modes_"  # how names of arrays begin: of proposals, and of where modes are
 COMPONENTS = 12  # of one that is fitted to samples
+APART = 3.0  # standard deviations: minima that are closer are one mode
+HALF_LOG = 0.5 * np.log(2.0 * np.pi)
 
 Floats = NDArray[np.float64]
 
@@ -39,29 +43,51 @@ class Mixture:
     """A density over the unconstrained vectors of a problem with P parameters: M Student-t densities in the box.
 
     centre: (M, P). root: (M, P, P), whose product with its transpose is a covariance. log_weight: (M,). held: (P,)
-    bool, at a bound: a component is folded over there, and the parameter independent of the others.
+    bool, at a bound: a component is folded over there, and the parameter independent of the others; none where there
+    are several modes. modes: (M,), to which of the modes of the posterior a component belongs, 0 the best minimum's.
     """
 
     centre: Floats
     root: Floats
     log_weight: Floats
     held: NDArray[np.bool_]
+    modes: NDArray[np.int64]
 
     @classmethod
     def of(cls, fit: Fit) -> "Mixture | None":
-        """The mixture about the points of a fit's ridge, as wide as the information there; None without a ridge."""
-        problem = fit.problem
-        optimum = np.asarray(problem.model.box.to_unit(jnp.asarray(fit.vector)), float)
-        held = np.isin(problem.names, fit.at_bound)
+        """The mixture about the points of a fit's ridge, and of those of its other minima that hold a share of the
+        posterior, as wide as the information there; None where there is one point alone."""
+        parts: list[Mixture] = []
+        for place in places(fit):
+            if any(part._holds(place.unit) for part in parts):
+                continue
+            parts.append(cls._about(fit.problem, place.unit, place.held))
+        # by Laplace's approximation; of what a bound holds it is half a density, and falls off otherwise
+        masses = [logsumexp(part.log_weight) - HALF_LOG * np.sum(part.held) for part in parts]
+        parts = [part for part, mass in zip(parts, masses, strict=True) if mass > max(masses) - WITHIN]
+        if len(parts) == 1:
+            (only,) = parts
+            return None if len(only.centre) == 1 else only._normalised()
+        weights = [part.log_weight - HALF_LOG * np.sum(part.held) for part in parts]
+        return cls(
+            np.concatenate([part.centre for part in parts]),
+            np.concatenate([part.root for part in parts]),
+            np.concatenate(weights),
+            np.zeros(len(fit.problem.names), bool),
+            np.repeat(np.arange(len(parts)), [len(part.centre) for part in parts]),
+        )._normalised()
+
+    @classmethod
+    def _about(cls, problem: Problem, optimum: Floats, held: NDArray[np.bool_]) -> "Mixture":
+        """The mixture about the points of the ridge of a minimum, its weights those of the posterior but for a factor
+        that all minima have in common."""
         slope = slope_at_bounds(problem, optimum, held)
         # what is hardly pressed against its bound, and open with others, lies along the ridge
         if held.any():
             part = np.sum(open_directions(local_information(problem, optimum)[0]) ** 2, axis=0)
-            held &= (part < LEAST_PART) | (slope > LOOSE)
+            held = held & ((part < LEAST_PART) | (slope > LOOSE))
         found = ridge(problem, optimum, ~held)
         count = len(found.points)
-        if count == 1:
-            return None
         reach = np.clip(1.0 / np.maximum(slope, SMALLEST_REACH), SMALLEST_REACH, WIDEST_REACH)
         data = np.where(held, 0.0, found.rows)
         at_bound, wide = np.diag(1.0 / reach)[held], np.eye(len(held)) / WIDEST_REACH
@@ -69,7 +95,24 @@ class Mixture:
         _, values, directions = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
         root = np.swapaxes(directions, 1, 2) / values[:, None]
         log_weight = found.height + np.linalg.slogdet(root)[1]
-        return cls(found.points, root, log_weight - logsumexp(log_weight), held)
+        return cls(found.points, root, log_weight, held, np.zeros(count, int))
+
+    @property
+    def mode_count(self) -> int:
+        """How many modes the posterior has, as far as it is known."""
+        return int(self.modes.max()) + 1
+
+    def mode_of(self, positions: Floats) -> NDArray[np.int64]:
+        """Which mode each of unconstrained `positions` (count, P) belongs to, (count,)."""
+        return self.modes[np.argmax(self._log_parts(expit(positions)), axis=0)]
+
+    def _holds(self, unit: Floats) -> bool:
+        """Whether a point (P,) of the box lies so close to a component that it is no mode of its own."""
+        away = np.linalg.solve(self.root, (unit - self.centre)[..., None])[..., 0]
+        return bool(np.min(np.linalg.norm(away, axis=1)) < APART)
+
+    def _normalised(self) -> "Mixture":
+        return replace(self, log_weight=self.log_weight - logsumexp(self.log_weight))
 
     @classmethod
     def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
@@ -82,21 +125,25 @@ class Mixture:
         within = _root(np.atleast_2d(np.cov((white - centres[nearest]).T)))
         log_weight = np.full(len(centres), -np.log(len(centres)))
         roots = np.tile(root @ within, (len(centres), 1, 1))
-        return cls(centres @ root.T, roots, log_weight, np.zeros(white.shape[1], bool)).refined(positions)
+        dimension = white.shape[1]
+        mixture = cls(centres @ root.T, roots, log_weight, np.zeros(dimension, bool), np.zeros(len(centres), int))
+        return mixture.refined(positions)
 
-    def arrays(self) -> dict[str, Any]:
+    def arrays(self, prefix: str = MIXTURE) -> dict[str, Any]:
         """What `from_arrays` makes it of, named apart from what else a chain keeps of its moves."""
-        return {f"{MIXTURE}{field.name}": getattr(self, field.name) for field in fields(self)}
+        return {f"{prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
 
     @classmethod
-    def within(cls, arrays: dict[str, Any]) -> bool:
+    def within(cls, arrays: dict[str, Any], prefix: str = MIXTURE) -> bool:
         """Whether a mixture's `arrays` are among these."""
-        return f"{MIXTURE}centre" in arrays
+        return f"{prefix}centre" in arrays
 
     @classmethod
-    def from_arrays(cls, arrays: dict[str, Any]) -> "Mixture":
+    def from_arrays(cls, arrays: dict[str, Any], prefix: str = MIXTURE) -> "Mixture":
         """The mixture of these `arrays`."""
-        return cls(*(np.asarray(arrays[f"{MIXTURE}{field.name}"]) for field in fields(cls)))
+        # of a chain that was begun before there were several modes
+        one = {f"{prefix}modes": np.zeros(len(arrays[f"{prefix}log_weight"]), int)}
+        return cls(*(np.asarray((one | arrays)[f"{prefix}{field.name}"]) for field in fields(cls)))
 
     def leaps(self) -> "Leaps":
         """The mixture in JAX; none of its parameters is held at a bound."""
@@ -127,10 +174,10 @@ class Mixture:
             covariance = (scatter + own * prior) / (count + own)[:, None, None]
             covariance *= np.where(self.held[:, None] | self.held, np.eye(dimension), 1.0)
             log_weight = np.log((count + 1.0) / (count + 1.0).sum())
-            now = Mixture(centre, _root(covariance), log_weight, self.held)
+            now = Mixture(centre, _root(covariance), log_weight, self.held, self.modes)
         centres, roots = np.concatenate([now.centre, self.centre]), np.concatenate([now.root, self.root])
         weights = np.concatenate([np.log1p(-KEPT) + now.log_weight, np.log(KEPT) + self.log_weight])
-        return Mixture(centres, roots, weights, self.held)
+        return Mixture(centres, roots, weights, self.held, np.concatenate([self.modes, self.modes]))
 
     def mean_log_density(self, positions: Floats) -> float:
         """Mean log-density over samples of the posterior: the higher, the closer the mixture is to it."""

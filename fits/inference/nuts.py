@@ -1,10 +1,11 @@
 """A few chains of the No-U-Turn sampler (Hoffman and Gelman 2014) by blackjax: for many parameters.
 
 Its metric is the covariance of the fit's approximation, which whitens the posterior, refined once in the warm-up; the
-length of its steps is found by dual averaging. Where the fit lies on a ridge, every step begins with a draw of the
-ridge's mixture, which is taken by the rule of Metropolis and Hastings: trajectories alone seldom find the way into a
-thin tail. The metric is then made of the higher half of the samples: one as wide as the tail makes steps short
-everywhere. blackjax is an extra, and imported on first use.
+length of its steps is found by dual averaging. Where the fit lies on a ridge, or has other minima that hold a share of
+the posterior, every step begins with a draw of their mixture, which is taken by the rule of Metropolis and Hastings:
+trajectories alone seldom find the way into a thin tail, and never to another mode. The metric is then made of the
+higher half of the samples: one as wide as the tail makes steps short everywhere. blackjax is an extra, and imported on
+first use.
 """
 
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.inference.chain import MemoryChain
-from fits.inference.ensemble import log_posteriors
+from fits.inference.ensemble import log_posteriors, modes_of
 from fits.inference.fit_result import Fit
 from fits.inference.laplace import Approximation, first_positions
 from fits.inference.mixture import Leaps, Mixture
@@ -60,6 +61,7 @@ class Nuts:
         if mixture is not None and mixture.held.any():  # its leaps know no bounds
             mixture = None
         leaps = None if mixture is None else mixture.leaps()
+        modes = modes_of(mixture)
         metric, length, done = np.atleast_2d(np.cov(near.draw(generator, DRAWS).T)), FIRST_STEP, 0
         for steps in WARM_UP:
             begin, update, end = _dual_averaging(TARGET)
@@ -77,11 +79,12 @@ class Nuts:
             length = float(end(state))
             if done < sum(WARM_UP):
                 settled, level = np.concatenate(visited[SETTLING:]), np.concatenate(heights[SETTLING:])
-                metric = _refined(metric, settled if leaps is None else settled[level >= np.median(level)])
+                settled = settled if leaps is None else settled[level >= np.median(level)]
+                metric = _refined(metric, settled if not modes or mixture is None else _centred(mixture, settled))
             elif mixture is not None:
                 mixture = mixture.refined(np.concatenate(visited))
         moves = {"sampler": "nuts", "positions": positions, "metric": metric, "length": length, "words": ""}
-        self.chain.decide(moves | ({} if mixture is None else mixture.arrays()))
+        self.chain.decide(moves | modes | ({} if mixture is None else mixture.arrays()))
 
     def advance(self, step: int, tell: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""
@@ -126,6 +129,13 @@ def _refined(metric: Floats, samples: Floats) -> Floats:
     """The covariance of samples (n, P), of which correlated ones are few, with what was known before."""
     own = OWN_SAMPLES + samples.shape[1]
     return (len(samples) * np.atleast_2d(np.cov(samples.T)) + own * metric) / (len(samples) + own)
+
+
+def _centred(mixture: Mixture, samples: Floats) -> Floats:
+    """Samples (n, P) about the mean of the mode that each belongs to: a metric as wide as modes lie apart fits none."""
+    modes = mixture.mode_of(samples)
+    means = np.stack([samples[modes == mode].mean(axis=0) for mode in np.unique(modes)])
+    return samples - means[np.searchsorted(np.unique(modes), modes)]
 
 
 def _step(

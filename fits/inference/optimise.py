@@ -159,11 +159,11 @@ def fit_again(
     return _found(shared, places, solver, report, checkpoint, settings, without, refine)
 
 
-def refit(problem: Problem, vector: Floats) -> Fit:
-    """The fit of a problem whose optimum is near this vector (P,), roughly, at the resolution that the problem has."""
-    end = rough_end(problem, unit_of(problem, vector), fresh=False)
-    best = optimum(problem, [end], "least_squares", check=False, promise=ROUGHLY)
-    return _fit_of(best, None, {"starts": 1}, {})
+def refit(problem: Problem, *vectors: Floats) -> Fit:
+    """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
+    ends = [rough_end(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
+    best = optimum(problem, ends, "least_squares", check=False, promise=ROUGHLY)
+    return _fit_of(best, None, {"starts": len(ends)}, {})
 
 
 def again(checkpoint: str | Path) -> Path:
@@ -310,6 +310,8 @@ def _status(fit: Fit) -> list[str]:
         words.append(f"without influence on the data: {', '.join(fit.without_influence)}")
     if fit.unresolved:
         words.append(f"the data leave {len(fit.unresolved)} direction(s) unresolved")
+    if fit.alternatives:
+        words.append(f"the errors are of this minimum alone, and {len(fit.alternatives)} more explain the data as well")
     if not fit.is_posterior:
         words.append(
             f"objective {fit.problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from fits._lazy import shown_by
 from fits.inference.chain import MemoryChain
 from fits.inference.fit_result import Fit
-from fits.inference.length import BURN_IN, LONG_ENOUGH, STEADY, autocorrelation_times, long_enough
+from fits.inference.length import (
+    BURN_IN,
+    LONG_ENOUGH,
+    MIXED,
+    STEADY,
+    autocorrelation_times,
+    long_enough,
+    r_hat,
+)
+from fits.inference.mixture import MODES, Mixture
 from fits.problem.logarithm import logarithm
 from fits.problem.model import Model
 from layerjax._checks import require_kind
@@ -24,8 +33,20 @@ if TYPE_CHECKING:
     from arviz import InferenceData
 
 REPORTED_DRAWS = 2048
+LOOKED_AT = 1000
+"""Steps of a chain by which shares of modes are told."""
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a posterior: the share of it, its standard error as walkers scatter about it, and the mean of the
+    parameters there, by name."""
+
+    share: float
+    error: float
+    values: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +59,12 @@ class Posterior:
         autocorrelation_time: (P,), in steps, of the chain without its first tenth.
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
         converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
-            changed by less than 5 % since the last check.
+            changed by less than 5 % since the last check, and R-hat is below 1.05.
         allow_short: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
         divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
+        modes: where the fit knows several minima that hold a share of the posterior: these, the largest share first.
+            Estimates are of all of them together. Empty where one is known.
     """
 
     fit: Fit
@@ -53,11 +76,13 @@ class Posterior:
     allow_short: bool = False
     status: str = ""
     divergences: int = 0
+    modes: tuple[Mode, ...] = ()
 
     def __repr__(self) -> str:
         steps, walkers = self.chain.shape[:2]
-        ended = "converged" if self.converged else "too short"
-        return f"<Posterior of {', '.join(self.names)}: {steps} steps of {walkers} walkers, {ended}>"
+        ended = "converged" if self.converged else "not converged"
+        modes = f", {len(self.modes)} modes" if self.modes else ""
+        return f"<Posterior of {', '.join(self.names)}: {steps} steps of {walkers} walkers, {ended}{modes}>"
 
     def _repr_html_(self) -> str:
         return str(shown_by("fits.reporting.notebook:posterior_fragment", self))
@@ -66,7 +91,12 @@ class Posterior:
         """What the posterior of a `Joint` says of one measurement. ValueError for a name that none has."""
         fit = self.fit.part(name)
         own = list(self.fit.problem.places(name))
-        return replace(self, fit=fit, chain=self.chain[..., own], autocorrelation_time=self.autocorrelation_time[own])
+        whole = {plain: self.names[place] for plain, place in zip(fit.problem.names, own, strict=True)}
+        modes = tuple(
+            replace(mode, values={plain: mode.values[name] for plain, name in whole.items()}) for mode in self.modes
+        )
+        time = self.autocorrelation_time[own]
+        return replace(self, fit=fit, chain=self.chain[..., own], autocorrelation_time=time, modes=modes)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,6 +118,12 @@ class Posterior:
     def effective_samples(self) -> Floats:
         """Effective number of independent samples of each parameter, (P,)."""
         return (len(self.chain) - self.burn_in) * self.chain.shape[1] / self.autocorrelation_time
+
+    @cached_property
+    def r_hat(self) -> Floats:
+        """Rank-normalised split R-hat of each parameter, (P,): 1 where all walkers tell the same, above 1.01 where some
+        do not yet, or stay in modes of their own."""
+        return r_hat(self.chain)
 
     @cached_property
     def samples(self) -> Floats:
@@ -148,14 +184,16 @@ class Posterior:
         raise ValueError(
             f"the chain of {len(self.chain)} steps is too short to report from: its longest autocorrelation time is "
             f"{np.max(self.autocorrelation_time):.0f} steps, and {LONG_ENOUGH:.0f} of them after burn-in are needed, "
-            f"steady to {STEADY:.0%}; sample again with the same path and a larger max_steps to go on, or with "
-            "allow_short=True"
+            f"steady to {STEADY:.0%}, with R-hat below {MIXED:g} (it is {np.max(self.r_hat):.3g}); sample again with "
+            "the same path and a larger max_steps to go on, or with allow_short=True"
         )
 
 
 def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Posterior:
     """What a chain of a fit's posterior says."""
     positions, moves = chain.get_chain(), chain.moves
+    count = positions.shape[-1]
+    values = np.asarray(fit.problem.call(_constrained, positions.reshape(-1, count))).reshape(positions.shape)
     taken = float(np.mean(chain.accepted) / chain.iteration)
     divergences, words = 0, str(moves.get("words", ""))
     if moves.get("sampler") == "nuts":
@@ -165,9 +203,7 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
         words += ", near which it may have missed a part of the posterior" if divergences else ""
     return Posterior(
         fit=fit,
-        chain=np.asarray(fit.problem.call(_constrained, positions.reshape(-1, positions.shape[-1]))).reshape(
-            positions.shape
-        ),
+        chain=values,
         log_probability=chain.get_log_prob(),
         autocorrelation_time=autocorrelation_times(chain, len(positions)),
         acceptance=taken,
@@ -175,7 +211,24 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
         allow_short=allow_short,
         status=words,
         divergences=divergences,
+        modes=_modes(fit, moves, positions, values),
     )
+
+
+def _modes(fit: Fit, moves: dict[str, Any], positions: Floats, values: Floats) -> tuple[Mode, ...]:
+    """Where the samples are, if the chain was begun with several modes: positions and values (steps, walkers, P)."""
+    if not Mixture.within(moves, MODES):
+        return ()
+    kept = slice(len(positions) // BURN_IN, None, max(1, len(positions) // LOOKED_AT))
+    positions, values = positions[kept], values[kept]
+    which = Mixture.from_arrays(moves, MODES).mode_of(positions.reshape(-1, positions.shape[-1]))
+    which = which.reshape(positions.shape[:2])
+    found = []
+    for mode in np.unique(which):
+        shares, at = np.mean(which == mode, axis=0), values[which == mode].mean(axis=0)
+        error = float(np.std(shares, ddof=1) / math.sqrt(len(shares)))
+        found.append(Mode(float(np.mean(shares)), error, dict(zip(fit.problem.names, map(float, at), strict=True))))
+    return tuple(sorted(found, key=lambda mode: -mode.share))
 
 
 def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Array, Array]:

@@ -55,7 +55,7 @@ def sample(
         surrogate: whether most proposals come from a polynomial surrogate of the model, each of which takes one exact
             evaluation and is nearly independent of the last (delayed acceptance); the posterior is the same. A
             surrogate that does not hold is left out, which `status` of the result says. None: where one evaluation
-            takes more than about 200 microseconds, by the clock; the chain remembers it. Of emcee alone.
+            takes more than about 200 microseconds, by the clock, and one mode is known. Of emcee alone.
         ess: effective samples of the worst parameter that are asked for, above 0: sampling goes on until the chain has
             them, and is 50 autocorrelation times long. None asks for the latter alone. A chain may be gone on with for
             more of them.
@@ -161,8 +161,8 @@ def _decide(
         if surrogate not in (None, bool(chain.moves.get("surrogate", False))):
             raise ValueError(another(path or "memory", "surrogate"))
         return
-    if surrogate is None:
-        surrogate = is_costly(sampler.problem, _fixed_points(sampler.problem))
+    if surrogate is None:  # a polynomial about several modes holds at none
+        surrogate = not sampler.has_modes and is_costly(sampler.problem, _fixed_points(sampler.problem))
     rounds = None if path is None else beside(Path(path), SURROGATE)
     sampler.decide(surrogate, Kept(rounds, identity), progress)
 

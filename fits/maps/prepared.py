@@ -238,6 +238,7 @@ def save(prepared: Prepared, root: "zarr.Group") -> None:
             "arrays": list(arrays),
             "noise": [_plain(problem.noise.relative), _plain(problem.noise.floor)],
             "transport": _transport(problem.transport),
+            "rings": None if problem.instrument is None else problem.instrument.rings,
             "expected": starts.expected,
             "highest": None if table is None else table.highest,
             "numerical_error": prepared.numerical_error,
@@ -270,6 +271,8 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     }
     if about["transport"] is not None:
         rest["transport"] = transport_from_dict(about["transport"])
+    if rest.get("instrument") is not None:
+        rest["instrument"] = replace(rest["instrument"], rings=about.get("rings"))
     values = array["values"]
     channels, used = channel_names(values.shape[1]), np.ones(len(values), bool)
     data = Measurements(array["wi"], array["wo"], values, array.get("sigma"), used, channels)

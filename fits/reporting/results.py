@@ -256,12 +256,14 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "acceptance": posterior.acceptance,
         "status": posterior.status,
         "divergences": posterior.divergences,
+        "modes": [asdict(mode) for mode in posterior.modes],
         "parameters": [
             {
                 "name": name,
                 **dict(zip(("median", "low_68", "high_68", "mean", "sd"), estimates, strict=True)),
                 "autocorrelation_time": posterior.autocorrelation_time[index],
                 "effective_samples": posterior.effective_samples[index],
+                "r_hat": posterior.r_hat[index],
             }
             for index, (name, estimates) in enumerate(posterior.summary().items())
         ],

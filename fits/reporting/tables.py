@@ -118,11 +118,10 @@ def parameter_table(fit: "Fit") -> Table:
         error = fit.standard_errors[name]
         number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
         rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
-    note = (
-        ""
-        if fit.is_posterior
-        else "The objective is a named residual, not a likelihood: the errors are only indicative."
-    )
+    notes = ["Errors are those of the best minimum alone."] if fit.alternatives else []
+    if not fit.is_posterior:
+        notes.append("The objective is a named residual, not a likelihood: the errors are only indicative.")
+    note = " ".join(notes)
     return Table(
         "Fitted parameters", ("parameter", "value", "error", "unit", "bounds", "identified"), tuple(rows), note
     )
@@ -189,7 +188,8 @@ def posterior_table(posterior: "Posterior") -> Table:
         unit = posterior.fit.units[name]
         rows.append((name, *words, f"{deviation:.2g}", unit, f"{time[index]:.0f}", f"{effective[index]:.0f}"))
     columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "unit", "autocorr. steps", "effective samples")
-    return Table("Posterior", columns, tuple(rows))
+    note = f"Of all {len(posterior.modes)} modes together." if posterior.modes else ""
+    return Table("Posterior", columns, tuple(rows), note)
 
 
 def incidence_table(structure: ResidualStructure) -> Table:

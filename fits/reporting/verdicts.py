@@ -9,6 +9,7 @@ import numpy as np
 
 from fits.inference.fit_result import ENDED
 from fits.inference.identifiability import OPEN_BEYOND, UNRESOLVED_BEYOND, Combination
+from fits.inference.length import MIXED
 from fits.inference.limits import instrument_limits, limited_with
 from fits.inference.resolution import ENOUGH
 from fits.reporting.agreement import (
@@ -22,6 +23,7 @@ from fits.reporting.agreement import (
     without_discrepancy,
 )
 from fits.reporting.diagnostics import ResidualStructure
+from fits.reporting.modes import errors_of_one, modes
 
 if TYPE_CHECKING:
     from fits.inference.fit_result import Fit
@@ -98,8 +100,8 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         sentences.append(f"Without influence on the data: {', '.join(fit.without_influence)}.")
     for combination in fit.unresolved[:1]:
         sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
-    if fit.alternatives and not undescribed:
-        sentences.append("Another local minimum of the same model fits equally well.")
+    if not undescribed:
+        sentences += errors_of_one(fit)
     if undescribed or sentences:
         return [*undescribed, *close, *notes, *sentences], False
     return [
@@ -230,28 +232,26 @@ def minima(fit: "Fit") -> list[str]:
     sentences = [f"{best.count} of {starts} reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
         sentences.append("Only one start found it: more starts may find a better one.")
-    if fit.alternatives and describes(fit):
-        sentences.append(
-            f"Other local minima of the same model that fit equally well: {len(fit.alternatives)} (same chi-square)."
-        )
-    return sentences
+    return [*sentences, *errors_of_one(fit)] if describes(fit) else sentences
 
 
 def sampled(posterior: "Posterior") -> list[str]:
     """How long the chain is, and whether that is long enough for its estimates to mean anything."""
     steps, walkers = posterior.chain.shape[:2]
-    longest = float(np.max(posterior.autocorrelation_time))
+    longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
     sentences = [
         f"{walkers} walkers made {steps} steps; the first {posterior.burn_in} are left out, and the rest is "
         f"{(steps - posterior.burn_in) / longest:.0f} times the longest autocorrelation time of {longest:.0f} steps.",
         f"The effective sample size is at least {float(np.min(posterior.effective_samples)):.0f}; "
-        f"{posterior.acceptance:.0%} of the proposals were accepted.",
+        f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
+        *modes(posterior),
     ]
     if posterior.status:
         sentences.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
         sentences.append(
-            "The chain is too short (under 50 autocorrelation times, or these still change): "
+            "The chain is too short (under 50 autocorrelation times, or these still change), or walkers do not tell "
+            f"the same (R-hat above {MIXED:g}): "
             + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
         )
     return sentences

@@ -41,6 +41,7 @@ def corner_picture(posterior: "Posterior") -> Figure:
             max_n_ticks=3,
             labelpad=0.1,
             fig=figure,
+            quiet=bool(posterior.modes),  # of modes narrower than a bin there are no contours
         )
     return figure
 

@@ -323,6 +323,9 @@ def test_an_instrument_stands_between_map_and_readings(tmp_path, geometry, value
     for name in found.names:
         assert abs(found.values[name][0, 2] - one.values[name]) < 2e-3 * one.standard_errors[name]
         assert found.errors[name][0, 2] == pytest.approx(one.standard_errors[name], rel=1e-3)
+    kept = zarr.open_group(tmp_path / "seen.zarr", mode="r")["pilot"].attrs["rings"]
+    assert kept == one.problem.instrument.rings == 1
+    assert found.numerical_error is not None
     shared = fits.Instrument(offset=fits.Free(0.0, -1.0, 1.0, shared=True))
     with pytest.raises(ValueError, match=r"instrument\.offset is shared"):
         fitted(tmp_path / "none.zarr", geometry, values, instrument=shared)
