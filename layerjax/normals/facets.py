@@ -19,7 +19,7 @@ from layerjax.directions import Vector, dot
 from layerjax.normals import vmf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_masking, ggx_sample
 from layerjax.normals.sggx import radii
-from layerjax.quadrature import Nodes, flake_rule, gauss_legendre, panels
+from layerjax.quadrature import Nodes, flake_rule, panels
 
 Distribution = Literal["ggx", "vmf"]
 """Normals of Walter et al. 2007, or von Mises-Fisher normals with kappa = 2 / alpha^2 (Guo et al. 2015)."""
@@ -102,36 +102,6 @@ def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> No
     if distribution == "ggx":
         return flake_rule(wi, *radii("surface", alpha), None, nodes)[0]
     return _mirror_rule(wi, vmf.concentration(alpha), nodes)
-
-
-def seen_normals(wi: Vector, alpha: Array, polar: int, azimuths: int) -> tuple[Vector, Array]:
-    """vMF normals that wi sees, wi in the plane of x and z: on one side of it (the other is its mirror image).
-
-    Args:
-        wi: shape (n, 1) a component, x <= 0.
-        polar, azimuths: number of polar angles, and of azimuths at each.
-
-    Returns:
-        Normals (n, polar * azimuths) a component, and weights that add up to the integral of D <wi, m> G1(wi) / cos.
-    """
-    kappa = vmf.concentration(alpha)
-    x, w = (jnp.asarray(array, wi[2].dtype) for array in gauss_legendre(polar))
-    end = safe_sqrt(at_most(kappa, TAIL * TAIL))
-    t = end * x
-    drop = t * t / kappa
-    sine, cosine = safe_sqrt(drop * (2.0 - drop)), 1.0 - drop
-    share = 2.0 * t * jnp.exp(-t * t) * end * w / -jnp.expm1(-kappa)
-    planar = safe_sqrt(wi[0] * wi[0])
-    _, rim = _azimuths(wi[2] * cosine, planar * sine)
-    middle = (jnp.arange(azimuths, dtype=t.dtype) + 0.5) / azimuths
-    phi = rim[..., None] * middle
-    z = cosine[:, None] * jnp.ones_like(phi)
-    m = (-sine[:, None] * jnp.cos(phi), sine[:, None] * jnp.sin(phi), z)
-    weight = share[:, None] * rim[..., None] * jnp.ones_like(middle) / (jnp.pi * azimuths)
-    flat = tuple(part.reshape(phi.shape[0], -1) for part in (*m, weight))
-    normals = (flat[0], flat[1], flat[2])
-    level = vmf.upper_share(kappa) * vmf.masking_over_cosine(wi[2], kappa) / vmf.hemisphere_norm(kappa)
-    return normals, flat[3] * at_least(dot(wi, normals), 0.0) * level
 
 
 def _plane(wi: Vector) -> tuple[Array, Array, Array]:

@@ -16,15 +16,15 @@ from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
 from layerjax.normals import facets
+from layerjax.normals.facet_rule import Parallels, Way, parallels, polar_angles, seen_facets
 from layerjax.quadrature import gauss_legendre
-from layerjax.transport.adding_doubling.facet_rule import Parallels, Way, parallels, polar_angles, seen_facets
 from layerjax.transport.adding_doubling.grid import Grid, Region
 
 ENERGY_POINTS = (12, 8)
 """Points a panel, and in azimuth, of the quadrature of energies."""
 
 LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
-"""Points of the dense quadrature of visible normals in either direction, at least (see `_visible_normals`): of a single
+"""Points of the dense quadrature of visible normals in either direction, at least (`refracted_densely`): of a single
 interface, and where there are several, between which light goes on."""
 
 
@@ -65,21 +65,16 @@ def of_facets(
     function: Callable[..., Any], region: Region, normals: Normals, ratio: Array, way: Way, points: tuple[int, int]
 ) -> Any:
     """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `seen_facets`."""
-    alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
+    alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
 
     def seen(rows: tuple[Array, ...]) -> Any:
         cosine, sine, *at = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
-        if normals.distribution == "vmf":
-            m, weight = facets.seen_normals(wi, alpha, 2 * points[0], 2 * points[1])
-            return function(m, dot(wi, m), weight, wi)
-        return function(*seen_facets(cosine, sine, Parallels(*at), alpha, points[1]), wi)
+        return function(*seen_facets(cosine, sine, Parallels(*at), alpha, kind, points[1]), wi)
 
-    if normals.distribution == "vmf":
-        return by_rows(seen, (region.cosine, region.sine))
-    polar = polar_angles(region.cosine, region.sine, alpha, ratio, way, points[0])
+    polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, way, points[0])
     # outside of the loop: kept in memory, not computed again for each of the facets' numbers
-    at = parallels(region.cosine, region.sine, polar, alpha, way)
+    at = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, way)
     return by_rows(seen, (region.cosine, region.sine, *at))
 
 
@@ -100,8 +95,12 @@ def _through(
 
 def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, modes: int) -> tuple[Vector, Array]:
     """Of light from every near node, by facets: where to and how much is refracted."""
-    m, weight, wi = _visible_normals(grid, near, normals, modes)
-    return _through(wi, m, dot(wi, m), weight, far.ior / near.ior, normals)
+    ratio = far.ior / near.ior
+    if normals.distribution == "vmf":
+        points = max(ENERGY_POINTS[0], polar_count(grid) // 2), azimuth_count(grid, modes)
+        return refracted_rays(near, ratio, normals, points)
+    m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
+    return _through(wi, m, dot(wi, m), weight, ratio, normals)
 
 
 def polar_count(grid: Grid) -> int:
@@ -109,23 +108,26 @@ def polar_count(grid: Grid) -> int:
     return max(_least(grid), 3 * grid.nodes // 2)
 
 
+def azimuth_count(grid: Grid, modes: int) -> int:
+    """Azimuths at each of them."""
+    return max(_least(grid), 3 * modes // 4)
+
+
 def _least(grid: Grid) -> int:
     return LEAST_OF_SEVERAL if grid.interfaces > 1 else LEAST_FACETS
 
 
-def _visible_normals(grid: Grid, region: Region, normals: Normals, modes: int) -> tuple[Vector, Array, Vector]:
-    """Normals visible from every node, (nodes, points), their weights, and the nodes' wi.
+def _ggx_normals(grid: Grid, region: Region, width: Array, modes: int) -> tuple[Vector, Array, Vector]:
+    """GGX normals visible from every node, (nodes, points), their weights, and the nodes' wi.
 
-    Of GGX a spherical cap, stretched: the cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over
-    half a turn (the other half is its mirror image). Denser than what it is put on: light that goes straight through
+    A spherical cap, stretched: the cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over half a
+    turn (the other half is its mirror image). Denser than what it is put on: light that goes straight through
     two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
     from pole to rim.
     """
-    polar_facets, azimuth_facets = polar_count(grid), max(_least(grid), 3 * modes // 4)
-    alpha = jnp.asarray(normals.alpha, region.cosine.dtype)
+    polar_facets, azimuth_facets = polar_count(grid), azimuth_count(grid, modes)
+    alpha = jnp.asarray(width, region.cosine.dtype)
     wi: Vector = (-region.sine[:, None], jnp.zeros_like(region.sine[:, None]), region.cosine[:, None])
-    if normals.distribution == "vmf":
-        return *facets.seen_normals(wi, alpha, polar_facets, azimuth_facets), wi
     v = normalize((alpha * wi[0], alpha * wi[1], wi[2]))
     s, w = (jnp.asarray(array, alpha.dtype) for array in gauss_legendre(polar_facets))
     rim = jnp.arctan2(safe_sqrt(v[0] * v[0]), -v[2])  # cosine -v_z

@@ -34,7 +34,7 @@ from layerjax.transport.adding_doubling.sampling import cosines, modes_at_nodes,
 STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
 
-LEAST_POINTS = (12, 6)
+LEAST_POINTS = {"ggx": (12, 6), "vmf": (12, 8)}
 """Points a panel, and in azimuth, of light let in along few directions, at least (see `seen_facets`)."""
 
 AT_ONCE = 1 << 20
@@ -142,7 +142,8 @@ def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes:
     directions outside is needed."""
     ratio = inner.ior / asked.ior
     if diffuse:  # only smooth functions are summed over what is let in
-        points = max(LEAST_POINTS[0], grid.nodes), max(LEAST_POINTS[1], modes // 2)
+        least = LEAST_POINTS[normals.distribution]
+        points = max(least[0], grid.nodes), max(least[1], modes // 2)
         rays = refracted_rays(asked, ratio, normals, points)
     else:
         rays = refracted_densely(grid, asked, inner, normals, modes)

@@ -15,8 +15,9 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import at_most, safe_sqrt
 from layerjax.channels import Channels, mean, total
-from layerjax.directions import Vector, dot, flip, half_vector, is_above, reflect, refract, sanitised, select
+from layerjax.directions import Vector, flip, half_vector, is_above, reflect, refract, sanitised, select
 from layerjax.normals import facets
+from layerjax.normals.facet_rule import parallels, polar_angles, seen_facets
 from layerjax.quadrature import Nodes
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.surfaces.lambertian import sample_cosine
@@ -219,10 +220,12 @@ def _rules(coat: Coat, lobes: list[Proposal], wi: Vector, nodes: int) -> Nodes:
 
 def _refracted_energy(top: UpperSide, options: Options, wi: Vector, nodes: int) -> Array:
     """Energy through one interface, over the facets that wi sees."""
-    planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])
-    flat: Vector = (-planar.reshape(1, 1), jnp.zeros((1, 1), planar.dtype), wi[2].reshape(1, 1))
-    m, weight = facets.seen_normals(flat, width(top.kappa), nodes, 2 * nodes)
-    cosine = dot(flat, m)
+    planar, upright = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1]).reshape(1), wi[2].reshape(1)
+    flat: Vector = (-planar[:, None], jnp.zeros((1, 1), planar.dtype), upright[:, None])
+    alpha = width(top.kappa)
+    polar = polar_angles(upright, planar, alpha, "vmf", top.ior, "refracted", nodes)
+    at = parallels(upright, planar, polar, alpha, "vmf", top.ior, "refracted")
+    m, cosine, weight = seen_facets(upright, planar, at, alpha, "vmf", nodes)
     wo, exists = refract(flat, m, top.ior)
     passes = exists & is_above(flip(wo))
     share = (1.0 - fresnel.dielectric(cosine, top.ior)) * masked(sanitised(flip(wo)), top.kappa, options.masking)
