@@ -64,6 +64,7 @@ def make_tables(
     azimuths: int | None,
     opaque: bool,
     interaction_probability: Callable[[Vector], Channels | None],
+    onward_probability: Callable[[Vector], Channels | None] | None,
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -74,6 +75,7 @@ def make_tables(
         azimuths: ordinates in azimuth; None: Fourier modes.
         opaque: only light from above, and what is reflected.
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
+        onward_probability: of what does, that the layers have it as passing untouched (None: 0).
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
@@ -85,9 +87,11 @@ def make_tables(
         lit.append((bottom, whole.reflect_bottom, whole.transmit_up, -1.0))
     near, far = [], []
     for end, reflect, transmit, side in lit:
-        share = interaction_probability(_node_directions(end.region, azimuths, side))
-        near.append(_energy(reflect.total, share, end))
-        far.append(_energy(transmit.total, share, end))
+        directions = _node_directions(end.region, azimuths, side)
+        share = interaction_probability(directions)
+        onward = None if onward_probability is None else onward_probability(directions)
+        near.append(_energy(reflect.total, None, share, end))
+        far.append(_energy(transmit.total, onward, share, end))
     shape = (max(row.shape[0] for row in near + far), near[0].shape[-1])
     near, far = ([jnp.broadcast_to(row, shape) for row in rows] for rows in (near, far))
     return Tables(grid, values, jnp.stack(near), jnp.stack(far), opaque, azimuths, steps)
@@ -140,16 +144,18 @@ def _quadrant(
     return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
 
 
-def _energy(flux: Operator, share: Channels | None, end: _End) -> Array:
+def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end: _End) -> Array:
     """Energy that leaves for light along each direction of a table, of what interacts: (channels or 1, points)."""
     lift = end.lift[0]
     leaving = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
+    if onward is not None:
+        leaving = leaving + jnp.stack(onward)
     met = jnp.ones((1, lift.shape[-1]), lift.dtype) if share is None else jnp.stack(share)
     return safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))) @ lift.T
 
 
-def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
-    """BSDF of the paths with more than one event, never below 0."""
+def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side, *, may_be_negative: bool = False) -> Channels:
+    """BSDF of the paths with more than one event, not below 0 unless it may be."""
     zero = jnp.zeros_like(wi[2] * wo[2])
     if tables.values is None or (tables.opaque and side == "transmission"):
         return (zero,)
@@ -179,7 +185,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
         axes.append(_azimuth_points(into, out, tables.steps))
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
     found = look_up(tables.values, start, axes)
-    return tuple(factor * not_negative(value) for value in found)
+    return tuple(factor * (value if may_be_negative else not_negative(value)) for value in found)
 
 
 def read_energy(tables: Tables, wi: Vector) -> tuple[Channels, Channels]:

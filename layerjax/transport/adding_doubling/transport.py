@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 
 from layerjax._devices import exact_products
-from layerjax._numerics import safe_div
+from layerjax._numerics import not_negative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
@@ -27,13 +27,20 @@ from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
+from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import ORDINATES_LADDER, Resolution, chosen, modes_for, rungs
 from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, solve
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energy, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
+from layerjax.transport.first_order import (
+    FirstOrder,
+    evaluate_first,
+    first_order,
+    interaction_probability,
+    onward_probability,
+)
 from layerjax.transport.known_directions import Known, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
 
@@ -50,13 +57,15 @@ PROBED = 8
 class Solved(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest. straight: what passes two interfaces, left out of either.
+    Both are None if there is no rest. straight: what passes two interfaces, left out of either. scaled: what the rest
+    leaves out in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
     """
 
     first: FirstOrder
     tables: Tables | None
     between: Between | None = None
     straight: Straight | None = None
+    scaled: FirstOrder | None = None
 
 
 class AddingDoubling(DeterministicTransport):
@@ -142,15 +151,19 @@ class AddingDoubling(DeterministicTransport):
         gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
         if self.orders == "first" or not (stack.layers or gives_back):
             return Solved(first, None)
-        return Solved(first, _solve(stack, first, self._plan(stack, None)), straight=straight(stack))
+        plan = self._plan(stack, None)
+        carried, once = _as_carried(stack, plan)
+        return Solved(first, _solve(stack, first, once, plan), None, straight(carried), once)
 
     def prepare_for(self, stack: Stack, known: Known) -> Solved:
         found = followed(stack, known) if self.orders != "first" else None
         if found is None:
             return self.prepare(stack)
         closed, directions = found
-        rest = _solve_between(closed, directions, self._plan(closed, directions))
-        return Solved(first_order(stack), None, rest, straight(closed))
+        plan = self._plan(closed, directions)
+        rest = _solve_between(closed, directions, plan)
+        carried, once = _as_carried(closed, plan)
+        return Solved(first_order(closed), None, rest, straight(carried), once)
 
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
@@ -158,10 +171,7 @@ class AddingDoubling(DeterministicTransport):
         if state.between is None:
             return super().measured(state, wi, wo, side, channels, key)
         i, o = split(wi), split(wo)
-        rest = read_between(state.between, i, o, side)
-        parts = [rest] if self.orders == "multiple" else [evaluate_first(state.first, i, o, side), rest]
-        parts.extend(_straight(state, i, o, side))
-        values = total(parts, jnp.zeros_like(i[2] * o[2]))
+        values = self._values(state, read_between(state.between, i, o, side), i, o, side)
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
     def coarser(self) -> "AddingDoubling":
@@ -176,13 +186,22 @@ class AddingDoubling(DeterministicTransport):
         return self._at(self._given().another())
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
-        parts: list[Channels] = []
-        if self.orders != "multiple":
-            parts.append(evaluate_first(state.first, wi, wo, side))
-        if state.tables is not None:
-            parts.append(read_rest(state.tables, wi, wo, side))
-        parts.extend(_straight(state, wi, wo, side))
-        return total(parts, jnp.zeros_like(wi[2] * wo[2]))
+        if state.tables is None:
+            rest: Channels = (jnp.zeros_like(wi[2] * wo[2]),)
+        else:
+            rest = read_rest(state.tables, wi, wo, side, may_be_negative=state.scaled is not None)
+        return self._values(state, rest, wi, wo, side)
+
+    def _values(self, state: Solved, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
+        """The orders that are asked for, of the rest and what is known in closed form."""
+        parts = [rest, *_straight(state, wi, wo, side)]
+        if self.orders == "multiple":
+            if state.scaled is None:
+                return total(parts)
+            parts.append(tuple(-value for value in evaluate_first(state.first, wi, wo, side)))
+        parts.append(evaluate_first(state.first if state.scaled is None else state.scaled, wi, wo, side))
+        found = total(parts)
+        return found if state.scaled is None else tuple(map(not_negative, found))
 
     def sample(self, state: Solved, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return propose(state.first, wi, uniforms)
@@ -276,12 +295,23 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
+    """The stack as the grid has it, and paths with one event in that, where they differ from the stack's own."""
+    carried = scaled(stack, plan.nodes)
+    if carried is None:
+        return stack, None
+    once = first_order(carried)
+    media = once.upper.media if once.lower is None else once.upper.media + once.lower.media
+    return carried, once if media else None
+
+
 @eqx.filter_jit
 @exact_products
-def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
+def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
     grid, whole, rest = solve(stack, plan)
     met = partial(interaction_probability, first)
-    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met)
+    onward = None if once is None else partial(onward_probability, first, once)
+    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, onward)
 
 
 @eqx.filter_jit
