@@ -4,6 +4,7 @@ import abc
 from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax._parameters import Parameter
@@ -65,17 +66,20 @@ class PhaseFunction(Shown):
         """
         return sphere_rule(wi, nodes)
 
-    @property
-    def peaks_forward(self) -> bool | Array:
-        """What becomes of a peak too narrow for a grid of directions: what the grid misses of it goes straight on, as
-        of narrow forward lobes; or else (False) the kernel is scaled to its energy, as of mirrors."""
-        return True
+    def moments(self, count: int) -> Array | np.ndarray | None:
+        """Means over p of the first Legendre polynomials of the cosine of deflection, (count,).
+
+        A numpy array is known while tracing. None: p depends on more than that angle, or is to be sampled as it is. A
+        class whose p does not can return what `layerjax.phase.moments.moments_by_quadrature` finds: then any grid of
+        directions carries its forward peak.
+        """
+        return None
 
     @property
     def width(self) -> Parameter:
         """About the angle, in radians and up to 1, within which p changes: what a grid of directions must resolve.
 
-        Peaks that may go straight on (see `peaks_forward`) do not count.
+        Forward peaks of what has `moments` do not count: what a grid does not resolve of them goes straight on.
         """
         return 1.0
 

@@ -48,9 +48,8 @@ class HenyeyGreenstein(PhaseFunction):
     def rule(self, wi: Vector, nodes: int) -> Rule:
         return henyey_greenstein_rule(wi, self.g, nodes)
 
-    @property
-    def peaks_forward(self) -> Array:
-        return self.g >= 0.0
+    def moments(self, count: int) -> Array:
+        return jnp.asarray(self.g) ** np.arange(count)
 
     @property
     def width(self) -> Parameter:

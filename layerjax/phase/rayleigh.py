@@ -1,6 +1,7 @@
 """Rayleigh scattering (Rayleigh 1871): particles much smaller than the wavelength, unpolarised light."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from layerjax._numerics import safe_sqrt
@@ -25,3 +26,6 @@ class Rayleigh(PhaseFunction):
         # the root of cos^3 + 3 cos = 8 u - 4, which the cumulative distribution asks for
         cosine = 2.0 * jnp.sinh(jnp.arcsinh(4.0 * u - 2.0) / 3.0)
         return cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine))
+
+    def moments(self, count: int) -> np.ndarray:
+        return np.array([1.0, 0.0, 0.1, *[0.0] * count][:count])

@@ -57,10 +57,6 @@ class SGGX(PhaseFunction):
         return flake_rule(wi, *radii(self.kind, self.alpha), self._axis(), nodes)
 
     @property
-    def peaks_forward(self) -> bool:
-        return False
-
-    @property
     def width(self) -> Parameter:
         return self.alpha
 

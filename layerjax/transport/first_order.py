@@ -14,7 +14,7 @@ from jax import Array
 
 from layerjax._numerics import horizon, one_minus_exp
 from layerjax._parameters import Parameter
-from layerjax.channels import Channels, total
+from layerjax.channels import Channels, each, total
 from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
 from layerjax.normals.facets import Distribution, reflection_pdf, rule, sample
 from layerjax.quadrature import Nodes
@@ -107,6 +107,15 @@ def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
     if state.layered or state.opaque:
         return None
     return colliding_share(state.upper.media, sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype)))
+
+
+def onward_probability(state: FirstOrder, scaled: FirstOrder, w: Vector) -> Channels | None:
+    """Probability that light along w goes straight through the scaled media and not the others; None: that is 0."""
+    if state.layered or state.opaque:
+        return None
+    w = sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype))
+    whole, less = (total(optical_depths(one.upper.media, w), jnp.zeros_like(w[2])) for one in (state, scaled))
+    return each(lambda whole, less: jnp.exp(-less) * one_minus_exp(whole - less), whole, less)
 
 
 def colliding_share(media: Sequence[Medium], w: Vector) -> Channels:

@@ -3,8 +3,6 @@
 Whatever keeps the contract is carried by the transports that carry any medium, and refused by name by the others.
 """
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +14,7 @@ from layerjax._parameters import parameter
 from layerjax._shapes import channel_count
 from layerjax.directions import add, combine, dot, frame, half_vector, join, normalize, reflect, scale, split
 from layerjax.phase.contract import deflected
+from layerjax.phase.moments import moments_by_quadrature
 
 
 class Schlick(lj.PhaseFunction):
@@ -30,14 +29,15 @@ class Schlick(lj.PhaseFunction):
         cosine = (2.0 * u1 + self.k - 1.0) / (2.0 * self.k * u1 - self.k + 1.0)
         return deflected(wi, cosine, jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), 2.0 * jnp.pi * u2)
 
+    def moments(self, count):
+        return moments_by_quadrature(self.pdf, count, jnp.result_type(self.k))
+
 
 class Ellipsoid(lj.PhaseFunction):
     """Mirrors with the normals of any ellipsoid S = M M' (Heitz et al. 2015, Eqs. 4, 5 and 12), written as matrices.
 
     M: the directions of its axes, each as long as the area seen along it.
     """
-
-    peaks_forward: ClassVar[bool] = False
 
     m: jax.Array
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, not_negative, safe_sqrt
+from layerjax._numerics import horizon, safe_sqrt
 from layerjax.channels import Channels
 from layerjax.directions import Vector
 from layerjax.transport.adding_doubling.grid import Region
@@ -57,8 +57,8 @@ def between(whole: Layer, known: KnownDirections, bottom: Array, opaque: bool) -
     return Between(values, known.of_wi, known.of_wo, opaque)
 
 
-def read_between(found: Between, wi: Vector, wo: Vector, side: Side, sign: float = 1.0) -> Channels:
-    """BSDF of the paths with more than one event, never below 0; of sign -1 how far below it would be."""
+def read_between(found: Between, wi: Vector, wo: Vector, side: Side) -> Channels:
+    """BSDF of the paths with more than one event, which ringing may take below 0."""
     edge, (z_i, z_o) = horizon(wi[2].dtype), (wi[2], wo[2])
     if found.opaque or side == "reflection":
         valid = (z_i > edge) & (z_o > edge)
@@ -72,7 +72,7 @@ def read_between(found: Between, wi: Vector, wo: Vector, side: Side, sign: float
     series = found.values[out, into]
     waves = jnp.where(modes == 0, 1.0, 2.0) * jnp.cos(turn(wi, wo)[..., None] * modes)
     total = jnp.sum(series * waves[..., None, :], axis=-1)
-    return tuple(jnp.where(valid, not_negative(sign * total[..., c]), 0.0) for c in range(total.shape[-1]))
+    return tuple(jnp.where(valid, total[..., c], 0.0) for c in range(total.shape[-1]))
 
 
 def turn(wi: Vector, wo: Vector) -> Array:

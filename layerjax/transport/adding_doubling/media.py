@@ -21,6 +21,7 @@ from layerjax.directions import Vector, half_vector
 from layerjax.phase import PhaseFunction
 from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
+from layerjax.transport.adding_doubling.moments import Terms, kernel_of_moments, truncated
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
 from layerjax.transport.adding_doubling.sampling import balance, modes_at_nodes, straight_on
 from layerjax.transport.adding_doubling.slab import slab
@@ -44,6 +45,8 @@ class Kernel(eqx.Module):
 
     `schlick`: the same times (1 - |wi . h|)^5, if the medium has a Fresnel term. `solid` is the weight of dmu dphi over
     2 pi, `turn` takes azimuths by half a turn (modes: nothing).
+
+    onward: share of a collision that goes straight on, in neither, (nodes,); the same of `schlick`.
     """
 
     plain: Pair
@@ -53,6 +56,7 @@ class Kernel(eqx.Module):
     cosine: Array
     solid: Array
     azimuths: int | None = eqx.field(static=True)
+    onward: tuple[Array, Array] | None = None
 
     def turn(self, operator: Operator) -> Operator:
         """An operator lit from above to the same lit from below: the medium is its own image under inversion."""
@@ -70,13 +74,34 @@ class Kernel(eqx.Module):
         return jnp.roll(split, self.azimuths // 2, axis=-1).reshape(values.shape)
 
 
-def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int) -> Kernel:
-    """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel."""
+def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms) -> Kernel:
+    """Kernel of a medium that is symmetric about the normal, as Fourier modes cos(m phi) in the azimuth of travel.
+
+    carried: moments, if the phase function has any.
+    """
+    area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
+    if phase.moments(1) is not None:
+        return _by_moments(phase, with_schlick, region, modes, carried, area)
     found = modes_at_nodes(lambda wi, wo: _both_sides(phase, with_schlick, wi, wo), region, region, modes)
     plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
-    area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
-    kernel = Kernel(plain, schlick, area, region.cosine, region.solid, None)
-    return _balanced(kernel, phase)
+    return _balanced(Kernel(plain, schlick, area, region.cosine, region.solid, None))
+
+
+def _by_moments(
+    phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms, area: Array
+) -> Kernel:
+    """What quadrature misses, where there is more than one panel, goes straight on as well."""
+    dtype = region.cosine.dtype
+    chi, onward = truncated(phase, False, carried, dtype)
+    plain = kernel_of_moments(chi, region.cosine, region.sine, modes)
+    missing = area - onward - 2.0 * jnp.pi * region.solid @ (plain[0][0] + plain[1][0])
+    schlick, fifth = None, onward
+    if with_schlick:
+        chi, fifth = truncated(phase, True, carried, dtype)
+        schlick = kernel_of_moments(chi, region.cosine, region.sine, modes)
+    return Kernel(
+        plain, schlick, area, region.cosine, region.solid, None, (onward + missing, fifth + jnp.zeros_like(missing))
+    )
 
 
 def kernel_ordinates(phase: PhaseFunction, with_schlick: bool, region: Region, azimuths: int) -> Kernel:
@@ -91,7 +116,7 @@ def kernel_ordinates(phase: PhaseFunction, with_schlick: bool, region: Region, a
     plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
     area = phase.cross_section((-travel[0], -travel[1], travel[2]))
     solid = jnp.repeat(region.solid, azimuths) / azimuths
-    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths), phase)
+    return _balanced(Kernel(plain, schlick, area, cosine, solid, azimuths))
 
 
 def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector) -> list[Array]:
@@ -107,27 +132,12 @@ def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector
     return plain + schlick
 
 
-def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
-    """The kernel with a collision scattering exactly sigma.
-
-    That of mirrors is scaled, and one with a peak backward. What is left goes straight on, as does all that a forward
-    peak has too little or too much of: there it changes nothing.
-    """
+def _balanced(kernel: Kernel) -> Kernel:
+    """The kernel scaled so that a collision scatters exactly sigma; what is left goes straight on."""
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
     area = kernel.area * jnp.ones_like(weight)
-
-    def as_it_is() -> Pair:
-        return jnp.ones_like(weight), area - weight @ (reflect + transmit)
-
-    def scaled() -> Pair:
-        return balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
-
-    onward = phase.peaks_forward
-    if isinstance(onward, bool):
-        scale, missing = as_it_is() if onward else scaled()
-    else:  # a branch, not a choice of results: most lobes point forward
-        scale, missing = jax.lax.cond(onward, as_it_is, scaled)
+    scale, missing = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
     forward = straight_on(missing, weight)
     back, through = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
 
@@ -144,6 +154,7 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: boo
     steps: see `doublings`; None: decided at run time.
     """
     thickness = _column(medium.thickness, kernel)
+    kernel = _less_onward(medium, kernel)
     direct = _direct(kernel, thickness)
     if is_known(medium.albedo, 0.0):
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
@@ -151,6 +162,17 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: boo
     if thickness.dtype != jnp.float64 if doubled is None else doubled:
         return _by_doublings(kernel, strength, thickness, direct, steps)
     return _by_eigenvectors(kernel, strength, thickness, direct)
+
+
+def _less_onward(medium: Medium, kernel: Kernel) -> Kernel:
+    """The kernel with an extinction, (channels or 1, 1, nodes), that what goes straight on has no part in."""
+    if kernel.onward is None or is_known(medium.albedo, 0.0):
+        return kernel
+    onward, fifth = kernel.onward
+    if kernel.schlick is not None:
+        f0 = _column(medium.f0, kernel)
+        onward = f0 * onward + (1.0 - f0) * fifth
+    return eqx.tree_at(lambda k: k.area, kernel, kernel.area - _column(medium.albedo, kernel) * onward)
 
 
 def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array, steps: int | None) -> Layer:
@@ -190,7 +212,7 @@ def _by_eigenvectors(kernel: Kernel, strength: Pair, thickness: Array, direct: A
     rate = safe_sqrt(2.0 * jnp.pi * kernel.solid / kernel.cosine)
     turn = kernel.turn_rows if kernel.azimuths is not None else lambda operator: operator
     back, onward = (rate[:, None] * part * rate for part in (turn(strength[0]), strength[1]))
-    removed = jnp.diag(kernel.area / kernel.cosine)
+    removed = (kernel.area / kernel.cosine)[..., None] * jnp.eye(root.size, dtype=root.dtype)
     half = jnp.broadcast_to(0.5 * thickness[..., 0], jnp.broadcast_shapes(thickness.shape[:-1], back.shape[:-2]))
     reflect, transmit = slab(*jnp.broadcast_arrays(removed - onward + back, removed - onward - back), half)
     once = _once(kernel, strength, thickness)
@@ -237,7 +259,7 @@ def _twice(kernel: Kernel, strength: Pair, thickness: Array) -> Pair:
     gain, depth = _depths(kernel, thickness)
     started = gain * exprel(depth)[..., None, :]
     up, down = (started * part - once for part, once in zip(strength, _once(kernel, strength, thickness), strict=True))
-    again = 2.0 * jnp.pi * kernel.solid[:, None] / kernel.area
+    again = 2.0 * jnp.pi * kernel.solid[:, None] / kernel.area[..., None, :]
     back, onward = strength[0] * again, strength[1] * again
     risen, turned_down = matmul(kernel.turn(onward), up), matmul(kernel.turn(back), up)  # for what travels upward
     assert risen is not None

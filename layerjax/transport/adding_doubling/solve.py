@@ -27,6 +27,7 @@ from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
+from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
 from layerjax.transport.adding_doubling.straight import without_straight
@@ -168,7 +169,7 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
     indices, phase = numbers
     here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
     if not tilted:
-        return kernel_modes(phase, fresnel, here, plan.modes)
+        return kernel_modes(phase, fresnel, here, plan.modes, terms(plan.nodes, len(indices) > 1))
     assert plan.azimuths is not None
     return kernel_ordinates(phase, fresnel, here, plan.azimuths)
 

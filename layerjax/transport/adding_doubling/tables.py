@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import horizon, not_negative, safe_div
+from layerjax._numerics import horizon, safe_div
 from layerjax.channels import Channels
 from layerjax.directions import Vector, select
 from layerjax.transport.adding_doubling.energies import Face, node_shares
@@ -66,6 +66,7 @@ def make_tables(
     opaque: bool,
     interaction_probability: Callable[[Vector], Channels | None],
     faces: tuple[Face | None, Face | None] | None,
+    onward_probability: Callable[[Vector], Channels | None] | None,
 ) -> Tables:
     """Tables of a solved stack.
 
@@ -77,6 +78,7 @@ def make_tables(
         opaque: only light from above, and what is reflected.
         interaction_probability: that light along a direction meets an event at all, per channel (None: 1).
         faces: see `outer_faces`; None, if there are no interfaces.
+        onward_probability: of what does, that the layers have it as passing untouched (None: 0).
     """
     modes = max(flux.shape[1] for flux in jax.tree.leaves(whole))
     steps = None if azimuths is not None or modes == 1 else MODE_DENSITY * modes
@@ -92,8 +94,12 @@ def make_tables(
             weight = jnp.repeat(end.region.weight, azimuths or 1)
             rows.append(list(node_shares(found, face, weight) @ end.lift[0].T))
         else:
-            share = interaction_probability(_node_directions(end.region, azimuths, side))
-            rows.append([_energy(flux.total, share, end) for flux in (found.reflect, found.transmit)])
+            directions = _node_directions(end.region, azimuths, side)
+            share = interaction_probability(directions)
+            onward = None if onward_probability is None else onward_probability(directions)
+            rows.append(
+                [_energy(found.reflect.total, None, share, end), _energy(found.transmit.total, onward, share, end)]
+            )
     shape = (max(energy.shape[0] for row in rows for energy in row), rows[0][0].shape[-1])
     energies = tuple(jnp.stack([jnp.broadcast_to(e, shape) for e in each]) for each in zip(*rows, strict=True))
     return Tables(grid, values, energies, opaque, azimuths, steps)
@@ -146,16 +152,18 @@ def _quadrant(
     return jnp.einsum("cmij,mp->cijp", fine, jnp.asarray(_waves(values.shape[1], steps), fine.dtype))
 
 
-def _energy(flux: Operator, share: Channels | None, end: _End) -> Array:
+def _energy(flux: Operator, onward: Channels | None, share: Channels | None, end: _End) -> Array:
     """Energy that leaves for light along each direction of a table, of what interacts: (channels or 1, points)."""
     lift = end.lift[0]
     leaving = jnp.zeros((1, lift.shape[-1]), lift.dtype) if flux is None else jnp.sum(flux[:, 0], axis=-2)
+    if onward is not None:
+        leaving = leaving + jnp.stack(onward)
     met = jnp.ones((1, lift.shape[-1]), lift.dtype) if share is None else jnp.stack(share)
     return safe_div(leaving, jnp.broadcast_to(met, jnp.broadcast_shapes(leaving.shape, met.shape))) @ lift.T
 
 
-def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side, sign: float = 1.0) -> Channels:
-    """BSDF of the paths with more than one event, never below 0; of sign -1 how far below it would be."""
+def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side) -> Channels:
+    """BSDF of the paths with more than one event, which ringing may take below 0."""
     zero = jnp.zeros_like(wi[2] * wo[2])
     if tables.values is None or (tables.opaque and side == "transmission"):
         return (zero,)
@@ -185,7 +193,7 @@ def read_rest(tables: Tables, wi: Vector, wo: Vector, side: Side, sign: float = 
         axes.append(_azimuth_points(into, out, tables.steps))
     factor = jnp.where(valid, scale / (out[2] + into[2]), 0.0)
     found = look_up(tables.values, start, axes)
-    return tuple(factor * not_negative(sign * value) for value in found)
+    return tuple(factor * value for value in found)
 
 
 def read_energies(tables: Tables, wi: Vector) -> list[Channels]:

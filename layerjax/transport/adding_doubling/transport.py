@@ -21,7 +21,7 @@ from jax import Array
 
 from layerjax._batching import in_chunks
 from layerjax._devices import exact_products
-from layerjax._numerics import safe_div
+from layerjax._numerics import not_negative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.directions import Vector, direction, split
@@ -30,6 +30,7 @@ from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
+from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.resolution import (
     ORDINATES_LADDER,
@@ -44,7 +45,13 @@ from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, 
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
-from layerjax.transport.first_order import FirstOrder, evaluate_first, first_order, interaction_probability
+from layerjax.transport.first_order import (
+    FirstOrder,
+    evaluate_first,
+    first_order,
+    interaction_probability,
+    onward_probability,
+)
 from layerjax.transport.known_directions import Known, KnownDirections, known_directions
 from layerjax.transport.single_scattering import SingleScattering
 
@@ -68,13 +75,15 @@ class ResolutionWarning(UserWarning):
 class Solved(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest. straight: what passes two interfaces, left out of either.
+    Both are None if there is no rest. straight: what passes two interfaces, left out of either. scaled: what the rest
+    leaves out in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
     """
 
     first: FirstOrder
     tables: Tables | None
     between: Between | None = None
     straight: Straight | None = None
+    scaled: FirstOrder | None = None
 
 
 class AddingDoubling(DeterministicTransport):
@@ -171,15 +180,19 @@ class AddingDoubling(DeterministicTransport):
         gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
         if self.orders == "first" or not (stack.layers or gives_back):
             return Solved(first, None)
-        return Solved(first, _solve(stack, first, self._plan(stack, None)), straight=straight(stack))
+        plan = self._plan(stack, None)
+        carried, once = _as_carried(stack, plan)
+        return Solved(first, _solve(stack, first, once, plan), None, straight(carried), once)
 
     def prepare_for(self, stack: Stack, known: Known) -> Solved:
         found = followed(stack, known) if self.orders != "first" else None
         if found is None:
             return self.prepare(stack)
         closed, directions = found
-        rest = _solve_between(closed, directions, self._plan(closed, directions))
-        return Solved(first_order(stack), None, rest, straight(closed))
+        plan = self._plan(closed, directions)
+        rest = _solve_between(closed, directions, plan)
+        carried, once = _as_carried(closed, plan)
+        return Solved(first_order(closed), None, rest, straight(carried), once)
 
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
@@ -187,24 +200,16 @@ class AddingDoubling(DeterministicTransport):
         if state.between is None:
             return super().measured(state, wi, wo, side, channels, key)
         i, o = split(wi), split(wo)
-        rest = read_between(state.between, i, o, side)
-        parts = [rest] if self.orders == "multiple" else [evaluate_first(state.first, i, o, side), rest]
-        parts.extend(_straight(state, i, o, side))
-        values = total(parts, jnp.zeros_like(i[2] * o[2]))
+        values = self.evaluate(state, i, o, side)
         return jnp.stack([pick(values, c) for c in range(channels)], axis=-1), None
 
     def doubt(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
-        between, tables = state.between, state.tables
         least = FACETS_ERROR if state.first.layered else 0.0
 
         def found(wi: Vector, wo: Vector) -> Channels:
-            if between is not None:
-                signs = [read_between(between, wi, wo, side, sign) for sign in (1.0, -1.0)]
-            elif tables is not None:
-                signs = [read_rest(tables, wi, wo, side, sign) for sign in (1.0, -1.0)]
-            else:
-                return (jnp.zeros_like(wi[2] * wo[2]),) * channels
-            return tuple(least * pick(signs[0], c) + pick(signs[1], c) for c in range(channels))
+            rest = self._rest(state, wi, wo, side)
+            lowest = rest if state.scaled is None else self._sum(state, rest, wi, wo, side)
+            return tuple(least * jnp.abs(pick(rest, c)) + not_negative(-pick(lowest, c)) for c in range(channels))
 
         return in_chunks(found, wi, wo)
 
@@ -220,13 +225,28 @@ class AddingDoubling(DeterministicTransport):
         return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._given()))
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
-        parts: list[Channels] = []
-        if self.orders != "multiple":
-            parts.append(evaluate_first(state.first, wi, wo, side))
+        rest = self._rest(state, wi, wo, side)
+        if state.scaled is None:
+            return self._sum(state, tuple(map(not_negative, rest)), wi, wo, side)
+        return tuple(map(not_negative, self._sum(state, rest, wi, wo, side)))
+
+    def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
+        """What is read off: ringing may take it below 0, and where media are scaled what it leaves out may, too."""
+        if state.between is not None:
+            return read_between(state.between, wi, wo, side)
         if state.tables is not None:
-            parts.append(read_rest(state.tables, wi, wo, side))
-        parts.extend(_straight(state, wi, wo, side))
-        return total(parts, jnp.zeros_like(wi[2] * wo[2]))
+            return read_rest(state.tables, wi, wo, side)
+        return (jnp.zeros_like(wi[2] * wo[2]),)
+
+    def _sum(self, state: Solved, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
+        """The orders that are asked for, of the rest and what is known in closed form."""
+        parts = [rest, *_straight(state, wi, wo, side)]
+        if self.orders == "multiple":
+            if state.scaled is None:
+                return total(parts)
+            parts.append(tuple(-value for value in evaluate_first(state.first, wi, wo, side)))
+        parts.append(evaluate_first(state.first if state.scaled is None else state.scaled, wi, wo, side))
+        return total(parts)
 
     def sample(self, state: Solved, wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:
         return propose(state.first, wi, uniforms)
@@ -243,7 +263,7 @@ class AddingDoubling(DeterministicTransport):
         if state.tables is not None and self.orders == "all":
             energies = read_energies(state.tables, wi)
             if state.first.layered:
-                return directional_albedo(state.first, energies, wi, nodes)
+                return directional_albedo(state.scaled or state.first, energies, wi, nodes)
             met = interaction_probability(state.first, wi)
             near, far = none_negative(*energies)
             return (near, far) if met is None else (times(near, met), times(far, met))
@@ -329,12 +349,24 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
+def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
+    """The stack as the grid has it, and paths with one event in that, where they differ from the stack's own."""
+    carried = scaled(stack, plan.nodes)
+    if carried is None:
+        return stack, None
+    once = first_order(carried)
+    media = once.upper.media if once.lower is None else once.upper.media + once.lower.media
+    return carried, once if media else None
+
+
 @eqx.filter_jit
 @exact_products
-def _solve(stack: Stack, first: FirstOrder, plan: Plan) -> Tables:
+def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
     grid, whole, rest, faces = solve(stack, plan)
     met = partial(interaction_probability, first)
-    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, faces if first.layered else None)
+    onward = None if once is None else partial(onward_probability, first, once)
+    outer = faces if first.layered else None
+    return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
 @eqx.filter_jit

@@ -9,6 +9,7 @@ import pytest
 import layerjax as lj
 from layerjax.transport.adding_doubling import media
 from layerjax.transport.adding_doubling.grid import make_grid
+from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.slab import slab
 
 Long = np.longdouble
@@ -51,10 +52,11 @@ def truth(p, q, half):
 def equations(albedo, g, modes=2):
     """P and Q of a Henyey-Greenstein medium, (modes, n, n)."""
     region = make_grid([1.0], (0,), NODES, jnp.float64).regions[0]
-    kernel = media.kernel_modes(lj.HenyeyGreenstein(g), False, region, modes)
+    kernel = media.kernel_modes(lj.HenyeyGreenstein(g), False, region, modes, terms(NODES, False))
     rate = jnp.sqrt(2.0 * jnp.pi * kernel.solid / kernel.cosine)
     back, onward = (albedo * rate[:, None] * part * rate for part in kernel.plain)
-    removed = jnp.diag(kernel.area / kernel.cosine)
+    area = kernel.area if kernel.onward is None else kernel.area - albedo * kernel.onward[0]
+    removed = jnp.diag(area / kernel.cosine)
     return np.asarray(removed - onward + back), np.asarray(removed - onward - back)
 
 
@@ -147,7 +149,7 @@ FIBERS = lj.SGGX("fiber", 0.4, (0.5, 0.3, 0.8))
 def layer(medium, doubled):
     region = make_grid([1.0], (0,), 4, medium.thickness.dtype).regions[0]
     if medium.phase.is_upright:
-        kernel = media.kernel_modes(medium.phase, False, region, 4)
+        kernel = media.kernel_modes(medium.phase, False, region, 4, terms(4, False))
     else:
         kernel = media.kernel_ordinates(medium.phase, False, region, 8)
     return media.medium_layer(medium, kernel, None, doubled)
