@@ -25,7 +25,7 @@ STEEP = 5.0
 """Degrees of incidence from which the light has a side."""
 
 BRIGHTER = 1.3
-"""Ratio of the brightest readings of two sides from which one of them is the brighter: more than noise makes."""
+"""Ratio of the brightest measurements of two sides from which one of them is the brighter: more than noise makes."""
 
 Floats = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class Energy:
 class Peak:
     """Of a scan through the mirror direction: degrees between readings there, and how many are above half its top.
 
-    stands_out: whether readings about it fall to half of its top, so that it is a peak, and no flank of another.
+    stands_out: whether measurements about it fall to half of its top, so that it is a peak, and no flank of another.
     """
 
     theta: float
@@ -75,7 +75,7 @@ class Peak:
 
 @dataclass(frozen=True)
 class Sides:
-    """Of light at this polar angle, the brightest reading in its plane on its own side, and on the mirror side; NaN
+    """Of light at this polar angle, the brightest measurement in its plane on its own side, and on the mirror side; NaN
     where all of them are on its own."""
 
     theta: float

@@ -65,7 +65,7 @@ def _brighter_side(found: list[Sides]) -> list[str]:
         "phi_o = phi_i + 180."
     )
     if found and all(math.isnan(one.mirror) for one in found):
-        return [f"Sides: all readings in the plane of incidence lie on the light's side. {doubt}"]
+        return [f"Sides: all measurements in the plane of incidence lie on the light's side. {doubt}"]
     of_light = [one for one in found if one.light > BRIGHTER * max(one.mirror, 0.0)]
     of_mirror = [one for one in found if one.mirror > BRIGHTER * max(one.light, 0.0)]
     if len(of_light) <= len(of_mirror):
@@ -124,7 +124,7 @@ def _sampling(found: list[Peak]) -> str:
         return "Sampling: no scan crosses the mirror direction of its light, the peak was not seen."
     if not any(one.stands_out for one in found):
         return (
-            f"Sampling: no peak stands out about the mirror direction: readings within {FAR:g}° of it nowhere fall "
+            f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
             "to half of the brightest one."
         )
     worst = min((one for one in found if one.stands_out), key=lambda one: one.readings)

@@ -33,7 +33,7 @@ class Table:
         places = [self.names.index(name) for name in names]
         keep = [not any(_missing(cells[place]) for place in places) for cells in self.cells]
         if not any(keep):
-            raise self.header.error(f"no sample below holds a number in {named(names)}, must be at least one")
+            raise self.header.error(f"no data point below holds a number in {named(names)}, must be at least one")
         self.body = [line for line, kept in zip(self.body, keep, strict=True) if kept]
         self.cells = [cells for cells, kept in zip(self.cells, keep, strict=True) if kept]
         return len(keep) - len(self.body)

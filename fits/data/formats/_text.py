@@ -13,7 +13,7 @@ BOM = b"\xef\xbb\xbf"
 BOMS_16 = (b"\xff\xfe", b"\xfe\xff")
 ANY_NUMBER = (-LARGEST, LARGEST)
 MOST_VALUES = 20_000_000
-"""Samples times channels that are made of one file: 160 MB, which are copied some times."""
+"""Data points times channels that are made of one file: 160 MB, which are copied some times."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +107,12 @@ def _columns(cells: list[str]) -> list[tuple[str, int]]:
     return [(cell, column) for column, cell in enumerate(cells, start=1)]
 
 
-def require_room(path: Path, samples: int, channels: int) -> None:
+def require_room(path: Path, points: int, channels: int) -> None:
     """ValueError for more than can be held: files may state few numbers that stand for many."""
-    if samples * channels > MOST_VALUES:
+    if points * channels > MOST_VALUES:
         raise ValueError(
-            f"{path}: {plural(samples, 'sample')} of {plural(channels, 'channel')} are {samples * channels:,} numbers, "
-            f"must be {MOST_VALUES:,} at most"
+            f"{path}: {plural(points, 'data point')} of {plural(channels, 'channel')} are {points * channels:,} "
+            f"numbers, must be {MOST_VALUES:,} at most"
         )
 
 

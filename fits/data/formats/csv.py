@@ -75,7 +75,7 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     written_here = lines[0].text == _FIRST_LINE
     wi, wo, notes = _directions(table, written_here)
     if empty:
-        notes.append(f"left out: {plural(empty, 'sample')} without a value (an empty cell, or nan)")
+        notes.append(f"left out: {plural(empty, 'data point')} without a value (an empty cell, or nan)")
     if kind != chosen:
         notes.append(f"{named(list(channels.values()))} taken for {_MEANING[chosen]}")
 

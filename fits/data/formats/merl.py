@@ -109,7 +109,7 @@ def _looked_up(
     values = np.where(valid, (weights * corner_values).sum(axis=1), 0.0).T * SCALE
     notes = []
     if lost.any():
-        notes.append(f"left out: {plural(int(lost.sum()), 'sample')} that need a bin that holds nan")
+        notes.append(f"left out: {plural(int(lost.sum()), 'data point')} that need a bin that holds nan")
     if not (valid | lost).all():
         count = int((~valid & ~lost).sum())
         notes.append(f"masked: {plural(count, 'sample')} that need a bin without a measurement")

@@ -8,8 +8,8 @@ and the wall's reflectance, 5: and that of the other sphere, 6, 7: and of the st
 `COLUMNS` says. Then the rows; with a count, a number above 1 at the head of a row is its wavelength. As `iad_io.w` of
 iad 4 reads it.
 
-The header does not say how readings were compared. By two beams the sphere has the same gain for sample and standard,
-and iad makes no correction (`iad -X`); where a comment of the file says so, neither does this reader, and a note tells.
+The header does not say how sample and standard were compared. By two beams the sphere has the same gain for both, and
+iad makes no correction (`iad -X`); where a comment of the file says so, neither does this reader, and a note tells.
 """
 
 import re
@@ -69,7 +69,7 @@ UNUSED = {
     "e": "tolerance",
     "q": "quadrature",
 }
-"""Columns that iad's inversion takes and that say nothing of readings here."""
+"""Columns that iad's inversion takes and that say nothing of the measurements."""
 
 MUST_BE = {"c": 1.0, "C": 1.0, "E": 0.0}
 """What the model cannot follow otherwise."""
@@ -129,7 +129,7 @@ def read_slab(
     Args:
         path: the file.
         incidence: polar angle of the light, in [0, 90) degrees; None: that of column ``i``, or 0 without one.
-        sigma: standard deviation of every reading, above 0; the format does not say it.
+        sigma: standard deviation of every measurement, above 0; the format does not say it.
         corrected: the readings are of the slab itself, whatever the spheres: two beams were compared, say. Else what
             spheres add is part of the model (`Spheres`): of one at a time, each for its reading, or of two together.
             None: corrected if a comment of the file says that two beams were compared, and a note tells of it.
@@ -161,7 +161,7 @@ def read_slab(
     slides = _one(path, "N", columns, header[1])
     glass = columns.get("D", np.array(header[3:4]))
     if (glass > 0).any() != (glass > 0).all():
-        raise ValueError(f"{path}: D is 0 in some rows only; choose rows that are alike by their wavelengths")
+        raise ValueError(f"{path}: D is 0 in some rows only; restrict the wavelengths")
     totals, first = _totals(path, columns, incidence, sigma)
     by, notes = _compared(path, _described(path, header, columns), lines, corrected)
     unused = [f"{letter} ({UNUSED[letter]})" for letter in columns if letter in UNUSED]
@@ -190,7 +190,7 @@ def _totals(path: Path, columns: dict[str, Floats], given: float | None, sigma: 
         if not alike:
             raise ValueError(
                 f"{path}: rows at {angle:g} degrees have other wavelengths than those at {angles[0]:g}, must have "
-                "the same: choose rows by their wavelengths"
+                "the same: restrict the wavelengths"
             )
     first = rows[0]
     names = [f"row {place + 1}" for place in range(len(first))]
@@ -227,7 +227,7 @@ def _described(path: Path, header: list[float], columns: dict[str, Floats]) -> S
     """What header and columns say of spheres; a sphere of no diameter is none."""
     counts = [columns[letter] for letter in "SM" if letter in columns] or [np.array(header[6:7])]
     if len(set(np.concatenate(counts))) > 1:
-        raise ValueError(f"{path}: the number of spheres varies; choose rows that are alike by their wavelengths")
+        raise ValueError(f"{path}: the number of spheres varies; restrict the wavelengths")
     count = float(counts[0][0])
     if count not in (0, 1, 2):
         raise ValueError(f"{path}: number of spheres is {count:g}, must be 0, 1 or 2")

@@ -35,7 +35,7 @@ BAD_DATA = {
     "missing column": ("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n", "brdf"),
     "missing angle": ("theta_i,phi_i,theta_o,brdf\n10,180,20,0.1\n", "phi_o"),
     "text in a number": (HEADER + "10,180,twenty,0,0.1\n", "twenty"),
-    "nothing but NaN": (HEADER + "10,180,20,0,nan\n", "no sample below holds a number"),
+    "nothing but NaN": (HEADER + "10,180,20,0,nan\n", "no data point below holds a number"),
     "angle of NaN": (HEADER + "10,180,nan,0,0.1\n", "nan"),
     "too large": (HEADER + "10,180,20,0,1e300\n", "1e300"),
     "angle outside its range": (HEADER + "10,180,200,0,0.1\n", "200"),

@@ -140,7 +140,7 @@ def test_a_peak_on_the_side_of_the_light_is_told_of(width: float) -> None:
     assert all(one.light > one.mirror for one in sides(turned))
     assert sides(turned.where((SIGNED > -6.0) & (np.abs(SIGNED - 8.0) > 8.0)).used()) == []  # nothing to compare
     one_side = turned.where(SIGNED < 1.0).used()
-    assert "all readings in the plane of incidence lie on the light's side" in statement(one_side, "Sides")
+    assert "all measurements in the plane of incidence lie on the light's side" in statement(one_side, "Sides")
     assert statement(lobe(1.0).where(SIGNED > -1.0).used(), "Sides") == ""
     assert statement(lobe(1.0), "Sides") == ""
     assert "the peak about the mirror direction holds" in statement(lobe(1.0), "Sampling")

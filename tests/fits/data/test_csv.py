@@ -120,11 +120,11 @@ def test_what_was_not_measured_is_left_out_and_counted(tmp_path, missing):
     np.testing.assert_allclose(data.values[:, 0], [1, 3])
     np.testing.assert_allclose(data.theta_o, [20, 30])
     np.testing.assert_allclose(data.sigma[:, 0], [0.1, 0.3])  # unknown: as much of the value as where it is known
-    assert data.source.notes[0] == "left out: 1 sample without a value (an empty cell, or nan)"
+    assert data.source.notes[0] == "left out: 1 data point without a value (an empty cell, or nan)"
     colours = f"theta_i,theta_o,brdf_red,brdf_blue\n10,20,1,{missing}\n10,25,{missing},1\n10,30,1,2\n"
     data = read(_file(tmp_path, colours))
     np.testing.assert_array_equal(data.values, [[1, 2]])
-    assert "left out: 2 samples without a value (an empty cell, or nan)" in data.source.notes
+    assert "left out: 2 data points without a value (an empty cell, or nan)" in data.source.notes
 
 
 def test_signed_theta_without_azimuths(tmp_path):
@@ -176,7 +176,7 @@ GOOD = "10,180,20,0,0.5\n"
         (HEADER + "\n" + GOOD + "10,180,20,0,abc\n", "line 3, column 'brdf': 'abc' is not a number, must be a finite"),
         (HEADER + "\n# x\n\n,180,20,0,1\n", "line 4, column 'theta_i': '' is not a number"),
         (HEADER + "\n10,180,nan,0,1\n", "line 2, column 'theta_o': nan is not allowed, must be a number in"),
-        (HEADER + "\n10,180,20,0,\n10,180,25,0,NaN\n", "line 1: no sample below holds a number in column brdf"),
+        (HEADER + "\n10,180,20,0,\n10,180,25,0,NaN\n", "line 1: no data point below holds a number in column brdf"),
         (HEADER + "\n10,180,20,0,inf\n", "line 2, column 'brdf': inf is not allowed"),
         (HEADER + "\n10,180,20,0,1e300\n", r"line 2, column 'brdf': 1e300 is not allowed, .*at most 1e\+30 in size"),
         (HEADER + ",brdf_std\n10,180,20,0,1,1e-200\n", "line 2, column 'brdf_std': 1e-200 is not allowed, must be > 0"),

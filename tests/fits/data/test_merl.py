@@ -243,7 +243,7 @@ def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path):
     data = read(other)
     np.testing.assert_array_equal(np.flatnonzero(whole.mask & ~data.mask), [0, 1])
     np.testing.assert_array_equal(data.values[2:], whole.values[2:])
-    assert "left out: 2 samples that need a bin that holds nan" in data.source.notes
+    assert "left out: 2 data points that need a bin that holds nan" in data.source.notes
     every = read(other, bins="all")
     assert len(every) == len(read(path, bins="all")) - 2
     assert "left out: 2 bins of the table that hold nan" in every.source.notes

@@ -186,7 +186,7 @@ def test_a_long_spectrum_may_stand_for_more_than_there_is_room_for(tmp_path: Pat
     path = _file(tmp_path, _anisotropic([0.0], [10.0], spectrum, _table(THETA, PHI, _lobe(10.0, THETA, PHI))))
     tracemalloc.start()
     with pytest.raises(
-        ValueError, match=r"775 samples of 30000 channels are 23,250,000 numbers, must be 20,000,000 at"
+        ValueError, match=r"775 data points of 30000 channels are 23,250,000 numbers, must be 20,000,000 at"
     ):
         read(path)
     peak = tracemalloc.get_traced_memory()[1]
