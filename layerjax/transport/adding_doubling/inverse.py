@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from layerjax._numerics import broadcasting
+
 BLOCK = 8
 """Rows that are eliminated together: the rest is a matrix product."""
 
@@ -31,6 +33,7 @@ def inverse(matrix: Array) -> Array:
 
 
 @inverse.defjvp
+@broadcasting
 def _inverse_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     result = inverse(*primals)
     return result, -result @ tangents[0] @ result
