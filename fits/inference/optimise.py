@@ -25,7 +25,7 @@ from fits.inference.uncertainty import Uncertainty
 from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.joint import Joint
-from fits.problem.likelihood import Noise
+from fits.problem.likelihood import DEFAULT_RELATIVE, Noise
 from fits.problem.model import Transport
 from fits.problem.parameters import Free
 from fits.problem.posed import Posed
@@ -311,7 +311,9 @@ def _status(fit: Fit) -> list[str]:
     if fit.unresolved:
         words.append(f"the data leave {len(fit.unresolved)} direction(s) unresolved")
     if fit.alternatives:
-        words.append(f"the errors are of this minimum alone, and {len(fit.alternatives)} more explain the data as well")
+        words.append(f"the errors are of this minimum alone, and {len(fit.alternatives)} more fit equally well")
+    if fit.is_posterior and any(problem.noise_is_assumed for problem in fit.problem.problems.values()):
+        words.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
     if not fit.is_posterior:
         words.append(
             f"objective {fit.problem.objective} is no likelihood: the errors are scaled by its scatter, no posterior"

@@ -219,9 +219,7 @@ def _held_out(foretold: Foretold, images: Pictures) -> str:
     return section(
         "Readings that were held out",
         tables.html_table(scores_table(foretold.prediction, foretold.readings, "")),
-        image(
-            images, "held_out", "Readings that the fit has not seen, in the plane of incidence, and what it foretold."
-        ),
+        image(images, "held_out", "Held-out readings in the plane of incidence, and their prediction intervals."),
     )
 
 

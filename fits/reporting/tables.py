@@ -128,7 +128,7 @@ def parameter_table(fit: "Fit") -> Table:
 
 
 def alone_table(fit: "Fit") -> Table:
-    """Values and errors of a fit beside those of the same stack with noise that readings do not share."""
+    """Values and errors of a fit beside those of the same stack with independent noise."""
     assert fit.alone is not None
     rows = []
     for name, value in fit.alone.values.items():
@@ -137,7 +137,7 @@ def alone_table(fit: "Fit") -> Table:
     ratio = fit.alone.chi_square / max(fit.alone.degrees_of_freedom, 1)
     note = f"Chi-square per degree of freedom is {fit.reduced_chi_square:.3g} with and {ratio:.3g} without."
     columns = ("parameter", "with", "error", "without", "error", "unit")
-    return Table("With and without errors that readings share", columns, tuple(rows), note)
+    return Table("With and without the model discrepancy", columns, tuple(rows), note)
 
 
 def minima_table(fit: "Fit") -> Table:

@@ -136,7 +136,7 @@ def noise_in_words(problem: "Problem") -> str:
             assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
             parts.append(f"{value:.3g} {unit}{assumed}")
     if noise.correlated:
-        parts.append("errors that neighbouring readings share")
+        parts.append("a model discrepancy (Gaussian process)")
     tails = (
         "Gaussian" if noise.tails == "gaussian" else f"Student-t with {noise.degrees_of_freedom:g} degrees of freedom"
     )
@@ -173,7 +173,9 @@ def listed(names: Sequence[str]) -> str:
 def _not_separated(combination: Combination) -> str:
     error = {name: combination.error_of(name) for name in combination.weights}
     names = [name for name in error if error[name] > UNRESOLVED_BEYOND] or [max(error, key=lambda name: error[name])]
-    return f"The data do not {'separate' if len(names) > 1 else 'determine'} {listed(names)}"
+    if len(names) > 1:
+        return f"The data do not separate {listed(names)}"
+    return f"The data {'do not determine' if combination.open else 'weakly constrain'} {names[0]}"
 
 
 def determines(fit: "Fit") -> list[str]:

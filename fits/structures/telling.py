@@ -63,8 +63,9 @@ def _others(search: "Search") -> str:
     """Which others the score does not tell from the best; and that nothing else in the table does."""
     gaps = {one.name: one.foresight for one in search.found if one.foresight is not None}
     if not search.alike:
-        alone = "no other was looked at closely" if len(gaps) == 1 else "every other score is clearly lower"
-        return f"This identifies it among them: {alone}."
+        if len(gaps) == 1:
+            return "No other was looked at closely."
+        return "It is ahead of every other that was looked at closely by more than chance."
     near = listed([f"{name} ({gaps[name].behind:.2g} ± {gaps[name].behind_error:.2g})" for name in search.alike])
     return (
         f"It is statistically indistinguishable from {near}: these score differences are within two standard errors. "

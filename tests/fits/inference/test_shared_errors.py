@@ -105,6 +105,12 @@ def test_both_are_told(wrong: Fit) -> None:
     assert len(table.rows[0]) == len(table.columns)
 
 
+def test_a_noise_that_was_assumed_is_in_the_status_of_a_fit(wrong: Fit) -> None:
+    assert "assumed" not in wrong.status
+    plain = fit(STACK, readings(0.0), transport=line, noise=Noise(correlated=False), starts=1)
+    assert "a noise of 5 % of the model's value was assumed" in plain.status
+
+
 def test_starts_are_those_that_were_asked_for(wrong: Fit) -> None:
     """Two with independent noise, then one from each of their minima and two more with the discrepancy."""
     again = sum(wrong.ended.values())

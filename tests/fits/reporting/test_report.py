@@ -193,7 +193,7 @@ def test_a_small_share_in_a_loose_direction_does_not_make_a_parameter_loose(coat
     apart = Altered(coat_fit, unresolved=(mostly,), correlation=np.eye(2))
     assert verdicts.identifiability(apart) == {first: "weakly constrained: see direction 1", second: "yes"}
     structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
-    assert f"The data do not determine {first}." in verdicts.in_short(apart, structure)[0]
+    assert f"The data weakly constrain {first}." in verdicts.in_short(apart, structure)[0]
     # of two directions, the one that a parameter owes more of its variance
     other = Combination(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
     both = Altered(coat_fit, unresolved=(mostly, other), correlation=np.eye(2))

@@ -142,7 +142,7 @@ def test_there_is_one_verdict(found: fits.Search) -> None:
     (verdict,) = (line for line in words if "has the best" in line)
     assert "It is statistically indistinguishable from metal (" in verdict
     assert "BIC, weight and probability do not overrule this" in verdict
-    assert not any("identifies" in line for line in words)
+    assert not any("by more than chance" in line for line in words)
 
 
 def test_every_structure_is_seen_by_the_instrument(data: fits.Measurements, tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_it_is_told_in_words_and_pictures(found: fits.Search) -> None:
     assert all(len(row) == len(table.columns) for row in table.rows)
     words = " ".join(telling.search_sentences(found))
     assert "Of 4 models, interface / diffuse has the best cross-validated predictive score." in words
-    assert "This identifies it among them" in words
+    assert "It is ahead of every other that was looked at closely by more than chance." in words
     assert "indistinguishable" not in words
     assert as_png(telling.search_picture(found)).startswith(b"\x89PNG")
     page = telling.search_page(found)
