@@ -35,7 +35,7 @@ STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
 
 LEAST_POINTS = {"ggx": (12, 6), "vmf": (12, 8)}
-"""Points a panel, and in azimuth, of light let in along few directions, at least (see `seen_facets`)."""
+"""Points a panel, and in azimuth, of light let in along few directions, at least, by the distribution of normals."""
 
 AT_ONCE = 1 << 20
 """Numbers that arrays of facets hold at most."""

@@ -16,7 +16,7 @@ from tests.helpers.sampling import chi_square
 from tests.helpers.vmf_walks import Face, coated_energies, mean_and_error
 
 DRAWS = 200_000
-STEP = 1e-6  # short, for the facets that a change takes across the critical angle, where the slope is infinite
+STEP = 1e-5
 MIRROR = (0.01, 20.0)  # of index 1 reflects 0.9999 of the light, under an index of 1.5 as much
 
 
@@ -299,7 +299,7 @@ def test_references_are_finite_over_the_box(dtype):
 @pytest.mark.slow
 @pytest.mark.parametrize("transport", [lj.AddingDoubling(nodes=4, modes=4), "auto"], ids=["4", "auto"])
 def test_reverse_mode_of_a_varnish(transport):
-    """Against central differences: half of their step changes them by less than 1e-4."""
+    """Against central differences of the same resolution."""
 
     @jax.jit
     def both(x, wi, wo):
@@ -316,3 +316,31 @@ def test_reverse_mode_of_a_varnish(transport):
         both(x, *pair),
     )
     np.testing.assert_allclose(slope, (np.array(above) - below) / (2 * STEP), rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes_and_modes", [(6, 8), (12, 16)])
+def test_slopes_of_a_coat_are_those_of_a_fine_resolution(nodes_and_modes):
+    """At resolutions that are chosen for it: values to 1e-3, slopes by width and index to 1 %, and equal to
+    differences."""
+    wi, wo = lj.direction(np.deg2rad(20.0), 0.0), lj.direction(np.deg2rad([3.0, 25.0, 50.0, 60.0, 75.0]), np.pi)
+
+    def program(nodes, modes):
+        def values(alpha, ior):
+            stack = lj.Stack([lj.Interface(ior, alpha, "vmf")], lj.Lambertian(0.5))
+            found = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=nodes, modes=modes))[:, 0]
+            return found, found
+
+        return jax.jit(lambda *given: jax.jacfwd(values, (0, 1), has_aux=True)(*given))
+
+    coarse, fine = program(*nodes_and_modes), program(24, 32)
+    for alpha in (0.1, 0.3, 1.0):
+        for ior in (1.2, 1.5):
+            slopes, found = coarse(alpha, ior)
+            expected_slopes, expected = fine(alpha, ior)
+            np.testing.assert_allclose(found, expected, rtol=1e-3)
+            scale = np.max(np.abs(found))
+            for slope, fine_slope, apart in zip(slopes, expected_slopes, STEP * np.eye(2), strict=True):
+                ahead, back = (coarse(alpha + sign * apart[0], ior + sign * apart[1])[1] for sign in (1, -1))
+                np.testing.assert_allclose(slope, (ahead - back) / (2 * STEP), rtol=0, atol=1e-4 * scale)
+                np.testing.assert_allclose(slope, fine_slope, rtol=0, atol=0.01 * scale / max(alpha, 0.1))
