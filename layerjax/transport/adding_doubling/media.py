@@ -91,17 +91,19 @@ def _by_moments(
     phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms, area: Array
 ) -> Kernel:
     """What quadrature misses, where there is more than one panel, goes straight on as well."""
-    dtype = region.cosine.dtype
-    chi, onward = truncated(phase, False, carried, dtype)
-    plain = kernel_of_moments(chi, region.cosine, region.sine, modes)
-    missing = area - onward - 2.0 * jnp.pi * region.solid @ (plain[0][0] + plain[1][0])
-    schlick, fifth = None, onward
-    if with_schlick:
-        chi, fifth = truncated(phase, True, carried, dtype)
-        schlick = kernel_of_moments(chi, region.cosine, region.sine, modes)
-    return Kernel(
-        plain, schlick, area, region.cosine, region.solid, None, (onward + missing, fifth + jnp.zeros_like(missing))
-    )
+    weight = 2.0 * jnp.pi * region.solid
+    turned_round = jnp.asarray((-1.0) ** np.arange(modes), weight.dtype)[:, None, None]
+
+    def found(is_schlick: bool) -> tuple[Pair, Array]:
+        chi, onward, back = truncated(phase, is_schlick, carried, weight.dtype)
+        reflect, transmit = kernel_of_moments(chi, region.cosine, region.sine, modes)
+        return (reflect + turned_round * straight_on(back * jnp.ones_like(weight), weight), transmit), onward
+
+    plain, onward = found(False)
+    missing = area - onward - weight @ (plain[0][0] + plain[1][0])
+    schlick, fifth = found(True) if with_schlick else (None, onward)
+    shares = onward + missing, fifth + jnp.zeros_like(missing)
+    return Kernel(plain, schlick, area, region.cosine, region.solid, None, shares)
 
 
 def kernel_ordinates(phase: PhaseFunction, with_schlick: bool, region: Region, azimuths: int) -> Kernel:

@@ -30,6 +30,9 @@ from layerjax.stack import Interface, Medium, Stack, is_known
 LEAST_TERMS = 4
 """Moments of any grid: sums over two nodes are exact to their degree."""
 
+NARROW = 6
+"""Times the moments that a grid carries of it: those that a backward peak has if the grid shows no width of it."""
+
 
 class Terms(NamedTuple):
     """L of forward peaks, and of backward ones.
@@ -76,9 +79,9 @@ def _scaled(stack: Stack, carried: Terms) -> Stack:
 def _less_forward(medium: Interface | Medium, carried: Terms) -> Medium:
     assert isinstance(medium, Medium)
     dtype = jnp.result_type(*(leaf for leaf in jax.tree.leaves(medium) if eqx.is_array(leaf)), jnp.float32)
-    _, onward = truncated(medium.phase, False, carried, dtype)
+    _, onward, _ = truncated(medium.phase, False, carried, dtype)
     if medium.f0 is not None:
-        _, fifth = truncated(medium.phase, True, carried, dtype)
+        _, fifth, _ = truncated(medium.phase, True, carried, dtype)
         onward = medium.f0 * onward + (1.0 - medium.f0) * fifth
     left = 1.0 - medium.albedo * onward
     return eqx.tree_at(lambda m: (m.thickness, m.albedo), medium, (medium.thickness * left, medium.albedo / left))
@@ -124,11 +127,11 @@ def _legendre_functions(cosine: Array, sine: Array, modes: int, count: int) -> A
     return jax.lax.scan(step, (zero, zero), factors)[1] * half
 
 
-def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any) -> tuple[Array, Array]:
-    """Moments that a grid carries, and the share of a collision that goes straight on.
+def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any) -> tuple[Array, Array, Array]:
+    """Moments that a grid carries, and the shares of a collision that go straight on and straight back.
 
     A backward peak is cut off, and smoothly, so that slabs do not gain energy (see `slab`): what it has beyond counts
-    from the second collision on, and less with each.
+    from the second collision on, and less with each. One that is far narrower than nodes are apart goes straight back.
 
     Args:
         phase: one that has moments.
@@ -136,20 +139,20 @@ def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any
         carried: which moments.
         dtype: of the numbers.
     """
-    degree = np.arange(carried.most + 1)
+    count = NARROW * carried.backward + 1
     if is_schlick:
-        chi = moments_by_quadrature(lambda wi, wo: _fifth(wi, wo) * phase.pdf(wi, wo), degree.size, dtype)
+        chi = moments_by_quadrature(lambda wi, wo: _fifth(wi, wo) * phase.pdf(wi, wo), count, dtype)
     else:
-        found = phase.moments(degree.size)
+        found = phase.moments(count)
         assert found is not None
         chi = jnp.asarray(found, dtype)
     before, last = chi[carried.forward - 1], chi[carried.forward]
-    onward = at_least(jnp.minimum(before, last), 0.0)
+    points_back = before * last < 0.0
+    onward, back = at_least(jnp.minimum(before, last), 0.0), jnp.where(points_back, jnp.abs(chi[-1]), 0.0)
+    degree = np.arange(carried.most)
     beyond = np.clip((degree - carried.backward) / (carried.backward // 2), 0.0, 1.0)
-    kept = jnp.where(
-        before * last < 0.0, jnp.asarray(np.cos(0.5 * np.pi * beyond) ** 2, dtype), degree < carried.forward
-    )
-    return (kept * (chi - onward))[:-1], onward
+    kept = jnp.where(points_back, jnp.asarray(np.cos(0.5 * np.pi * beyond) ** 2, dtype), degree < carried.forward)
+    return kept * (chi[: carried.most] - onward - jnp.asarray((-1.0) ** degree, dtype) * back), onward, back
 
 
 def _fifth(wi: Vector, wo: Vector) -> Array:

@@ -96,6 +96,12 @@ class AddingDoubling(DeterministicTransport):
     beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the
     same error or less.
 
+    Of a forward peak of Henyey-Greenstein the grid carries what it resolves; the rest of it goes straight on (delta-M,
+    Wiscombe 1977), and light scattered once is corrected for that (TMS, Nakajima & Tanaka 1988). Seen through a bare
+    slab of thickness 2, at 17 degrees or more from the way of the light, errors were 3e-2 at 12 nodes, 2e-3 at 24 for g
+    0.9; 6e-3 at 48, 3e-4 at 96 for g 0.97; 2e-2 at 96 for g 0.99; nearer to that way they grow. Of g -0.97, reflection
+    was right to 7e-3 at 48 nodes and to 1e-3 at 96.
+
     To be differentiated once, forward or backward: second derivatives may be NaN.
 
     Args:
