@@ -138,23 +138,23 @@ def _balanced(kernel: Kernel, phase: PhaseFunction) -> Kernel:
     return Kernel(balanced(kernel.plain), schlick, kernel.area, kernel.cosine, kernel.solid, kernel.azimuths)
 
 
-def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: bool | None = None) -> Layer:
-    """The medium as a layer: by eigenvectors, or (if None: in single precision) by so many doublings.
-
-    steps: see `doublings`; None: decided at run time.
-    """
+def medium_layer(medium: Medium, kernel: Kernel, doubled: bool | None = None) -> Layer:
+    """The medium as a layer: by eigenvectors, or (if None: in single precision) by doublings."""
     thickness = _column(medium.thickness, kernel)
     direct = _direct(kernel, thickness)
     if is_known(medium.albedo, 0.0):
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
     if thickness.dtype != jnp.float64 if doubled is None else doubled:
-        return _by_doublings(kernel, strength, thickness, direct, steps)
+        return _by_doublings(kernel, strength, thickness, direct)
     return _by_eigenvectors(kernel, strength, thickness, direct)
 
 
-def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array, steps: int | None) -> Layer:
-    """The medium doubled up from a thin slab."""
+def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
+    """The medium doubled up from a thin slab.
+
+    How often is decided as it runs: one program does for every thickness.
+    """
 
     @jax.checkpoint
     def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
@@ -167,17 +167,13 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
     def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
         part = thickness * depth
         arguments = rest, _once(kernel, strength, part), _direct(kernel, part)
-        if steps is not None:
-            return doubled(*arguments), None
         return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
 
-    most = MOST_STEPS if steps is None else steps
-    depths = jnp.asarray(2.0 ** np.arange(-most, 0), thickness.dtype)
-    first = depths[0]
-    if steps is None:
-        # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
-        largest = jax.lax.stop_gradient(jnp.max(thickness))
-        first = depths[jnp.clip(most - jnp.ceil(jnp.log2(largest / THIN + 1e-30)), 0, most - 1).astype(jnp.int32)]
+    depths = jnp.asarray(2.0 ** np.arange(-MOST_STEPS, 0), thickness.dtype)
+    # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
+    largest = jax.lax.stop_gradient(jnp.max(thickness))
+    passed_over = MOST_STEPS - jnp.ceil(jnp.log2(largest / THIN + 1e-30))
+    first = depths[jnp.clip(passed_over, 0, MOST_STEPS - 1).astype(jnp.int32)]
     start = _twice(kernel, strength, thickness * first)
     rest, _ = jax.lax.scan(step, start, depths)
     return _layer(kernel, _once(kernel, strength, thickness), rest, direct)
@@ -209,14 +205,6 @@ def _layer(kernel: Kernel, once: Pair, rest: Pair, direct: Array) -> Layer:
         return Parts(kernel.turn(parts.first), kernel.turn(parts.rest))
 
     return Layer(reflect, turned_parts(reflect), transmit, turned_parts(transmit), direct, kernel.turn_row(direct))
-
-
-def doublings(thickness: Any) -> int | None:
-    """Steps from a slab no thicker than `THIN`; None, decided at run time, if the thickness is not known yet."""
-    if isinstance(thickness, jax.core.Tracer):
-        return None
-    largest = float(np.max(np.asarray(thickness)))
-    return max(1, int(np.ceil(np.log2(max(largest, THIN) / THIN))))
 
 
 def _direct(kernel: Kernel, thickness: Array) -> Array:
