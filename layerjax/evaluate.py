@@ -23,7 +23,7 @@ from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture
-from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
+from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at, prepared_for_energies
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.known_directions import (
@@ -182,7 +182,7 @@ def albedo(
         mapped, chosen, at = _mapped(stack, transport, shape, wi)
         given = chosen.needed(key, "albedo")
         return maps.energies(mapped, chosen, at, at.spread(wi), channel_count(stack), nodes, given)
-    prepared = prepared_at(stack, transport, wi.dtype)
+    prepared = prepared_for_energies(stack, transport, wi.dtype)
     return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
 

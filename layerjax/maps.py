@@ -189,7 +189,7 @@ def energies(
     """Scattered energy of every texel on wi's side and on the other, ``at.result + (channels,)`` each."""
 
     def one(stack: Stack, wi: Array, key: Array | None) -> tuple[Array, Array]:
-        return transport.energies(transport.prepare(stack), wi, channels, nodes, key)
+        return transport.energies(transport.prepare_energies(stack), wi, channels, nodes, key)
 
     near, far = _along(one, stack, transport, at, (wi,), key, together=1)
     return at.gathered(near), at.gathered(far)
