@@ -157,7 +157,8 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
     """
 
     @jax.checkpoint
-    def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
+    def doubled(rest: Pair, part: Array) -> Pair:
+        once, passed = _once(kernel, strength, part), _direct(kernel, part)
         parts = Parts(once[0], rest[0]), Parts(once[1], rest[1])
         reflect, transmit = double(*parts, (passed, kernel.turn_row(passed)), kernel.turn)
         assert reflect is not None
@@ -165,9 +166,7 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
         return reflect, transmit
 
     def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
-        part = thickness * depth
-        arguments = rest, _once(kernel, strength, part), _direct(kernel, part)
-        return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
+        return jax.lax.cond(depth >= first, doubled, lambda rest, _: rest, rest, thickness * depth), None
 
     depths = jnp.asarray(2.0 ** np.arange(-MOST_STEPS, 0), thickness.dtype)
     # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
