@@ -220,6 +220,7 @@ def _along(
     return each_texel(of_components, stack, at, [*parts, *keys], together)
 
 
+@compiled
 def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: Array, *options: Any) -> Array:
     """function(stack, w, *options) of every texel, ``at.result + ...``."""
     own = [] if at.shared else [at.spread(w)]
