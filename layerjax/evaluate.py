@@ -25,7 +25,7 @@ from layerjax.channels import pick
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture, require_material
 from layerjax.numerical_error import neighbours, numerical_error
-from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at
+from layerjax.preparation import Prepared, chosen_for, prepare, prepare_at, prepared_at, prepared_for_energies
 from layerjax.stack import Stack, media_of, optical_depths, require_numbers, simplify
 from layerjax.transport import Side, Transport
 from layerjax.transport.known_directions import (
@@ -208,7 +208,7 @@ def albedo(
         mapped, chosen, at = _mapped(stack, transport, shape, wi)
         given = chosen.needed(key, "albedo")
         return maps.energies(mapped, chosen, at, at.spread(wi), channel_count(stack), nodes, given)
-    prepared = prepared_at(stack, transport, wi.dtype)
+    prepared = prepared_for_energies(stack, transport, wi.dtype)
     return _albedo(prepared, wi, nodes, prepared.transport.needed(key, "albedo"))
 
 

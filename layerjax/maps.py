@@ -189,7 +189,7 @@ def energies(
     """Scattered energy of every texel on wi's side and on the other, ``at.result + (channels,)`` each."""
 
     def one(stack: Stack, wi: Array, key: Array | None) -> tuple[Array, Array]:
-        return transport.energies(transport.prepare(stack), wi, channels, nodes, key)
+        return transport.energies(transport.prepare_energies(stack), wi, channels, nodes, key)
 
     near, far = _along(one, stack, transport, at, (wi,), key, together=1)
     return at.gathered(near), at.gathered(far)
@@ -220,6 +220,7 @@ def _along(
     return each_texel(of_components, stack, at, [*parts, *keys], together)
 
 
+@compiled
 def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: Array, *options: Any) -> Array:
     """function(stack, w, *options) of every texel, ``at.result + ...``."""
     own = [] if at.shared else [at.spread(w)]

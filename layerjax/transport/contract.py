@@ -76,6 +76,10 @@ class Transport(eqx.Module):
         """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 
+    def prepare_energies(self, stack: Stack) -> Any:
+        """`prepare` for `energies` alone, for transports that need less for these."""
+        return self.prepare(stack)
+
     @abc.abstractmethod
     def sample(self, state: Any, wi: Vector, uniforms: Uniforms) -> Vector:
         """Outgoing directions from three uniform numbers each."""

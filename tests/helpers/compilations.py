@@ -1,7 +1,11 @@
-"""`pytest --compilations N`: the N tests and files that compile longest, with what they trace, lower and compile."""
+"""`pytest --compilations N`: the N tests and files that compile longest, with what they trace, lower and compile.
+
+And `compiled_by`: the programs that a call compiles.
+"""
 
 import time
 from collections import defaultdict
+from functools import cache
 
 import jax
 import pytest
@@ -12,6 +16,27 @@ STAGES = {
     "/jax/core/compile/backend_compile_duration": "compile",
 }
 COLUMNS = ("programs", *STAGES.values(), "cpu")
+
+
+def compiled_by(call):
+    """Names of the programs that call() compiles, or takes out of the cache on disk."""
+    programs = _programs()
+    programs.clear()
+    jax.block_until_ready(call())
+    return list(programs)
+
+
+@cache
+def _programs():
+    """A list to which every program adds its name: listeners stay for good, so that there is one."""
+    programs = []
+
+    def stage_ends(event, _, **known):
+        if STAGES.get(event) == "compile":
+            programs.append(known.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(stage_ends)
+    return programs
 
 
 def pytest_addoption(parser):

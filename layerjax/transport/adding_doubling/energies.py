@@ -11,9 +11,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, horizon, not_negative
-from layerjax.channels import Channels, each, total
+from layerjax._numerics import at_least, at_most, horizon, not_negative
+from layerjax.channels import Channels, each, select, times, total
 from layerjax.directions import Vector, flip
+from layerjax.microsurface import Microfacets
 from layerjax.stack import Interface, Stack
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
@@ -42,8 +43,8 @@ def outer_faces(stack: Stack, layers: list[Layer]) -> tuple[Face | None, Face | 
 
 
 def node_shares(whole: Face, face: Face | None, weight: Array) -> Array:
-    """For light along every node, (4, channels or 1, directions): of what masking takes at the first face, what comes
-    back and what does not enter; of what enters, what leaves on the same side and on the other.
+    """For light along every node, (3, channels or 1, directions): of what masking takes at the first face, what does
+    not enter after all; of what enters, what leaves on the same side and on the other.
 
     Where the first layer is a medium all enters that no single event sends back.
     """
@@ -56,13 +57,12 @@ def node_shares(whole: Face, face: Face | None, weight: Array) -> Array:
 
     once, again, far = energy(whole.reflect.first), energy(whole.reflect.rest), energy(whole.transmit.total)
     if face is None:
-        nothing = jnp.zeros_like(once)
-        rows = [nothing, nothing, _share(again, 1.0 - once, weight), _share(far, 1.0 - once, weight)]
+        rows = [jnp.zeros_like(once), _share(again, 1.0 - once, weight), _share(far, 1.0 - once, weight)]
     else:
         back, entered = energy(face.reflect.rest), energy(face.transmit.total)
         lost = 1.0 - once - energy(face.transmit.first)
-        rows = [_share(back, lost, weight), _share(1.0 - once - entered, lost, weight)]
-        rows += [_share(again - back, entered, weight), _share(far, entered, weight)]
+        rows = [_share(1.0 - once - entered, lost, weight), _share(again - back, entered, weight)]
+        rows.append(_share(far, entered, weight))
     channels = max(row.shape[0] for row in rows)
     return jnp.stack([jnp.broadcast_to(row, (channels, weight.size)) for row in rows])
 
@@ -75,26 +75,24 @@ def _share(part: Array, whole: Array, weight: Array) -> Array:
     return (part * whole + LEAST_SHARED**2 * jnp.clip(mean, 0.0, 1.0)) / (whole * whole + LEAST_SHARED**2)
 
 
-def directional_albedo(first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int) -> tuple[Channels, Channels]:
-    """Energy that leaves on wi's side and on the other; shares: the four of `node_shares` along wi."""
+def directional_albedo(
+    first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int, microfacets: Microfacets
+) -> tuple[Channels, Channels]:
+    """Energy that leaves on wi's side and on the other; shares: the three of `node_shares` along wi."""
     single = SingleScattering()
     sides = [(first.upper, wi)] + ([] if first.lower is None else [(first.lower, flip(wi))])
     once = total([single.albedo(media, w, nodes)[0] for media, w in sides])
     lost = total([(_lost(media, w, once[0], nodes),) for media, w in sides])
-    back, out, near, far = shares
-
-    def entered(once: Array, lost: Array, out: Array) -> Array:
-        return at_least(1.0 - once - lost * out, 0.0)
-
-    inside = each(entered, once, lost, out)
-    near, far = none_negative(near, far)
-    same = each(
-        lambda once, lost, back, inside, near: once + lost * back + inside * near, once, lost, back, inside, near
+    near, far = none_negative(*shares[1:])
+    stays = each(
+        lambda once, lost, out: at_most(at_least(lost * out, 0.0), at_least(1.0 - once, 0.0)), once, lost, shares[0]
     )
+    inside = each(lambda once, stays: at_least(1.0 - once - stays, 0.0), once, stays)
+    parts = [once, times(inside, near)] + ([stays] if microfacets == "multiple" else [])  # else masking absorbs it
     visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if first.lower is None:
         visible = visible & (wi[2] > 0)
-    return _where(visible, same), _where(visible, each(jnp.multiply, inside, far))
+    return select(visible, total(parts)), select(visible, times(inside, far))
 
 
 def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
@@ -116,7 +114,3 @@ def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
         return not_negative(not_negative(one) + (other - not_negative(other)))
 
     return each(kept, near, far), each(kept, far, near)
-
-
-def _where(visible: Array, energies: Channels) -> Channels:
-    return tuple(jnp.where(visible, energy, 0.0) for energy in energies)

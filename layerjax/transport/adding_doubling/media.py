@@ -150,11 +150,8 @@ def _balanced(kernel: Kernel) -> Kernel:
     return Kernel(balanced(kernel.plain), schlick, kernel.area, kernel.cosine, kernel.solid, kernel.azimuths)
 
 
-def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: bool | None = None) -> Layer:
-    """The medium as a layer: by eigenvectors, or (if None: in single precision) by so many doublings.
-
-    steps: see `doublings`; None: decided at run time.
-    """
+def medium_layer(medium: Medium, kernel: Kernel, doubled: bool | None = None) -> Layer:
+    """The medium as a layer: by eigenvectors, or (if None: in single precision) by doublings."""
     thickness = _column(medium.thickness, kernel)
     kernel = _less_onward(medium, kernel)
     direct = _direct(kernel, thickness)
@@ -162,7 +159,7 @@ def medium_layer(medium: Medium, kernel: Kernel, steps: int | None, doubled: boo
         return Layer(Parts(None), direct_down=direct, direct_up=kernel.turn_row(direct))
     strength = _strength(medium, kernel)
     if thickness.dtype != jnp.float64 if doubled is None else doubled:
-        return _by_doublings(kernel, strength, thickness, direct, steps)
+        return _by_doublings(kernel, strength, thickness, direct)
     return _by_eigenvectors(kernel, strength, thickness, direct)
 
 
@@ -177,11 +174,15 @@ def _less_onward(medium: Medium, kernel: Kernel) -> Kernel:
     return eqx.tree_at(lambda k: k.area, kernel, kernel.area - _column(medium.albedo, kernel) * onward)
 
 
-def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array, steps: int | None) -> Layer:
-    """The medium doubled up from a thin slab."""
+def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Array) -> Layer:
+    """The medium doubled up from a thin slab.
+
+    How often is decided as it runs: one program does for every thickness.
+    """
 
     @jax.checkpoint
-    def doubled(rest: Pair, once: Pair, passed: Array) -> Pair:
+    def doubled(rest: Pair, part: Array) -> Pair:
+        once, passed = _once(kernel, strength, part), _direct(kernel, part)
         parts = Parts(once[0], rest[0]), Parts(once[1], rest[1])
         reflect, transmit = double(*parts, (passed, kernel.turn_row(passed)), kernel.turn)
         assert reflect is not None
@@ -189,19 +190,13 @@ def _by_doublings(kernel: Kernel, strength: Pair, thickness: Array, direct: Arra
         return reflect, transmit
 
     def step(rest: Pair, depth: Array) -> tuple[Pair, None]:
-        part = thickness * depth
-        arguments = rest, _once(kernel, strength, part), _direct(kernel, part)
-        if steps is not None:
-            return doubled(*arguments), None
-        return jax.lax.cond(depth >= first, doubled, lambda rest, *_: rest, *arguments), None
+        return jax.lax.cond(depth >= first, doubled, lambda rest, _: rest, rest, thickness * depth), None
 
-    most = MOST_STEPS if steps is None else steps
-    depths = jnp.asarray(2.0 ** np.arange(-most, 0), thickness.dtype)
-    first = depths[0]
-    if steps is None:
-        # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
-        largest = jax.lax.stop_gradient(jnp.max(thickness))
-        first = depths[jnp.clip(most - jnp.ceil(jnp.log2(largest / THIN + 1e-30)), 0, most - 1).astype(jnp.int32)]
+    depths = jnp.asarray(2.0 ** np.arange(-MOST_STEPS, 0), thickness.dtype)
+    # thin slabs are passed over, down to the one that the thickness asks for; no derivative is in that
+    largest = jax.lax.stop_gradient(jnp.max(thickness))
+    passed_over = MOST_STEPS - jnp.ceil(jnp.log2(largest / THIN + 1e-30))
+    first = depths[jnp.clip(passed_over, 0, MOST_STEPS - 1).astype(jnp.int32)]
     start = _twice(kernel, strength, thickness * first)
     rest, _ = jax.lax.scan(step, start, depths)
     return _layer(kernel, _once(kernel, strength, thickness), rest, direct)
@@ -233,14 +228,6 @@ def _layer(kernel: Kernel, once: Pair, rest: Pair, direct: Array) -> Layer:
         return Parts(kernel.turn(parts.first), kernel.turn(parts.rest))
 
     return Layer(reflect, turned_parts(reflect), transmit, turned_parts(transmit), direct, kernel.turn_row(direct))
-
-
-def doublings(thickness: Any) -> int | None:
-    """Steps from a slab no thicker than `THIN`; None, decided at run time, if the thickness is not known yet."""
-    if isinstance(thickness, jax.core.Tracer):
-        return None
-    largest = float(np.max(np.asarray(thickness)))
-    return max(1, int(np.ceil(np.log2(max(largest, THIN) / THIN))))
 
 
 def _direct(kernel: Kernel, thickness: Array) -> Array:

@@ -17,7 +17,7 @@ from jax import Array
 
 from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
-from layerjax.stack import Interface, Medium, Stack
+from layerjax.stack import Interface, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
@@ -26,7 +26,7 @@ from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
 from layerjax.transport.adding_doubling.interfaces import interface_layer
-from layerjax.transport.adding_doubling.media import Kernel, doublings, kernel_modes, kernel_ordinates, medium_layer
+from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
@@ -43,21 +43,16 @@ class Plan(eqx.Module):
     nodes: int = eqx.field(static=True)
     modes: int = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
-    steps: tuple[int | None, ...] = eqx.field(static=True)
     ranks: tuple[int, ...] | None = eqx.field(static=True)
     microfacets: Microfacets = eqx.field(static=True)
 
 
 def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) -> Plan:
     """The plan for a simplified stack."""
-    doubles = _dtype(stack) != jnp.float64  # else nothing goes by the number of steps, and one program does for all
-    steps = tuple(
-        doublings(layer.thickness) if doubles else None for layer in stack.layers if isinstance(layer, Medium)
-    )
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, steps, _ranks(stack), microfacets)
-    return Plan(resolution.nodes, resolution.modes, None, steps, _ranks(stack), microfacets)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, _ranks(stack), microfacets)
+    return Plan(resolution.nodes, resolution.modes, None, _ranks(stack), microfacets)
 
 
 def solve(
@@ -75,7 +70,7 @@ def solve(
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
     faces = _interfaces(stack, plan, indices, asked)
     solved: list[tuple[Layer, bool]] = []
-    region, steps = 0, list(plan.steps)
+    region = 0
     for layer in stack.layers:
         if isinstance(layer, Interface):
             solved.append((faces[region], False))
@@ -84,7 +79,7 @@ def solve(
             tilted = plan.azimuths is not None and is_tilted(layer)
             of_medium = partial(_kernel, plan, region, layer.f0 is not None, tilted, dtype)
             kernel = element(of_medium, (indices, layer.phase), None, dtype)
-            solved.append((medium_layer(layer, kernel, steps.pop(0)), tilted))
+            solved.append((medium_layer(layer, kernel), tilted))
     if stack.base is not None:
         build = partial(_base, plan, region, dtype)
         solved.append((element(build, (indices, stack.base), None, dtype), False))

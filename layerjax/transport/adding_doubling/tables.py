@@ -39,7 +39,7 @@ class Tables(eqx.Module):
     above to below. `steps`: of the azimuth from 0 to pi, with one more point beyond either end.
 
     energies: a row for light from above and one for light from below, per channel, for each direction in. Where there
-    are interfaces, the four shares of `node_shares`; else what is scattered to the same side and the other, as a share
+    are interfaces, the shares of `node_shares`; else what is scattered to the same side and the other, as a share
     of what meets an event.
     """
 

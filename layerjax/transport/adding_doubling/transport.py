@@ -190,6 +190,10 @@ class AddingDoubling(DeterministicTransport):
         carried, once = _as_carried(stack, plan)
         return Solved(first, _solve(stack, first, once, plan), None, straight(carried), once)
 
+    def prepare_energies(self, stack: Stack) -> Solved:
+        """Energies are means over azimuth: of Fourier modes the first is all they need."""
+        return dataclasses.replace(self, modes=1).prepare(stack)
+
     def prepare_for(self, stack: Stack, known: Known) -> Solved:
         found = followed(stack, known) if self.orders != "first" else None
         if found is None:
@@ -269,7 +273,7 @@ class AddingDoubling(DeterministicTransport):
         if state.tables is not None and self.orders == "all":
             energies = read_energies(state.tables, wi)
             if state.first.layered:
-                return directional_albedo(state.scaled or state.first, energies, wi, nodes)
+                return directional_albedo(state.scaled or state.first, energies, wi, nodes, self.microfacets)
             met = interaction_probability(state.first, wi)
             near, far = none_negative(*energies)
             return (near, far) if met is None else (times(near, met), times(far, met))

@@ -152,7 +152,7 @@ def layer(medium, doubled):
         kernel = media.kernel_modes(medium.phase, False, region, 4, terms(4, False))
     else:
         kernel = media.kernel_ordinates(medium.phase, False, region, 8)
-    return media.medium_layer(medium, kernel, None, doubled)
+    return media.medium_layer(medium, kernel, doubled)
 
 
 def assert_close(one, other, atol):
