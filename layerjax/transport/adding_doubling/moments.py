@@ -139,16 +139,16 @@ def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any
         carried: which moments.
         dtype: of the numbers.
     """
-    count = NARROW * carried.backward + 1
     if is_schlick:
-        chi = moments_by_quadrature(lambda wi, wo: _fifth(wi, wo) * phase.pdf(wi, wo), count, dtype)
+        chi = moments_by_quadrature(lambda wi, wo: _fifth(wi, wo) * phase.pdf(wi, wo), carried.most + 1, dtype)
     else:
-        found = phase.moments(count)
+        found = phase.moments(NARROW * carried.backward + 1)
         assert found is not None
         chi = jnp.asarray(found, dtype)
     before, last = chi[carried.forward - 1], chi[carried.forward]
     points_back = before * last < 0.0
-    onward, back = at_least(jnp.minimum(before, last), 0.0), jnp.where(points_back, jnp.abs(chi[-1]), 0.0)
+    onward = at_least(jnp.minimum(before, last), 0.0)
+    back = jnp.where(points_back & (not is_schlick), jnp.abs(chi[-1]), 0.0)  # that factor is 0 straight back
     degree = np.arange(carried.most)
     beyond = np.clip((degree - carried.backward) / (carried.backward // 2), 0.0, 1.0)
     kept = jnp.where(points_back, jnp.asarray(np.cos(0.5 * np.pi * beyond) ** 2, dtype), degree < carried.forward)

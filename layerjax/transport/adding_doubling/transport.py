@@ -336,10 +336,12 @@ class AddingDoubling(DeterministicTransport):
             state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
             values = options.measured(state, wi, wo, "all", channel_count(stack), None)[0]
             # what is known in closed form does not change, and where it is a narrow peak it must not set the scale
-            solved, rest = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, straight=None)
-            found = solved.measured(rest, wi, wo, "all", channel_count(stack), None)[0]
+            solved, without = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, straight=None)
+            found = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
+            without = dataclasses.replace(without, scaled=None)
+            rest = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
             if before is not None:
-                change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(found))))
+                change = float(jnp.max(safe_div(jnp.abs(found - before), values + 0.1 * jnp.mean(rest))))
                 if change <= self.tolerance:
                     return options
             before = found

@@ -221,7 +221,7 @@ def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
         "layerjax.transport.adding_doubling.transport.rungs",
         lambda stack: [Resolution(2, 1, (2, 4)), Resolution(3, 2, (2, 4))],
     )
-    stack = Stack([Medium(1e-3, 0.9, HenyeyGreenstein(0.99))])
+    stack = Stack([Medium(1e-3, 0.9, lj.SGGX("surface", 0.05))])
     with pytest.raises(ValueError, match=r"0\.01 is not reached"):
         lj.choose_transport(stack, transport=lj.AddingDoubling(tolerance=0.01))
 
