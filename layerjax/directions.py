@@ -49,9 +49,9 @@ def direction(theta: ArrayLike, phi: ArrayLike, *, degrees: bool = False) -> Arr
         ValueError: a polar angle that is known lies outside [-pi, pi], as one in degrees would.
     """
     require_choice("degrees", degrees, (True, False))
-    _require_polar(theta, degrees)
     with jax.ensure_compile_time_eval():  # known angles give known directions, under jit too
         polar, azimuth = floating("theta", theta), floating("phi", phi)
+        _require_polar(theta, degrees)
         if degrees:
             polar, azimuth = jnp.deg2rad(polar), jnp.deg2rad(azimuth)
         theta, phi = jnp.broadcast_arrays(polar, azimuth)

@@ -25,7 +25,7 @@ FUNCTIONS = {
     "albedo": {**LIT, **SINGLE, "nodes": 8, "key": KEY},
     "unscattered": LIT,
     "prepare": {"stack": STACK, **SINGLE},
-    "choose_transport": {"stack": STACK, **SINGLE},
+    "choose_transport": {**PAIR, **SINGLE},
     "goniophotometer": {
         **LIT,
         "key": KEY,
@@ -115,7 +115,14 @@ def test_unknown_arguments_are_named(name):
 def test_all_public_names_are_asked():
     """What is left: data, results, and contracts that are derived from."""
     public = {name for name, value in vars(lj).items() if callable(value) and not name.startswith("_")}
-    assert public - {*FUNCTIONS, *CLASSES} == {"PhaseFunction", "Transport", "Prepared", "Goniogram", "Rayleigh"}
+    assert public - {*FUNCTIONS, *CLASSES} == {
+        "PhaseFunction",
+        "Transport",
+        "Prepared",
+        "Goniogram",
+        "Rayleigh",
+        "ResolutionWarning",
+    }
     for name, arguments in FUNCTIONS.items():
         assert not [one for one in inspect.signature(getattr(lj, name)).parameters if one not in arguments], name
 

@@ -97,8 +97,8 @@ def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, m
     """Of light from every near node, by facets: where to and how much is refracted."""
     ratio = far.ior / near.ior
     if normals.distribution == "vmf":
-        points = max(ENERGY_POINTS[0], polar_count(grid) // 2), azimuth_count(grid, modes)
-        return refracted_rays(near, ratio, normals, points)
+        # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
+        return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     return _through(wi, m, dot(wi, m), weight, ratio, normals)
 

@@ -198,7 +198,7 @@ FAULTS = {
     "no spectrum": (METAL, {"to": "zemax", "wavelengths": [450, 550, 650]}, "a file for 'zemax' has none"),
     "random": (METAL, {"to": "rgl", "transport": lj.RandomWalk(paths=8)}, "RandomWalk is random"),
     "free": (lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0))), {"to": "rgl"}, "this stack describes a family"),
-    "no stack": ("copper", {"to": "rgl"}, "material is a str, must be a Stack, a Mixture or a Fit"),
+    "no stack": ("copper", {"to": "rgl"}, "material is 'copper', must be a Stack, a Mixture or a Fit"),
 }
 
 

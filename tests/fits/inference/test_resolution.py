@@ -73,9 +73,14 @@ def test_a_fit_is_refined_until_its_error_is_a_tenth_of_the_noise(refined, sharp
     assert found.minima[0].count == 2
 
 
+def as_fine(transport, other):
+    """In nodes and modes: no medium here asks for ordinates."""
+    return (transport.nodes, transport.modes) == (other.nodes, other.modes)
+
+
 def test_a_coarse_one_stays_where_it_will_do():
     found = fit(STACK, measured(WIDE, 0.05), starts=2)
-    assert found.problem.transport == COARSE
+    assert as_fine(found.problem.transport, COARSE)
     assert found.numerical_error <= ENOUGH
 
 
@@ -93,7 +98,7 @@ def test_the_finest_resolution_is_told(sharp, monkeypatch):
     monkeypatch.setattr(resolution_module, "FINEST_NODES", 6)
     monkeypatch.setattr(resolution_module, "FINEST_MODES", 12)
     found = fit(STACK, sharp, starts=1)
-    assert found.problem.transport == COARSE
+    assert as_fine(found.problem.transport, COARSE)
     assert re.search(r"up to .* sigma at 6 nodes, 12 modes, the finest tried", found.status)
 
 
