@@ -59,9 +59,12 @@ Measured on bare media, the worst of all directions. Seen through, that is along
 4e-4; g 0.9, 32, 1e-2, 48, 8e-4, 64, 3e-5. Over paint: g 0.8, 16, 2e-3, 24, 5e-5; g 0.9, 16, 7e-3, 24, 5e-4.
 """
 
-COSINES = 5.0
-"""Needed where azimuths are ordinates too, times the width of the narrowest lobe. Measured on lying fibers over paint:
-alpha 0.3, 16 cosines and 28 azimuths, 3e-3 at 80 degrees; alpha 0.2, 16 and 28, 2e-2; alpha 0.1, 20 and 48, 9e-3."""
+COSINES, COSINES_UNDER = 5.0, 3.2
+"""Needed where azimuths are ordinates too, times the width of the narrowest lobe, bare and behind an interface.
+
+Measured on lying fibers over paint, up to 80 degrees: alpha 0.3, 16 cosines and 28 azimuths, 3e-3; alpha 0.2, 16 and
+28, 2e-2, under an interface of alpha 0.1 1e-3; alpha 0.1, 20 and 48, 9e-3.
+"""
 
 LEAST_COSINE, LEAST_BARE = 0.4, 0.25
 """Cosine of light inside a stack, as far as its lobes are to be resolved, and where media stand bare: flakes of alpha
@@ -145,7 +148,7 @@ def _needed(stack: Stack, followed: bool, assumed: float = ASSUMED_WIDTH) -> Nee
             continue
         nodes = max(nodes, NODES / (width * _inclined(index or NODES_AS_UNDER)))
         modes = max(modes, MODES / (width * (LEAST_BARE if index is None else _inclined(index) * index)))
-        cosines = max(cosines, COSINES / width)
+        cosines = max(cosines, (COSINES if index is None else COSINES_UNDER) / width)
     for width in _forward_peaks(stack, assumed):
         nodes, modes = max(nodes, 1.0 / width), max(modes, MODES_OF_PEAKS / width)
     return Needed(nodes, modes, cosines)

@@ -176,7 +176,7 @@ class AddingDoubling(DeterministicTransport):
         if short is not None:
             warnings.warn(
                 f"AddingDoubling: the lobes of this stack are too narrow for an error of 1e-3: {short}; "
-                "evaluate_with_error tells the error, and nodes and modes can be given",
+                "evaluate_with_error tells the error, and a resolution can be given",
                 ResolutionWarning,
                 stacklevel=_frames_inside(),
             )
