@@ -130,13 +130,13 @@ def evaluate_with_error(
         require_single(stack, "evaluate_with_error")
     if isinstance(stack, Mixture):
         return _mixed_with_error(stack, wi, wo, transport, side, key)
-    around = neighbours(wi, wo)
-    known = cache(partial(known_directions, *around))
+    around = cache(partial(neighbours, wi, wo))  # walks need none
+    known = cache(lambda: known_directions(*around()))
     prepared = prepared_at(stack, transport, wi.dtype, known)
     key = prepared.transport.needed(key, "evaluate_with_error")
     others = _compared(stack, prepared.transport, known)  # refuses before anything is evaluated
     if others is not None:
-        return numerical_error(prepared, in_precision(others, wi.dtype), *around, side)
+        return numerical_error(prepared, in_precision(others, wi.dtype), *around(), side)
     values, errors = _evaluate(prepared, wi, wo, side, key)
     assert errors is not None
     return values, errors

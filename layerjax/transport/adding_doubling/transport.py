@@ -61,7 +61,6 @@ Orders = Literal["all", "first", "multiple"]
 MOST = 1024
 """Largest number of nodes, modes, cosines or azimuths; tables of more fit in no memory."""
 
-
 FACETS_ERROR = 6e-5
 """Relative, of sums over the facets of interfaces at any resolution: up to three times that was seen."""
 
