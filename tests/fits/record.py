@@ -1,0 +1,296 @@
+"""A record of what `fits` finds on the shipped data and examples, to compare a changed `fits` with.
+
+    python -m tests.fits.record write [CASE ...]      # computes the cases (all by default) and keeps them
+    python -m tests.fits.record check [CASE ...]      # computes them again, and prints and counts what differs
+
+The numbers stand in `tests/data/record.json`. Costs agree to 1e-6 of themselves, values to 0.01 standard errors, standard
+errors and predictions to 1e-3, elpd differences to a hundredth of their error, quantiles of a posterior to 0.1 sd.
+Every case takes from seconds to minutes, which is why no test runs them.
+"""
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import fits
+import layerjax as lj
+
+ROOT = Path(__file__).parents[2]
+RECORD = ROOT / "tests" / "data" / "record.json"
+EXAMPLES = ROOT / "examples"
+COATINGS = EXAMPLES / "arizona_black_coatings"
+STARTS = 4
+
+COST, ERRORS, VALUES, QUANTILES, ELPD = 1e-6, 1e-3, 0.01, 0.1, 0.01
+"""Relative difference of costs and of standard errors; difference of values in standard errors, of quantiles in
+posterior standard deviations, of elpd differences in their standard errors."""
+
+
+# ---- what is read from a result: the only places that know its attributes ----
+
+
+def of_fit(fit: Any) -> dict[str, Any]:
+    """Optimum, cost, errors and identifiability."""
+    return {
+        "cost": fit.cost,
+        "values": fit.values,
+        "standard_errors": fit.standard_errors,
+        "at_bound": sorted(fit.at_bound),
+        "unidentified": [sorted(direction.weights) for direction in fit.unresolved],
+        "insensitive": sorted(fit.without_influence),
+        "reduced_chi_square": fit.reduced_chi_square,
+    }
+
+
+def of_prediction(prediction: Any) -> dict[str, Any]:
+    """Means, intervals and scores of held-out data, at every tenth of the points."""
+    return {
+        "mean": prediction.mean[::10].ravel().tolist(),
+        "low": prediction.quantile(0.025)[::10].ravel().tolist(),
+        "high": prediction.quantile(0.975)[::10].ravel().tolist(),
+        "median_error": prediction.scores.median_error,
+    }
+
+
+def of_comparison(comparison: Any) -> dict[str, Any]:
+    """Ranking and elpd differences."""
+    return {
+        "ranking": [row.name for row in comparison.rows],
+        "elpd_diff": {row.name: row.foresight.behind for row in comparison.rows},
+        "dse": {row.name: row.foresight.behind_error for row in comparison.rows},
+        "weight": {row.name: row.foresight.weight for row in comparison.rows},
+    }
+
+
+def of_search(search: Any) -> dict[str, Any]:
+    """Ranking and what cannot be told from the best."""
+    return {
+        "ranking": [one.name for one in search.found],
+        "indistinguishable": sorted(search.alike),
+        "bic": {one.name: one.bic for one in search.found},
+    }
+
+
+def of_map(fitted: Any) -> dict[str, Any]:
+    """Values, errors and flags of every texel."""
+    return {
+        "values": {name: fitted.values[name].ravel().tolist() for name in fitted.names},
+        "errors": {name: fitted.errors[name].ravel().tolist() for name in fitted.names},
+        "poor": int(fitted.has("poor").sum()),
+    }
+
+
+def of_posterior(posterior: Any) -> dict[str, Any]:
+    """Quantiles of every parameter."""
+    quantiles = np.quantile(posterior.samples, (0.05, 0.5, 0.95), axis=0).T.tolist()
+    sds = posterior.samples.std(axis=0).tolist()
+    return {
+        "quantiles": dict(zip(posterior.names, quantiles, strict=True)),
+        "sd": dict(zip(posterior.names, sds, strict=True)),
+    }
+
+
+# ---- the cases ----
+
+
+def example(name: str, data: Path, incidence: tuple[float, ...] | None = None, **options: Any) -> Any:
+    """The fit of a stack file of `examples` to a file of data."""
+    problem = fits.read_problem(EXAMPLES / f"{name}.toml")
+    measured = fits.read(data)
+    if incidence is not None:
+        measured = measured.select(incidence=incidence)
+    return fits.fit(
+        problem.stack,
+        measured,
+        transport=problem.transport,
+        noise=problem.noise,
+        scale=problem.scale,
+        starts=STARTS,
+        **options,
+    )
+
+
+def held_out() -> dict[str, Any]:
+    """A hazy coat on two incidences of a paint, and its prediction of the other two."""
+    data = COATINGS / "aeroglaze_650nm_inplane.csv"
+    fit = example("coated_diffuse", data, (10.0, 50.0))
+    prediction = fits.predict(fit, fits.read(data).select(incidence=[30.0, 70.0]))
+    return of_fit(fit) | {"prediction": of_prediction(prediction)}
+
+
+def joint() -> dict[str, Any]:
+    """One coating in two measurements."""
+    import joint_steel
+
+    return of_fit(fits.fit(fits.Joint(joint_steel.problems(), shared=joint_steel.SHARED), starts=STARTS))
+
+
+def slab() -> dict[str, Any]:
+    """A slab by scans and by an integrating sphere."""
+    import kinds_of_readings as kinds
+
+    solver = lj.AddingDoubling(nodes=8, modes=4)
+    noise = fits.Noise(relative=0.02, floor=1e-6)
+
+    def of(mu_s: Any, mu_a: Any, g: Any) -> Any:
+        return lj.Stack([lj.TurbidMedium(1.0, mu_s, mu_a, lj.HenyeyGreenstein(g))])
+
+    free = of(fits.Free(1.0, 0.1, 20.0), fits.Free(0.3, 0.0, 5.0), fits.Free(0.0, -0.9, 0.9))
+    parts = {
+        "scans": fits.Problem(free, kinds.readings(of(2.0, 0.1, 0.5), solver), solver, noise),
+        "sphere": kinds.sphere(free, 0.30, 0.55, solver),
+    }
+    return of_fit(fits.fit(fits.Joint(parts, shared=["layers"]), starts=STARTS))
+
+
+def mixture() -> dict[str, Any]:
+    """A metal that a coat covers in part."""
+    import kinds_of_readings as kinds
+
+    def partly(covered: Any, alpha: Any) -> Any:
+        coat = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
+        metal = lj.Stack([], lj.Conductor(0.2, 3.9, alpha))
+        return lj.Mixture({"coat": coat, "metal": metal}, {"coat": covered, "metal": None})
+
+    data = kinds.readings(partly(0.7, 0.35))
+    return of_fit(kinds.fit(partly(fits.Free(0.5, 0.0, 1.0), fits.Free(0.3, 0.02, 1.0)), data, lj.Statistical()))
+
+
+def texels() -> dict[str, Any]:
+    """A map of 16 by 16 texels."""
+    from tests.helpers import quick_maps
+
+    with tempfile.TemporaryDirectory() as folder:
+        return of_map(quick_maps.fitted(Path(folder) / "map.zarr", quick_maps.values((16, 16))))
+
+
+def structures() -> dict[str, Any]:
+    """A search among a few structures on simulated data."""
+    from benchmarks.studies.structures import LIBRARY, TRANSPORT
+
+    truth = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
+    geometry = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
+    data = fits.simulate(truth, geometry, transport=TRANSPORT, noise=0.02, seed=0)
+    return of_search(fits.search(data, LIBRARY, layers=1, transport=TRANSPORT, starts=STARTS))
+
+
+def compared() -> dict[str, Any]:
+    """Two stacks on one data set, by cross-validation."""
+    data = COATINGS / "anoblack_ec1_on_al6061_650nm_inplane.csv"
+    found = {name: example(name, data) for name in ("coated_diffuse", "rough_conductor")}
+    return of_comparison(fits.compare(found, refit=True))
+
+
+def posterior() -> dict[str, Any]:
+    """A posterior of two parameters and a scale."""
+    truth = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
+    free = lj.Stack([lj.Interface(fits.Free(1.4, 1.2, 2.2), fits.Free(0.3, 0.02, 1.0))], lj.Lambertian(0.4))
+    geometry = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
+    data = fits.simulate(truth, geometry, transport=lj.Statistical(), noise=0.05, seed=0)
+    fit = fits.fit(free, data, transport=lj.Statistical(), noise=fits.Noise(relative=0.05), starts=STARTS)
+    return of_fit(fit) | of_posterior(fits.sample(fit, ess=2000))
+
+
+DATA = {
+    "aeroglaze": "aeroglaze_650nm_inplane.csv",
+    "anoblack": "anoblack_ec1_on_al6061_650nm_inplane.csv",
+    "nite": "nite_on_blasted_steel1008_650nm_inplane.csv",
+    "nite_hemisphere": "nite_on_blasted_steel1008_650nm_hemisphere.csv",
+    "nite_zemax": "AnoBlackNiTEonSteel.bsdf",
+    "nite_lighttools": "AnoBlackNiTEonSteel.txt",
+}
+STACKS = sorted(path.stem for path in EXAMPLES.glob("*.toml"))
+
+CASES: dict[str, Callable[[], dict[str, Any]]] = {
+    **{f"nite-{stack}": lambda stack=stack: of_fit(example(stack, COATINGS / DATA["nite"])) for stack in STACKS},
+    **{
+        f"{name}-coated_diffuse": lambda file=file: of_fit(example("coated_diffuse", COATINGS / file))
+        for name, file in DATA.items()
+        if name != "nite"
+    },
+    "held_out": held_out,
+    "joint": joint,
+    "slab": slab,
+    "mixture": mixture,
+    "map": texels,
+    "search": structures,
+    "compare": compared,
+    "posterior": posterior,
+}
+
+
+# ---- comparing ----
+
+
+def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> list[str]:
+    """Sentences on what differs by more than the stated tolerances."""
+    said: list[str] = []
+
+    def compare(key: str, one: Any, other: Any, tolerance: float, scale: Any = None) -> None:
+        one, other = np.asarray(one, float), np.asarray(other, float)
+        if one.shape != other.shape:
+            said.append(f"{name}: {key}: shape {other.shape}, was {one.shape}")
+            return
+        unit = np.abs(one) if scale is None else np.asarray(scale, float)
+        same = (one == other) | (np.isnan(one) & np.isnan(other))
+        off = np.where(same, 0.0, np.abs(other - one) / np.where(unit > 0.0, unit, 1.0))
+        if not np.all(off <= tolerance):
+            worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
+            said.append(f"{name}: {key}: {other.flat[worst]:.8g}, was {one.flat[worst]:.8g} (off {off.flat[worst]:.2g})")
+
+    errors = stored.get("standard_errors", stored.get("errors", {}))
+    for key, old in stored.items():
+        new = found[key]
+        if key == "cost" or key == "reduced_chi_square":
+            compare(key, old, new, COST)
+        elif key == "prediction":
+            for part in ("mean", "low", "high", "median_error"):
+                compare(f"prediction {part}", old[part], new[part], ERRORS)
+        elif key == "values":
+            for one in old:
+                compare(f"value of {one}", old[one], new[one], VALUES, np.abs(errors[one]))
+        elif key in ("standard_errors", "errors", "bic"):
+            for one in old:
+                compare(f"{key} of {one}", old[one], new[one], ERRORS)
+        elif key in ("elpd_diff", "weight"):
+            scale = np.fmax(list(stored["dse"].values()), 1.0)
+            compare(key, list(old.values()), [new[one] for one in old], ELPD, scale)
+        elif key == "quantiles":
+            for one in old:
+                compare(f"quantiles of {one}", old[one], new[one], QUANTILES, stored["sd"][one])
+        elif key not in ("dse", "sd") and old != new:
+            said.append(f"{name}: {key}: {new}, was {old}")
+    return said
+
+
+def main() -> int:
+    """Write or check the cases that the command line names."""
+    verb, *names = sys.argv[1:] or ["check"]
+    record = json.loads(RECORD.read_text()) if RECORD.is_file() else {}
+    wrong = 0
+    for name in names or CASES:
+        began = time.perf_counter()
+        found = CASES[name]()
+        seconds = time.perf_counter() - began
+        if verb == "write":
+            record[name] = found
+            RECORD.write_text(json.dumps(record, indent=1, sort_keys=True) + "\n")
+            print(f"{name}: kept, {seconds:.0f} s", flush=True)
+            continue
+        said = differences(name, record[name], found)
+        wrong += len(said)
+        print("\n".join(said) or f"{name}: as it was, {seconds:.0f} s", flush=True)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sys.path.insert(0, str(EXAMPLES))
+    sys.exit(main())
