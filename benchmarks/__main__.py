@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     import jax
 
-    from fits.problem.compiled import devices_of_cores
+    from fits.problem.compilation import devices_of_cores
 
     jax.config.update("jax_enable_x64", True)
     devices_of_cores()

@@ -18,7 +18,7 @@ from matplotlib import pyplot as plt
 
 import fits
 import layerjax as lj
-from fits.reporting.render import LIGHTS, SKY, SUN, sphere
+from fits.reports.render import LIGHTS, SKY, SUN, sphere
 
 mi.set_variant("llvm_ad_rgb")
 import layerjax.mitsuba as plugin  # noqa: E402  (after the variant)

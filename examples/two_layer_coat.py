@@ -17,7 +17,7 @@ import numpy as np
 
 import fits
 import layerjax as lj
-from fits.reporting import verdicts
+from fits.reports import verdicts
 
 TRUTH = {
     "layers[0].ior": 1.5,

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 from PIL import Image
 
-from fits.problem.tables import material_to_dict
-from fits.reporting.plots.data import as_png
-from fits.reporting.render import render
+from fits.problem.toml import material_to_dict
+from fits.reports.plots.data import as_png
+from fits.reports.render import render
 from layerjax import gallery
 
 ROOT = Path(__file__).parents[1]

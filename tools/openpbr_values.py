@@ -17,7 +17,7 @@ import MaterialX
 import numpy as np
 from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenShader
 
-from fits.exporting.contents import pairs
+from fits.exports.contents import pairs
 
 OUT = Path(__file__).parents[1] / "tests" / "data" / "openpbr_values.json"
 PAGE = Path(__file__).with_suffix(".html")

@@ -16,9 +16,9 @@ from scipy import stats
 import fits
 import layerjax as lj
 from benchmarks.measuring import environment
+from benchmarks.measuring.repeats import Repeats, fit_many
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
-from fits.inference.optimise import fit_problem
-from fits.inference.repeats import Repeats, fit_many
+from fits.optimise.fit import fit_problem
 
 Floats = NDArray[np.float64]
 

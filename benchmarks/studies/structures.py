@@ -16,9 +16,9 @@ from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, 
 from benchmarks.suite import coated_haze
 from fits.data.measurements import Measurements
 from fits.engines import Failure, run
-from fits.problem.compiled import cores
-from fits.structures.library import Library, Structure, default_library
-from fits.structures.searching import named
+from fits.problem.compilation import cores
+from fits.structure_search.library import Library, Structure, default_library
+from fits.structure_search.searching import named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4

@@ -32,10 +32,10 @@ from fits.maps.fitted_map import is_store
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
-    from fits.inference.fit_result import Fit
-    from fits.inference.posterior import Posterior
-    from fits.inference.sampling import Sampler
+    from fits.optimise.result import Fit
     from fits.problem.stack_file import ProblemFile
+    from fits.sampling.posterior import Posterior
+    from fits.sampling.sample import Sampler
 
 DONE, DOUBTFUL = 0, 1
 SAMPLER: "Sampler" = "emcee"
@@ -46,11 +46,11 @@ def fit(arguments: Namespace) -> int:
     if not arguments.sample:
         refuse_alone(arguments, SAMPLING, "sample")
     use_jax()
-    from fits.many.fitting import fit_into, require_posterior
+    from fits.batch.fitting import fit_into, require_posterior
     from fits.problem.stack_file import read_problem
-    from fits.reporting import results, tables, verdicts
-    from fits.reporting.diagnostics import residual_structure, standardised
-    from fits.reporting.directories import check_directory
+    from fits.reports import results, tables, verdicts
+    from fits.reports.diagnostics import residual_structure, standardised
+    from fits.reports.directories import check_directory
 
     directory = Path(arguments.out)
     check_directory(directory, arguments.force)
@@ -86,8 +86,8 @@ def fit(arguments: Namespace) -> int:
 
 def _require_sampling(given: "ProblemFile", data: Measurements, arguments: Namespace) -> None:
     """ValueError, before anything is fitted, for settings of a sampler that is to follow."""
-    from fits.inference.sampling import require_settings
     from fits.problem.problem import Problem
+    from fits.sampling.sample import require_settings
 
     problem = Problem(given.stack, data, given.transport, given.noise, given.scale, instrument=given.instrument)
     require_settings(
@@ -107,9 +107,9 @@ def sample(arguments: Namespace) -> int:
 
 
 def _sample(directory: Path, arguments: Namespace) -> int:
-    from fits.inference.sampling import sample as run_sampler
-    from fits.reporting import results, tables, verdicts
-    from fits.reporting.report_files import write_report
+    from fits.reports import results, tables, verdicts
+    from fits.reports.report_files import write_report
+    from fits.sampling.sample import sample as run_sampler
 
     result = results.load_fit(directory)
     if not result.is_posterior:
@@ -149,7 +149,7 @@ def _sample(directory: Path, arguments: Namespace) -> int:
 
 def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
     """Sampler, walkers and seed: those of the chain that is there, which arguments must not contradict, or defaults."""
-    from fits.inference.chain import read_chain
+    from fits.sampling.chain import read_chain
 
     stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
     settings: dict[str, Any] = {}
@@ -166,10 +166,10 @@ def report(arguments: Namespace) -> int:
     if is_store(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
-    from fits.reporting import results
-    from fits.reporting.html import report as write_page
-    from fits.reporting.report_files import write_report
-    from fits.reporting.stored import held_out_of
+    from fits.reports import results
+    from fits.reports.html import report as write_page
+    from fits.reports.report_files import write_report
+    from fits.reports.stored import held_out_of
 
     refuse_existing(arguments.out, arguments.force)
     directory = Path(arguments.directory)
@@ -196,8 +196,8 @@ def compare(arguments: Namespace) -> int:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
     refuse_existing(arguments.out, arguments.force)
     use_jax()
-    from fits.inference.compare import compare as run_compare
-    from fits.reporting import tables
+    from fits.prediction.compare import compare as run_compare
+    from fits.reports import tables
 
     candidates = _candidates([Path(directory) for directory in arguments.directories])
     with show_progress() as progress:
@@ -206,7 +206,7 @@ def compare(arguments: Namespace) -> int:
     for sentence in compared.verdict:
         print(sentence)
     if arguments.out:
-        from fits.reporting.html import comparison_page
+        from fits.reports.html import comparison_page
 
         write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
@@ -222,11 +222,11 @@ def search(arguments: Namespace) -> int:
 
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
-    from fits.reporting.data_statements import data_statements
-    from fits.reporting.data_tables import data_table, source_table
-    from fits.reporting.plots.data import as_png, data_picture
-    from fits.reporting.plots.totals import totals_picture
-    from fits.reporting.tables import print_table
+    from fits.reports.data_statements import data_statements
+    from fits.reports.data_tables import data_table, source_table
+    from fits.reports.plots.data import as_png, data_picture
+    from fits.reports.plots.totals import totals_picture
+    from fits.reports.tables import print_table
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
@@ -256,7 +256,7 @@ def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, 
 
     own: a result that they are compared with, whose place and name are taken.
     """
-    from fits.reporting import results, verdicts
+    from fits.reports import results, verdicts
 
     places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
     names = [place.name for place in places]

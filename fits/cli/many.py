@@ -17,12 +17,12 @@ DONE, DOUBTFUL = 0, 1
 def fit_many(arguments: Namespace) -> int:
     """Fit every file by every stack, print what became of them, and write the table and its page."""
     use_jax()
-    from fits.many.files import fit_files
-    from fits.many.inputs import PAGE, TABLE
-    from fits.many.page import SHOWN, overview, told
-    from fits.problem.compiled import cores
-    from fits.reporting.tables import print_table
-    from fits.structures.searching import STARTS
+    from fits.batch.files import fit_files
+    from fits.batch.inputs import PAGE, TABLE
+    from fits.batch.page import SHOWN, overview, told
+    from fits.problem.compilation import cores
+    from fits.reports.tables import print_table
+    from fits.structure_search.searching import STARTS
 
     if not arguments.search:
         only_searches = ("library", "layers", "instrument", "noise", "calibration")

@@ -19,8 +19,8 @@ def report_map(arguments: Namespace) -> int:
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
     refuse_existing(str(out), arguments.force)
     map = open_map(arguments.directory)
-    from fits.reporting.maps import page, tables, verdicts
-    from fits.reporting.tables import print_table
+    from fits.maps.report import page, tables, verdicts
+    from fits.reports.tables import print_table
 
     with show_progress() as progress:
         found = page.report(map, out, arguments.force, progress)

@@ -33,10 +33,10 @@ def fit_map(arguments: Namespace) -> int:
 
     given = read_problem(arguments.stack)
     from fits.maps.fit_map import fit_map as run_map
+    from fits.maps.report import tables
     from fits.maps.summary import summarised
-    from fits.problem.compiled import cores
-    from fits.reporting.maps import tables
-    from fits.reporting.tables import print_table
+    from fits.problem.compilation import cores
+    from fits.reports.tables import print_table
 
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
     local = arguments.scheduler is None

@@ -13,7 +13,7 @@ from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
-    from fits.inference.fit_result import Fit
+    from fits.optimise.result import Fit
     from layerjax import Mixture, Stack
 
 DONE = 0
@@ -69,9 +69,9 @@ def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
     require_free_place(arguments, ".png", "pictures")
     use_jax()
-    from fits.reporting.plots.data import as_png
-    from fits.reporting.render import render as run_render
-    from fits.reporting.results import load_fit
+    from fits.reports.plots.data import as_png
+    from fits.reports.render import render as run_render
+    from fits.reports.results import load_fit
     from layerjax import Transport
 
     name = arguments.material
@@ -92,8 +92,8 @@ def export(arguments: Namespace) -> int:
     """Write a material, or the best of a saved fit, for renderers or for optical design."""
     refuse_existing(arguments.out, arguments.force)
     use_jax()
-    from fits.exporting.export import export as run_export
-    from fits.reporting.results import load_fit
+    from fits.exports.export import export as run_export
+    from fits.reports.results import load_fit
 
     name = arguments.material
     if Path(name).is_dir():

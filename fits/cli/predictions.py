@@ -18,15 +18,15 @@ from fits.data.reading import of_channels
 from fits.data.selection import select
 
 if TYPE_CHECKING:
-    from fits.inference.prediction import Prediction
+    from fits.prediction.prediction import Prediction
 
 DONE = 0
 
 
 def print_scores(prediction: "Prediction", readings: Measurements, title: str) -> None:
     """How well readings were foretold."""
-    from fits.reporting import tables
-    from fits.reporting.predictions import scores_table
+    from fits.reports import tables
+    from fits.reports.predictions import scores_table
 
     tables.print_table(scores_table(prediction, readings, title), sys.stdout)
 
@@ -44,9 +44,9 @@ def predict(arguments: Namespace) -> int:
     if arguments.out is not None:
         require_free_place(arguments, ".csv", "predictions")
     use_jax()
-    from fits.inference.predicting import predict as run_prediction
-    from fits.reporting import results, verdicts
-    from fits.reporting.predictions import UNRELIABLE, prediction_csv
+    from fits.prediction.predict import predict as run_prediction
+    from fits.reports import results, verdicts
+    from fits.reports.predictions import UNRELIABLE, prediction_csv
 
     directory = Path(arguments.directory)
     posterior = results.load_posterior(directory)

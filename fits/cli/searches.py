@@ -12,7 +12,7 @@ from fits.data.measurements import Measurements
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
-    from fits.many.searching import Searching
+    from fits.batch.searching import Searching
 
 DONE = 0
 
@@ -20,9 +20,9 @@ DONE = 0
 def search(data: Measurements, arguments: Namespace) -> int:
     """Fit stacks from a library, print which the data prefer, and write the report."""
     use_jax()
-    from fits.many.searching import REPORT, search_into
-    from fits.reporting import tables
-    from fits.structures import telling
+    from fits.batch.searching import REPORT, search_into
+    from fits.reports import tables
+    from fits.structure_search import telling
 
     directory = Path(arguments.out)
     given = searching(arguments, arguments.starts)
@@ -38,9 +38,9 @@ def search(data: Measurements, arguments: Namespace) -> int:
 
 def searching(arguments: Namespace, starts: int) -> "Searching":
     """What the options of a search say."""
-    from fits.many.searching import Searching
+    from fits.batch.searching import Searching
     from fits.problem.stack_file import read_instrument
-    from fits.structures.library import read_library
+    from fits.structure_search.library import read_library
 
     return Searching(
         library=None if arguments.library is None else read_library(arguments.library),

@@ -15,7 +15,7 @@ def use_jax() -> None:
 
     from fits.engines.compile_cache import keep_programs
     from fits.engines.worker import quieten
-    from fits.problem.compiled import devices_of_cores
+    from fits.problem.compilation import devices_of_cores
 
     quieten()
     jax.config.update("jax_enable_x64", True)

@@ -12,7 +12,7 @@ def run_threads(
     work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], threads: int | None = None
 ) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`. Whoever leaves the loop waits for the tasks that have begun."""
-    from fits.problem.compiled import cores
+    from fits.problem.compilation import cores
 
     left, most = iter(enumerate(tasks)), threads or cores()
     # the first alone: it compiles the program, which keeps one core busy

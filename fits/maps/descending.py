@@ -17,10 +17,10 @@ import optimistix as optx
 from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from fits.inference.descent import NEARBY, PROMISE
-from fits.inference.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
-from fits.inference.starts import MOST_STEPS
 from fits.maps.texels import Texels, model_of
+from fits.optimise.descent import NEARBY, PROMISE
+from fits.optimise.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
+from fits.optimise.multi_start import MOST_STEPS
 from fits.problem.model import Model
 
 BESIDE = 4

@@ -38,8 +38,8 @@ from fits.maps.smoothing import Smoothness
 from fits.maps.store import clean, create, left
 from fits.names import Objective
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise
 from fits.problem.model import Transport
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import unit, with_floor
 from fits.progress import Progress

@@ -141,7 +141,7 @@ class FittedMap:
         return f"<FittedMap of {size} texels, {100.0 * self.done:.4g} % done: {', '.join(self.names)}; {self.path}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reporting.maps.notebook:map_fragment", self))
+        return str(shown_by("fits.maps.report.notebook:map_fragment", self))
 
     @cached_property
     def _types(self) -> dict[str, tuple[np.dtype, Any]]:

@@ -8,14 +8,14 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.inference import apertures
-from fits.inference.optimise import fit_problem
-from fits.inference.refinement import resolution_in_words
-from fits.inference.resolution import ENOUGH, Resolutions, resolutions
-from fits.inference.starts import start_points
 from fits.maps.searching import Ends, Starts, all_predicted, reduced_chi_square, search, starts_at
 from fits.maps.solving import Found, solve
 from fits.maps.texels import Texels
+from fits.optimise import apertures
+from fits.optimise.fit import fit_problem
+from fits.optimise.multi_start import start_points
+from fits.optimise.refinement import resolution_in_words
+from fits.optimise.resolution import ENOUGH, Resolutions, resolutions
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress

@@ -9,8 +9,6 @@ import zarr
 from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
-from fits.inference.optimise import refit
-from fits.inference.sampling import sample
 from fits.maps import chunk_files
 from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.inputs import Readings
@@ -18,8 +16,10 @@ from fits.maps.job import Part, part_of, rows_of
 from fits.maps.prepared import GOLDEN, Prepared
 from fits.maps.sampled import GROUP, QUANTILES
 from fits.maps.texels import model_of
+from fits.optimise.fit import refit
 from fits.problem.problem import Problem
 from fits.progress import Progress
+from fits.sampling.sample import sample
 
 Floats = NDArray[np.float64]
 

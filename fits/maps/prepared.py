@@ -24,10 +24,10 @@ from fits.maps.sharing import Shared, fit_shared, held
 from fits.maps.tabulated import Table, Tabulated
 from fits.maps.tabulating import tabulate
 from fits.maps.texels import Texels, texels, with_floor, with_own_directions
-from fits.problem.likelihood import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
+from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
 from fits.problem.problem import Problem
-from fits.problem.tables import transport_from_dict, transport_to_dict
+from fits.problem.toml import transport_from_dict, transport_to_dict
 from fits.progress import Progress
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits.problem.correlated import Correlated
+from fits.problem.discrepancy.parameters import Correlated
 from fits.problem.parameters import is_free, split
 from fits.problem.problem import Problem
 from fits.problem.spectra import is_law

@@ -14,15 +14,15 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.inference.descent import PROMISE, descend
-from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
-from fits.inference.starts import start_points
-from fits.inference.uncertainty import ON_BOUND
 from fits.maps.pilot import FIRST, distinct, from_all
 from fits.maps.searching import search, starts_at
 from fits.maps.shared import hold, shared_names
 from fits.maps.solving import solve
 from fits.maps.texels import Texels, model_of
+from fits.optimise.descent import PROMISE, descend
+from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
+from fits.optimise.multi_start import start_points
+from fits.optimise.uncertainty import ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 

@@ -9,11 +9,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from fits.inference.descent import PROMISE
-from fits.inference.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
-from fits.inference.uncertainty import LEAST_PULL, ON_BOUND
 from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, linear
 from fits.maps.texels import Texels, chi_square, model_of
+from fits.optimise.descent import PROMISE
+from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
+from fits.optimise.uncertainty import LEAST_PULL, ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -205,7 +205,7 @@ def _found(model: Model, end: End, texel: Texels) -> Found:
 
 
 def _errors(model: Model, end: End, root: Array, scatter: Array) -> tuple[Array, Array, Array]:
-    """As `fits.inference.uncertainty`, for a compiled program."""
+    """As `fits.optimise.uncertainty`, for a compiled program."""
     box, unit, count = model.box, end.unit, end.unit.size
     root, pull = root / jnp.sqrt(scatter), LEAST_PULL * scatter
     known = jnp.isfinite(end.cost) & jnp.all(jnp.isfinite(root))

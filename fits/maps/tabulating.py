@@ -15,7 +15,7 @@ from scipy import fft
 from scipy.stats import qmc
 
 from fits.maps.tabulated import Table, Tabulated, with_table
-from fits.problem.compiled import cores, in_shares
+from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress

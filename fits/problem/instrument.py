@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
 from fits.data.scans import SAME_ANGLE
-from fits.problem.narrowness import Spread, spread_over_lobes
+from fits.problem.aperture_rays import MOST_RINGS, ray_counts, rays
+from fits.problem.lobe_width import Spread, spread_over_lobes
 from fits.problem.parameters import Free, LogNormal
-from fits.problem.rays import MOST_RINGS, ray_counts, rays
 from fits.problem.values import shown
 from layerjax.transport.known_directions import KnownDirections, known_directions
 

@@ -13,10 +13,10 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from fits.names import Objective
+from fits.problem.base import Assembled, Floats, Posed
 from fits.problem.density import Density
 from fits.problem.model import Model, half_squares
 from fits.problem.parameters import Box
-from fits.problem.posed import Assembled, Floats, Posed
 from fits.problem.problem import Problem
 
 OF_EACH = tuple(field for field in Box.__dataclass_fields__ if field != "between")

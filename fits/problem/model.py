@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 import layerjax as lj
 from fits.names import Objective
 from fits.problem.density import Density
+from fits.problem.discrepancy.logarithm import logarithm, size
+from fits.problem.discrepancy.process import Process, Whitened
+from fits.problem.discrepancy.whitening import Correlation
 from fits.problem.instrument import Optics, Setting
-from fits.problem.likelihood import (
+from fits.problem.noise import (
     Tails,
     information_weights,
     level_residual,
@@ -29,11 +32,8 @@ from fits.problem.likelihood import (
     tail_residual,
     total_sigma,
 )
-from fits.problem.logarithm import logarithm, size
 from fits.problem.parameters import Box, Template
-from fits.problem.process import Process, Whitened
 from fits.problem.spectra import with_values
-from fits.problem.whitening import Correlation
 from layerjax._shapes import require_single
 from layerjax.evaluate import evaluate_known
 from layerjax.transport.known_directions import KnownDirections

@@ -22,17 +22,16 @@ from fits.data.measurements import Measurements
 from fits.data.scans import groups
 from fits.data.totals import Totals
 from fits.names import Objective
-from fits.problem.compiled import Static, run
-from fits.problem.correlated import Correlated, numbers_of
+from fits.problem.base import Assembled, Posed
+from fits.problem.compilation import Static, run
+from fits.problem.discrepancy.parameters import Correlated, numbers_of
+from fits.problem.discrepancy.process import Process, make_process
+from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.levels import Levels, is_assumed, noise_levels
-from fits.problem.likelihood import Noise
 from fits.problem.model import Model, Parts, Side, Transport
+from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
-from fits.problem.posed import Assembled, Posed
-from fits.problem.process import Process, make_process
 from fits.problem.spectra import require_in_range
-from fits.problem.totalling import Totalling
 from fits.problem.values import shown
 from layerjax._checks import in_short, require_kind
 from layerjax._parameters import plain_name

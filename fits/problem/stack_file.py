@@ -39,9 +39,9 @@ import layerjax as lj
 from fits._files import write_text
 from fits.names import Objective
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.problem.tables import (
+from fits.problem.toml import (
     MATERIAL,
     changed_to_dict,
     instrument_from_dict,

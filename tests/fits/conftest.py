@@ -10,11 +10,11 @@ import layerjax as lj
 from fits.data.formats.csv import write_csv
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.inference import ensemble
-from fits.inference.fit_result import Fit
-from fits.inference.optimise import fit
+from fits.optimise.fit import fit
+from fits.optimise.result import Fit
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
+from fits.sampling import ensemble
 from tests.helpers.models import line_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6

@@ -3,8 +3,8 @@
     python -m tests.fits.record write [CASE ...]      # computes the cases (all by default) and keeps them
     python -m tests.fits.record check [CASE ...]      # computes them again, and prints and counts what differs
 
-The numbers stand in `tests/data/record.json`. Costs agree to 1e-6 of themselves, values to 0.01 standard errors, standard
-errors and predictions to 1e-3, elpd differences to a hundredth of their error, quantiles of a posterior to 0.1 sd.
+The numbers stand in `tests/data/record.json`. Costs agree to 1e-6 of themselves, values to 0.01 standard errors,
+standard errors and predictions to 1e-3, elpd differences to a hundredth of their error, quantiles to 0.1 sd.
 Every case takes from seconds to minutes, which is why no test runs them.
 """
 
@@ -229,42 +229,38 @@ CASES: dict[str, Callable[[], dict[str, Any]]] = {
 # ---- comparing ----
 
 
+RELATIVE = {"cost": COST, "reduced_chi_square": COST, "prediction": ERRORS, "standard_errors": ERRORS, "errors": ERRORS}
+RELATIVE["bic"] = COST
+
+
 def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> list[str]:
     """Sentences on what differs by more than the stated tolerances."""
     said: list[str] = []
+    errors = stored.get("standard_errors", stored.get("errors", {}))
 
-    def compare(key: str, one: Any, other: Any, tolerance: float, scale: Any = None) -> None:
-        one, other = np.asarray(one, float), np.asarray(other, float)
-        if one.shape != other.shape:
-            said.append(f"{name}: {key}: shape {other.shape}, was {one.shape}")
+    def compare(key: str, old: Any, new: Any, tolerance: float, unit: Any = None) -> None:
+        if isinstance(old, dict):
+            for one in old:
+                compare(f"{key} of {one}", old[one], new[one], tolerance, None if unit is None else unit[one])
             return
-        unit = np.abs(one) if scale is None else np.asarray(scale, float)
-        same = (one == other) | (np.isnan(one) & np.isnan(other))
-        off = np.where(same, 0.0, np.abs(other - one) / np.where(unit > 0.0, unit, 1.0))
+        old, new = np.asarray(old, float), np.asarray(new, float)
+        unit = np.abs(old if unit is None else np.asarray(unit, float))
+        same = (old == new) | (np.isnan(old) & np.isnan(new))
+        off = np.where(same, 0.0, np.abs(new - old) / np.where(unit > 0.0, unit, 1.0))
         if not np.all(off <= tolerance):
             worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
-            said.append(f"{name}: {key}: {other.flat[worst]:.8g}, was {one.flat[worst]:.8g} (off {off.flat[worst]:.2g})")
+            said.append(f"{name}: {key}: {new.flat[worst]:.8g}, was {old.flat[worst]:.8g}, off {off.flat[worst]:.2g}")
 
-    errors = stored.get("standard_errors", stored.get("errors", {}))
     for key, old in stored.items():
         new = found[key]
-        if key == "cost" or key == "reduced_chi_square":
-            compare(key, old, new, COST)
-        elif key == "prediction":
-            for part in ("mean", "low", "high", "median_error"):
-                compare(f"prediction {part}", old[part], new[part], ERRORS)
+        if key in RELATIVE:
+            compare(key, old, new, RELATIVE[key])
         elif key == "values":
-            for one in old:
-                compare(f"value of {one}", old[one], new[one], VALUES, np.abs(errors[one]))
-        elif key in ("standard_errors", "errors", "bic"):
-            for one in old:
-                compare(f"{key} of {one}", old[one], new[one], ERRORS)
-        elif key in ("elpd_diff", "weight"):
-            scale = np.fmax(list(stored["dse"].values()), 1.0)
-            compare(key, list(old.values()), [new[one] for one in old], ELPD, scale)
+            compare(key, old, new, VALUES, errors)
         elif key == "quantiles":
-            for one in old:
-                compare(f"quantiles of {one}", old[one], new[one], QUANTILES, stored["sd"][one])
+            compare(key, old, new, QUANTILES, stored["sd"])
+        elif key in ("elpd_diff", "weight"):
+            compare(key, old, new, ELPD, {one: max(error, 1.0) for one, error in stored["dse"].items()})
         elif key not in ("dse", "sd") and old != new:
             said.append(f"{name}: {key}: {new}, was {old}")
     return said

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fits.data.measurements import Measurements
-from fits.inference.fit_result import Fit
-from fits.inference.optimise import fit
+from fits.optimise.fit import fit
+from fits.optimise.result import Fit
 from fits.problem.parameters import Free
 
 

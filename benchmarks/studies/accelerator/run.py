@@ -13,7 +13,7 @@ from benchmarks.measuring import environment, timing
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from benchmarks.studies.accelerator.processes import FLOOR, Measured, measured
 from benchmarks.studies.accelerator.tasks import READINGS, TASKS, Task
-from fits.problem.compiled import cores
+from fits.problem.compilation import cores
 
 NAME = "accelerator"
 

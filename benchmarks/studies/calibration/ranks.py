@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import fits
-from fits.reporting.plots.data import CYCLE, INK, STYLE
+from fits.reports.plots.data import CYCLE, INK, STYLE
 
 DRAWS = 99
 """Posterior draws a repeat: ranks go from 0 to 99, and bins of them are equally wide."""

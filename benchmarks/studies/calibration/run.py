@@ -32,8 +32,8 @@ from benchmarks.studies.calibration.ranks import (
 )
 from fits._files import write_bytes
 from fits.engines import Failure, run
-from fits.problem.compiled import cores
-from fits.reporting.plots.data import as_png
+from fits.problem.compilation import cores
+from fits.reports.plots.data import as_png
 from layerjax.evaluate import evaluate_known
 from layerjax.transport.known_directions import known_directions
 

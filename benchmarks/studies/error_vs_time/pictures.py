@@ -12,7 +12,7 @@ from benchmarks.studies.error_vs_time.models import VALUES, Model, Row
 from benchmarks.studies.error_vs_time.tables import amortised, floored, limits_of
 from benchmarks.studies.error_vs_time.truth import Judged
 from benchmarks.suite.cases import FAMILIES
-from fits.reporting.plots.data import CYCLE, GREY, INK, STYLE
+from fits.reports.plots.data import CYCLE, GREY, INK, STYLE
 
 MARKERS = "osD^v<>P*Xp"
 HIGHEST = 10.0

@@ -26,7 +26,7 @@ from benchmarks.studies.error_vs_time.truth import (
 from benchmarks.suite import cases as suite
 from benchmarks.suite.cases import Case
 from fits._files import write_bytes
-from fits.reporting.plots.data import as_png
+from fits.reports.plots.data import as_png
 
 NAME = "error-vs-time"
 QUICK = Size(rounds=1, longest=1.0)

@@ -11,7 +11,7 @@ def main(path: str) -> None:
     """Print what was fitted, and what it took, as JSON."""
     import jax
 
-    from fits.problem.compiled import devices_of_cores
+    from fits.problem.compilation import devices_of_cores
 
     jax.config.update("jax_enable_x64", True)
     devices_of_cores()

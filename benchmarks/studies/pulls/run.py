@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import environment
+from benchmarks.measuring.repeats import fit_many
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
 from benchmarks.studies.pulls import cases
 from benchmarks.studies.pulls.cases import Case
-from fits.inference.repeats import fit_many
 
 NAME = "pulls"
 WITHIN, ENOUGH = 3.0, 0.98

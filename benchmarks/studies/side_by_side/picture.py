@@ -12,7 +12,7 @@ import layerjax as lj
 from benchmarks.studies.error_vs_time.models import Model, supports
 from benchmarks.studies.error_vs_time.truth import REFERENCES
 from benchmarks.suite.cases import FAMILIES, Case
-from fits.reporting.plots.data import CYCLE, INK, STYLE, as_png
+from fits.reports.plots.data import CYCLE, INK, STYLE, as_png
 
 SHOWN = {
     "plastics_and_paints": "coated_sand",

@@ -16,11 +16,11 @@ from scipy.optimize import least_squares
 
 import fits
 import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
 from benchmarks.measuring.timing import interleaved
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.suite.scenes import pairs
-from fits.inference.optimise import fit_problem
-from fits.inference.repeats import fit_many
+from fits.optimise.fit import fit_problem
 
 Floats = NDArray[np.float64]
 

@@ -18,9 +18,9 @@ import pytest
 from fits.cli import commands
 from fits.cli.interrupts import raised_again
 from fits.cli.parser import main
-from fits.inference.fit_result import Fit
+from fits.optimise.result import Fit
 from fits.problem.problem import Problem
-from fits.reporting.results import load_fit, load_posterior, save_fit
+from fits.reports.results import load_fit, load_posterior, save_fit
 from tests.helpers.commands import refused
 from tests.helpers.files import contents
 from tests.helpers.places import ROOT
@@ -247,7 +247,7 @@ def test_an_interrupted_sampler_says_how_to_go_on(
         raise KeyboardInterrupt
 
     save_fit(coat_fit, "result")
-    monkeypatch.setattr("fits.inference.sampling.sample", interrupted)
+    monkeypatch.setattr("fits.sampling.sample.sample", interrupted)
     assert main(["sample", "result"]) == 130
     assert "`layerjax sample result` goes on with it" in capsys.readouterr().err
 

@@ -15,8 +15,8 @@ from fits.data.geometry import slices
 from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.smoothing import Smoothness
 from fits.maps.store import FLAGS
-from fits.problem.compiled import cores
-from fits.problem.likelihood import Noise
+from fits.problem.compilation import cores
+from fits.problem.noise import Noise
 from tests.helpers.commands import refused
 from tests.helpers.map_files import ANGLES, MASK, SIGMA, VALUES, hdf5_file
 from tests.helpers.painted_maps import numbers, stored, without

@@ -14,19 +14,19 @@ import pytest
 
 from fits._files import locked
 from fits.cli.parser import main
-from fits.inference import starts
-from fits.inference.chain import FileChain
-from fits.inference.fit_result import Fit
-from fits.inference.optimise import fit
-from fits.inference.posterior import Posterior
-from fits.inference.sampling import identity_of, load, sample
-from fits.inference.starts import start_points
-from fits.inference.starts_file import StartsFile
-from fits.problem.likelihood import Noise
+from fits.optimise import multi_start as starts
+from fits.optimise.fit import fit
+from fits.optimise.multi_start import start_points
+from fits.optimise.result import Fit
+from fits.optimise.starts_file import StartsFile
+from fits.problem.noise import Noise
 from fits.problem.problem import Problem
-from fits.reporting.directories import reserved
-from fits.reporting.plots.data import data_picture
-from fits.reporting.results import load_fit, load_posterior, save_fit, save_posterior
+from fits.reports.directories import reserved
+from fits.reports.plots.data import data_picture
+from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior
+from fits.sampling.chain import FileChain
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import identity_of, load, sample
 from tests.helpers.files import contents, largest_file, mounted, read_only
 from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT
@@ -115,7 +115,7 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # any picture will do, and this one is drawn fast
-    monkeypatch.setattr("fits.reporting.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
+    monkeypatch.setattr("fits.reports.render.render", lambda *_, **__: data_picture(coat_fit.problem.data))
     for directory in ("one", "two"):
         save_fit(coat_fit, directory)
     for output in ("out.csv", "out.png", "out.html", "one/report.html"):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fits.cli.parser import main
-from fits.reporting.results import load_fit
+from fits.reports.results import load_fit
 from tests.helpers.coats import make_folder
 from tests.helpers.commands import refused
 
@@ -102,7 +102,7 @@ def test_an_interrupt_says_how_to_go_on(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fits.many.files.fit_one", interrupted)
+    monkeypatch.setattr("fits.batch.files.fit_one", interrupted)
     assert main(MANY) == 130
     assert "out keeps what was fitted; the same command again goes on with it" in capsys.readouterr().err
     assert (folder / "out" / "table.csv").is_file()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from fits.cli.parser import main
-from fits.inference.fit_result import Fit
-from fits.reporting.results import load_fit, save_fit
+from fits.optimise.result import Fit
+from fits.reports.results import load_fit, save_fit
 from tests.helpers.commands import refused
 
 FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "2"]

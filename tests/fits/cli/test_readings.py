@@ -8,7 +8,7 @@ import pytest
 from fits.cli.parser import main
 from fits.data.formats import read
 from fits.data.measurements import Measurements
-from fits.reporting.plots.data import MOST_CHANNELS, data_picture
+from fits.reports.plots.data import MOST_CHANNELS, data_picture
 
 
 def test_info_says_what_is_there_and_draws_it(work: Path, capsys: pytest.CaptureFixture[str]) -> None:

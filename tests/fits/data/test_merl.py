@@ -11,7 +11,7 @@ from fits.data.formats.merl import half_difference
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, incidences, relative_azimuth
-from fits.inference.optimise import fit
+from fits.optimise.fit import fit
 from fits.problem.parameters import Free
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
 

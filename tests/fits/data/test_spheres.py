@@ -9,7 +9,7 @@ import layerjax as lj
 from fits.data.formats.rxt import read_slab
 from fits.data.spheres import Shares, Sphere, Spheres
 from fits.data.totals import Totals
-from fits.inference.optimise import fit
+from fits.optimise.fit import fit
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 

@@ -7,12 +7,12 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.inference.descent import PROMISE, descend
 from fits.maps import descending
 from fits.maps.searching import search, starts_at
 from fits.maps.solving import _solved, all_known, solve
 from fits.maps.texels import blank, texels, with_own_directions
-from fits.problem.compiled import _run
+from fits.optimise.descent import PROMISE, descend
+from fits.problem.compilation import _run
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, TRANSPORT, coat

@@ -8,9 +8,9 @@ import layerjax as lj
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.maps.shared import hold, shared_names
-from fits.problem.correlated import Correlated
+from fits.problem.discrepancy.parameters import Correlated
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free, Uniform, is_free
 from fits.problem.problem import Problem
 from fits.problem.spectra import PowerLaw

@@ -7,12 +7,12 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.inference.limits import limited_with
+from fits.optimise.limits import limited_with
 from fits.problem.instrument import Instrument
 from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
-from fits.reporting import verdicts
-from fits.reporting.diagnostics import residual_structure, standardised
+from fits.reports import verdicts
+from fits.reports.diagnostics import residual_structure, standardised
 
 SINGLE = lj.SingleScattering()
 TILT = 30.0

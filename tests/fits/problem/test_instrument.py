@@ -10,9 +10,9 @@ import pytest
 import fits
 import layerjax as lj
 from benchmarks.measuring.cones import mean_over_cones
+from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements
-from fits.inference.repeats import fit_many
 from fits.problem.instrument import Instrument
 from fits.problem.model import Model
 from fits.problem.parameters import Free, LogNormal

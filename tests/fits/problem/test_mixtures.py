@@ -7,12 +7,12 @@ import pytest
 
 import fits
 import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
 from fits.cli.parser import main
-from fits.inference.repeats import fit_many
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
-from fits.reporting.plots.data import as_png
-from fits.reporting.plots.parameters import stack_picture
+from fits.reports.plots.data import as_png
+from fits.reports.plots.parameters import stack_picture
 
 FILE = """\
 transport = "SingleScattering"

@@ -8,15 +8,15 @@ from scipy import stats
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
-from fits.inference.descent import here
-from fits.problem.correlated import Correlated
-from fits.problem.likelihood import Noise
+from fits.optimise.descent import here
+from fits.problem.discrepancy.inducing_points import places
+from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.process import make_process
+from fits.problem.discrepancy.whitening import Correlation
 from fits.problem.model import Model
-from fits.problem.nodes import places
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.problem.process import make_process
-from fits.problem.whitening import Correlation
 
 FREE = Free(0.4, 0.0, 1.0)
 LAYOUTS = {

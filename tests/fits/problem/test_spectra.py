@@ -8,8 +8,8 @@ from scipy import stats
 
 import fits
 import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
 from fits import Free, LogNormal, LogUniform, Normal, PowerLaw
-from fits.inference.repeats import fit_many
 from fits.problem.parameters import Box
 from fits.problem.stack_file import read_problem, write_problem
 

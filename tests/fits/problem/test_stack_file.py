@@ -8,10 +8,10 @@ import pytest
 
 import layerjax as lj
 from fits.problem.instrument import Instrument
-from fits.problem.likelihood import Noise
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, is_free
 from fits.problem.stack_file import read_instrument, read_problem, write_problem
-from fits.problem.tables import stack_from_dict, stack_to_dict
+from fits.problem.toml import stack_from_dict, stack_to_dict
 from tests.helpers import places
 
 EXAMPLES = sorted(places.EXAMPLES.glob("*.toml"))

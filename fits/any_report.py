@@ -1,0 +1,46 @@
+"""The report of a result, whether a fit or a fitted map."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from fits.data.measurements import Measurements
+from fits.maps.fitted_map import FittedMap
+from fits.maps.report import page
+from fits.optimise.result import Fit
+from fits.reports import html
+from fits.sampling.posterior import Posterior
+from layerjax._checks import require_kind
+
+
+def report(
+    fit: Fit | FittedMap,
+    posterior: Posterior | None = None,
+    path: str | Path = "report.html",
+    *,
+    others: Mapping[str, Fit | Posterior] | None = None,
+    name: str = "this fit",
+    unseen: Measurements | None = None,
+    force: bool = True,
+) -> None:
+    """Writes the report of a fit, or of a fitted map, to `path`, whole or not at all.
+
+    Args:
+        fit: what the report is about; of a map, finished or not, nothing else is said but `path` and `force`.
+        posterior: what `fits.sample` made of the fit, if it was sampled.
+        path: HTML file to write, pictures inside.
+        others: further fits of the same data, or their posteriors, by name, to be compared with this one.
+        name: what this fit is called beside `others`.
+        unseen: measurements that were not fitted, to be shown with the prediction of them.
+        force: replace a file that is there.
+
+    Raises:
+        ValueError: `path` exists and `force` is False, `others` cannot be compared with this fit, or it is one of
+            several measurements (see `Fit.part`); or a part of a map is damaged.
+    """
+    require_kind("fit", fit, Fit, FittedMap)
+    if isinstance(fit, Fit):
+        html.report(fit, posterior, path, others=others, name=name, unseen=unseen, force=force)
+        return
+    if posterior is not None or others or unseen is not None:
+        raise ValueError("posterior, others, unseen: of a map there are none; it is reported by itself")
+    page.report(fit, path, force)

@@ -1,0 +1,117 @@
+"""The way from a stack to a file of a material: `fits.export`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import layerjax as lj
+from fits._files import write_bytes
+from fits.data.geometry import Floats
+from fits.exports import klems, merl, rgl, slices, zemax
+from fits.exports.contents import Contents
+from fits.exports.material import Material, material_of
+from fits.exports.openpbr import document as openpbr
+from fits.names import EXPORTS, To
+from fits.optimise.result import Fit
+from fits.progress import Progress, silent
+from layerjax._checks import in_short
+
+_WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
+    "rgl": rgl.contents,
+    "merl": merl.contents,
+    "zemax": zemax.contents,
+    "klems": klems.contents,
+    "openpbr": openpbr.contents,
+    "csv": slices.contents,
+}
+
+ENDINGS: dict[str, str] = {
+    "rgl": ".bsdf",
+    "merl": ".binary",
+    "zemax": ".bsdf",
+    "klems": ".xml",
+    "openpbr": ".mtlx",
+    "csv": ".csv",
+}
+"""What names of files end in."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written. notes: what it holds, how well, and what it does not, one sentence each."""
+
+    path: Path
+    to: To
+    notes: tuple[str, ...]
+
+
+def export(
+    material: "lj.Stack | lj.Mixture | Fit",
+    path: str | Path,
+    to: To,
+    *,
+    transport: lj.Transport | Literal["auto"] | None = None,
+    wavelengths: ArrayLike | None = None,
+    name: str | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Exported:
+    """Write a material for renderers or for optical design.
+
+    Args:
+        material: a stack or a mixture of numbers, or a fit, of which the best values are written.
+        path: the file; its name ends as `ENDINGS` says.
+        to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
+            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "openpbr": the OpenPBR surface in
+            MaterialX that resembles it most (extra `materialx`). "csv": slices in this project's convention.
+        transport: carries the light; None: that of the fit, or "auto".
+        wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
+        name: what the material is called in the file; None: after the file.
+        force: replace a file that is there.
+        progress: called with (stage, done, total, note).
+
+    Raises:
+        ValueError: the format cannot hold the material (the number of channels, or an axis that breaks the symmetry it
+            needs, or for "openpbr" light that passes), a transport that is random or does not carry the stack, an extra
+            that is not installed, or a file that is there without `force`.
+    """
+    if not isinstance(to, str) or to not in EXPORTS:
+        raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
+    path = Path(path)
+    if path.suffix.lower() != ENDINGS[to]:
+        raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")
+    if path.exists() and not force:
+        raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
+    stack, chosen = _stack_and_transport(material, transport)
+    prepared = material_of(stack, chosen, name or path.stem, progress or silent)
+    written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
+    write_bytes(path, written.content, force)
+    return Exported(path, to, written.notes)
+
+
+def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.Mixture, Any]:
+    if isinstance(material, Fit):
+        own = material.problem.transport
+        if transport is None and own != "auto" and not isinstance(own, lj.Transport):
+            raise ValueError("transport: the fit's is a function of one's own; give one of layerjax")
+        return material.stack, transport or own
+    if not isinstance(material, lj.Stack | lj.Mixture):
+        raise ValueError(f"material is {in_short(material)}, must be a Stack, a Mixture or a Fit")
+    return material, transport or "auto"
+
+
+def _checked(wavelengths: ArrayLike | None, to: str, channels: int) -> Floats | None:
+    if wavelengths is None:
+        return None
+    if to != "rgl":
+        raise ValueError(f"wavelengths: a file for {to!r} has none, only one for 'rgl'")
+    given = np.atleast_1d(np.asarray(wavelengths, float))
+    if given.shape != (channels,):
+        raise ValueError(f"wavelengths: {given.size} given, must be one for each of {channels} channels")
+    if not (np.isfinite(given).all() and (given > 0).all() and (np.diff(given) > 0).all()):
+        raise ValueError(f"wavelengths: {', '.join(f'{one:g}' for one in given)} nm, must be above 0 and ascend")
+    return given

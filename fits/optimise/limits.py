@@ -1,0 +1,106 @@
+"""What an instrument does not resolve: lobes narrower than its aperture, or than the steps of its scans."""
+
+import math
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+import layerjax as lj
+from fits.data.scans import in_plane, scans, signed_angle
+from fits.optimise.uncertainty import local_information
+from layerjax.mixture import stacks_by_name
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+    from fits.optimise.result import Fit
+
+HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
+"""Tangent of the half vector, over alpha, at which facets are half as many as along the normal."""
+
+READINGS = 2.0
+"""That a lobe has to hold within its full width at half maximum."""
+
+NEAR = 10.0
+"""Degrees from the mirror direction within which steps of a scan count."""
+
+
+def instrument_limits(fit: "Fit") -> dict[str, float]:
+    """Fitted roughnesses whose lobe is narrower than what can be seen of it, and the least alpha that could be.
+
+    A mirror lobe is as wide as its full width at half maximum, in the angle of the viewer. That has to be wider than
+    the aperture of the `Instrument`, and hold two steps of the scan that is finest about the mirror direction.
+    """
+    instrument = fit.problem.instrument
+    aperture = 0.0 if instrument is None else math.hypot(instrument.source, instrument.detector)
+    resolved = max(aperture, READINGS * finest_step(fit.problem.data.used()))
+    if not (resolved > 0.0 and isinstance(fit.problem.stack, lj.Stack | lj.Mixture)):
+        return {}
+    found = {}
+    for name, distribution in _facets(fit.problem.stack).items():
+        least = math.tan(math.radians(resolved / 4.0)) / HALF[distribution]
+        if name in fit.values and fit.values[name] < least:
+            found[name] = least
+    return found
+
+
+def limited_with(fit: "Fit") -> dict[str, tuple[str, float]]:
+    """Other parameters that what is not resolved limits: the roughness that each moves with, and how far.
+
+    A roughness that is limited may be anything up to the least that could be seen (`instrument_limits`). What moves by
+    more than its standard error when that is put in its place, by the information in the data about both, is known no
+    better: it counts in standard errors, by the roughness that moves it most.
+    """
+    found: dict[str, tuple[str, float]] = {}
+    limits, names = instrument_limits(fit), list(fit.values)
+    for roughness, least in limits.items():
+        moves = np.abs(_slopes(fit, names.index(roughness)) * (least - fit.values[roughness]))
+        for name, move, error in zip(names, moves, fit.errors, strict=True):
+            if name not in limits and 0.0 < error < move and move / error > found.get(name, ("", 0.0))[1]:
+                found[name] = (roughness, float(move / error))
+    return found
+
+
+def _slopes(fit: "Fit", place: int) -> NDArray[np.float64]:
+    """How the best values of all parameters, (P,), change with one that is held."""
+    spread = fit.covariance[place, place]
+    if spread > 0.0 and math.isfinite(spread):
+        return fit.covariance[:, place] / spread
+    # at a bound it has no errors of its own
+    box, vector = fit.problem.model.box, jnp.asarray(fit.vector)
+    width = np.asarray(box.slope(vector), float)
+    root = local_information(fit.problem, np.asarray(box.to_unit(vector), float))[0] / width
+    others = np.flatnonzero(np.isfinite(fit.errors) & (np.arange(len(width)) != place))
+    slopes = np.zeros(len(width))
+    slopes[others] = -np.linalg.lstsq(root[:, others], root[:, place], rcond=None)[0]
+    return slopes
+
+
+def finest_step(data: "Measurements") -> float:
+    """Degrees between neighbours about the mirror direction, of the scan that is finest there; 0 if none crosses it."""
+    signed, plane = signed_angle(data), in_plane(data)
+    steps = []
+    for rows in scans(data):
+        rows = rows[plane[rows]]
+        angle, mirror = signed[rows], float(data.theta_i[rows[0]]) if rows.size else 0.0
+        if rows.size < 2 or not angle.min() <= mirror <= angle.max():
+            continue
+        gaps = np.diff(angle)
+        middle = 0.5 * (angle[1:] + angle[:-1])
+        near = (np.abs(middle - mirror) <= NEAR) & (gaps > 0.0)
+        if near.any():
+            steps.append(float(np.min(gaps[near])))
+    return min(steps, default=0.0)
+
+
+def _facets(material: lj.Stack | lj.Mixture) -> dict[str, str]:
+    """Names of roughnesses, and the distribution of each."""
+    found: dict[str, str] = {}
+    for prefix, stack in stacks_by_name(material).items():
+        for place, layer in enumerate(stack.layers):
+            if isinstance(layer, lj.Interface):
+                found[f"{prefix}layers[{place}].alpha"] = layer.distribution
+        if isinstance(stack.base, lj.Conductor):
+            found[f"{prefix}base.alpha"] = stack.base.distribution
+    return found

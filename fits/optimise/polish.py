@@ -1,0 +1,97 @@
+"""The lowest of the ends of all starts, and what is known there."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits.optimise.descent import PROMISE, ROUGHLY, here
+from fits.optimise.multi_start import WORTH_OF_COST, End, Solver, least_squares_end, polished, unit_of
+from fits.optimise.uncertainty import Uncertainty, uncertainty
+from fits.problem.base import Posed
+
+EQUALLY_WELL = 2.0
+"""Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
+where that is above 1."""
+
+Floats = NDArray[np.float64]
+
+
+class Optimum(NamedTuple):
+    """The ends of all starts, the place of the lowest among them, and what is known there.
+
+    improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
+    differences in cost count in, see `EQUALLY_WELL`.
+    """
+
+    problem: Posed
+    ends: list[End]
+    best: int
+    found: Uncertainty
+    improved: bool
+    predicted: Floats
+    excess: float
+
+    @property
+    def lowest(self) -> End:
+        """The lowest end, exactly on the bounds that hold it."""
+        return self.ends[self.best]
+
+
+def optimum(
+    problem: Posed, ends: list[End], solver: Solver, *, check: bool = True, promise: float = PROMISE
+) -> Optimum:
+    """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
+
+    check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
+    minimum that was checked goes without. promise: how far it is followed, see `descend`.
+    """
+    best = int(np.argmin([end.cost for end in ends]))
+    lowest, improved = ends[best], False
+    if solver == "least_squares" and lowest.converged and promise < ROUGHLY and problem.objective == "likelihood":
+        lowest = _followed(problem, lowest, promise)
+    found = uncertainty(problem, lowest.vector, lowest.cost)
+    if solver == "least_squares" and check and found.without_influence:
+        lowest, lower = _off_the_plateau(problem, lowest, found, promise)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if lower else found
+    if solver == "least_squares" and ((check and found.at_bound.any()) or not lowest.converged):
+        lowest, improved = polished(problem, lowest)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
+    lowest = lowest._replace(vector=_on_bounds(problem, lowest.vector, found.at_bound))
+    held = found.at_bound.any()
+    predicted = here(problem, unit_of(problem, lowest.vector)).predicted if held else found.predicted
+    ends = [*ends[:best], lowest, *ends[best + 1 :]]
+    return Optimum(problem, ends, best, found, improved, predicted, _excess(problem, lowest, predicted))
+
+
+def _followed(problem: Posed, end: End, promise: float) -> End:
+    """The end, closer to its minimum."""
+    closer = least_squares_end(problem, unit_of(problem, end.vector), False, promise)
+    return closer._replace(steps=end.steps + closer.steps) if closer.cost <= end.cost else end
+
+
+def _off_the_plateau(problem: Posed, end: End, found: Uncertainty, promise: float) -> tuple[End, bool]:
+    """The end, or where it goes on to if what has no influence there, or is at a bound, begins anew; and whether it is.
+
+    No step leads off a plateau: every start may end on one though another minimum is far lower.
+    """
+    stuck = np.isin(problem.names, found.without_influence) | found.at_bound
+    point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, end.vector))
+    other = least_squares_end(problem, point, promise=promise)
+    lower = other.cost < end.cost - (ROUGHLY if problem.objective == "likelihood" else WORTH_OF_COST * end.cost)
+    return (other._replace(steps=end.steps + other.steps) if lower else end), lower
+
+
+def _on_bounds(problem: Posed, vector: Floats, held: NDArray[np.bool_]) -> Floats:
+    """Exact bounds where the solver ended on them."""
+    nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
+    return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
+
+
+def _excess(problem: Posed, lowest: End, predicted: Floats) -> float:
+    """The reduced chi-square where it is above 1; of a named objective, the residual variance."""
+    freedom = problem.count - len(lowest.vector)
+    if problem.objective != "likelihood":
+        return 2.0 * lowest.cost / max(freedom, 1)
+    chi_square = float(problem.call("chi_square_at", lowest.vector, predicted))
+    return max(1.0, chi_square / freedom if freedom > 0 else 1.0)

@@ -1,0 +1,256 @@
+"""The outcome of a fit: values, how far to trust them, and what else would explain the data."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fits._lazy import shown_by
+from fits.optimise.identifiability import Combination
+from fits.problem.problem import Problem
+
+Floats = NDArray[np.float64]
+
+ENDED = {
+    "this minimum": "reached this minimum",
+    "other minima": "ended at other minima",
+    "out of steps": "ran out of steps",
+    "failed": "failed",
+}
+"""What is said of the starts that ended in each way (see `Fit.ended`)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A minimum that `count` starts reached: values by name, half the sum of squared residuals, and the stack."""
+
+    values: dict[str, float]
+    cost: float
+    count: int
+    stack: Any
+
+
+@dataclass(frozen=True)
+class Alone:
+    """The same stack fitted with noise that readings do not share: values and standard errors by name, how well.
+
+    alike: correlation of residuals of neighbours along the scans. pairs: of them.
+    """
+
+    values: dict[str, float]
+    errors: dict[str, float]
+    chi_square: float
+    degrees_of_freedom: int
+    log_likelihood: float
+    alike: float
+    pairs: int
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best minimum of a `Problem` with P parameters, N used samples and C channels.
+
+    Attributes:
+        problem: what was fitted to what.
+        vector: (P,), best values in the problem's order, in physical units.
+        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data leave it open; those of
+            the others hold with the parameters in `at_bound` kept there.
+        covariance: (P, P), of the parameters.
+        cost: half the sum of squared residuals.
+        at_bound: names of the parameters that ended on a bound.
+        converged: whether the best start did.
+        status: how the fit ended, in words.
+        iterations: steps of the solver to this minimum.
+        condition_number: of the information about the parameters, each scaled to unit length.
+        unresolved: the combinations of parameters that the data alone do not separate, worst first.
+        minima: the minima that starts reached, best first.
+        alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
+            `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
+            that hold a share of the posterior.
+        without_influence: names of the parameters that the data say nothing about.
+        settings: starts, seed and solver.
+        ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
+        numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
+            the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
+            from a coarser one, which is more than it; that of the rays for an instrument's cones is added. None where
+            there is neither a resolution nor a cone.
+        resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
+        alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
+            that rule (see `Noise`); else None.
+        alone_parts: of a `Joint`, the same by the names of measurements.
+        part_of_joint: of one measurement of a `Joint`, its name there, kept where it is saved.
+        within: of the same, the fit of all of them, which is not.
+    """
+
+    problem: Problem
+    vector: Floats
+    errors: Floats
+    covariance: Floats
+    cost: float
+    at_bound: tuple[str, ...]
+    converged: bool
+    status: str
+    iterations: int
+    condition_number: float
+    unresolved: tuple[Combination, ...]
+    minima: tuple[Minimum, ...]
+    alternatives: tuple[Minimum, ...]
+    without_influence: tuple[str, ...] = ()
+    settings: Mapping[str, int | str] = field(default_factory=dict)
+    ended: Mapping[str, int] = field(default_factory=dict)
+    numerical_error: float | None = None
+    resolution: str | None = None
+    alone: Alone | None = None
+    alone_parts: Mapping[str, Alone] = field(default_factory=dict)
+    part_of_joint: str | None = None
+    within: "Fit | None" = None
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
+        )
+        return f"<Fit to {self.problem.count} readings: {values}; {self.status}>"
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("fits.reports.notebook:fit_fragment", self))
+
+    def part(self, name: str = "") -> "Fit":
+        """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
+
+        Raises:
+            ValueError: a name that no measurement has.
+        """
+        problem = self.problem.problems.get(name)
+        if problem is None:
+            raise ValueError(f"part {name!r} is not one of {', '.join(self.problem.problems)}")
+        if problem is self.problem:
+            return self
+        own = list(self.problem.places(name))
+        called = {self.problem.names[place]: plain for place, plain in zip(own, problem.names, strict=True)}
+
+        def minimum(one: Minimum) -> Minimum:
+            values = {plain: one.values[whole] for whole, plain in called.items()}
+            return replace(one, values=values, stack=one.stack[name])
+
+        found = replace(
+            self,
+            problem=problem,
+            vector=self.vector[own],
+            errors=self.errors[own],
+            covariance=self.covariance[np.ix_(own, own)],
+            at_bound=_called(self.at_bound, called),
+            without_influence=_called(self.without_influence, called),
+            unresolved=tuple(one.called(called) for one in self.unresolved if set(one.weights) & set(called)),
+            minima=tuple(map(minimum, self.minima)),
+            alternatives=tuple(map(minimum, self.alternatives)),
+            alone=self.alone_parts.get(name),
+            part_of_joint=name,
+            within=self,
+        )
+        vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
+        return found
+
+    def require_one(self, what: str) -> None:
+        """Refuse, for `what` shows or keeps one measurement, a fit of several.
+
+        Raises:
+            ValueError: it is one.
+        """
+        problems = self.problem.problems
+        if problems.get("") is not self.problem:
+            raise ValueError(f"{what}: of a joint fit it takes a part: fit.part(...) of {', '.join(problems)}")
+
+    def require_alone(self, what: str) -> None:
+        """Refuse, for `what` asks the data anew, one measurement of several, whose problem knows nothing of the others.
+
+        Raises:
+            ValueError: it is one.
+        """
+        if self.part_of_joint is not None:
+            raise ValueError(
+                f"{what}: {self.part_of_joint!r} is a part of a joint fit, and without the others it says something "
+                "else; fit it by itself, or take the whole fit"
+            )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Best value of each parameter."""
+        return dict(zip(self.problem.names, map(float, self.vector), strict=True))
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard error of each parameter."""
+        return dict(zip(self.problem.names, map(float, self.errors), strict=True))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return self.problem.units
+
+    @cached_property
+    def stack(self) -> Any:
+        """The stack with the best values."""
+        return self.problem.build(self.vector).stack
+
+    @cached_property
+    def scale(self) -> float | tuple[float, ...]:
+        """The calibration factor, one number or one a channel. ValueError for a fit of several measurements."""
+        self.require_one("scale")
+        scale = np.asarray(self.problem.build(self.vector).scale, float)
+        return float(scale) if scale.ndim == 0 else tuple(scale.tolist())
+
+    @property
+    def is_posterior(self) -> bool:
+        """Whether the objective was a likelihood, so that errors are those of a posterior."""
+        return self.problem.objective == "likelihood"
+
+    @cached_property
+    def predicted(self) -> Floats:
+        """The model at the used samples, (N, C), in 1/sr."""
+        return np.asarray(self.problem.predict(self.vector), float)
+
+    @cached_property
+    def residuals(self) -> Floats:
+        """(N, C): (datum - model) / sigma, or datum minus model in the named objective's own measure.
+
+        With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
+        assumed model they are independent standard normal; `chi_square` is the sum of their squares.
+        """
+        return np.asarray(self.problem.call("independent_at", self.vector, self.predicted), float)
+
+    @cached_property
+    def chi_square(self) -> float:
+        """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
+        return float(self.problem.call("chi_square_at", self.vector, self.predicted))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of data less number of parameters."""
+        return self.problem.count - len(self.vector)
+
+    @property
+    def reduced_chi_square(self) -> float:
+        """`chi_square` per degree of freedom; NaN without any."""
+        return self.chi_square / self.degrees_of_freedom if self.degrees_of_freedom > 0 else float("nan")
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Normalised log-likelihood of the best values; NaN for a named objective."""
+        if not self.is_posterior:
+            return float("nan")
+        return float(self.problem.call("log_likelihood_at", self.vector, self.predicted))
+
+    @property
+    def correlation(self) -> Floats:
+        """(P, P); NaN in the rows and columns of parameters at a bound."""
+        spread = np.sqrt(np.diagonal(self.covariance))
+        spread = np.where(spread > 0, spread, np.nan)
+        return self.covariance / np.outer(spread, spread)
+
+
+def _called(names: tuple[str, ...], called: Mapping[str, str]) -> tuple[str, ...]:
+    """Those of the names that are known, as they are called elsewhere."""
+    return tuple(called[name] for name in names if name in called)

@@ -1,0 +1,211 @@
+"""Noise models and named residuals: one definition, used by the optimiser and by the sampler.
+
+With model value f, datum d and z = (d - f) / sigma, the negative log-density of a datum is a sum of squares up to a
+constant, so that a least-squares solver maximises the likelihood exactly:
+
+- Gaussian: z^2 / 2 + log sigma;
+- Student-t: (nu + 1) / 2 log(1 + z^2 / nu) + log sigma, half the square of z sqrt((nu + 1) / nu log1p(x) / x), x = z^2
+  / nu;
+- log sigma, where it depends on the parameters: half the square of sqrt(1 + 2 log(sigma / lowest)).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.special import gammaln
+from numpy.typing import NDArray
+
+from fits.data.measurements import Measurements
+from fits.names import Objective
+from fits.problem.discrepancy.logarithm import size, softness
+from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.process import Process
+from fits.problem.parameters import Free, is_free
+from fits.problem.values import shown
+
+Tails = Literal["gaussian", "student"]
+DEFAULT_RELATIVE = 0.05
+DEFAULT_FLOOR = 1e-4
+CUBE_ROOT_OFFSET = 1e-6
+LEVELS = (1e-100, 1e100)  # of a floor, or a scale: their squares neither vanish nor overflow in float64
+DEGREES_OF_FREEDOM = (0.01, 1e6)  # above, a Student-t is a Gaussian, and the terms of its constant cancel
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How a datum scatters about the model: variance = sigma^2 + (relative f)^2 + floor^2, with f the model's value.
+
+    relative: unitless, in [0, 1e100], or `Free`. floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
+    use_sigma: take the measurement's own sigma where it has one.
+    tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
+    then sigma.
+    correlated: errors of the model that neighbouring readings share, beside those: `Correlated`, or True for one whose
+    numbers are all free; only with Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted
+    without; where residuals of neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is
+    fitted with them, and the fit tells of both (`Fit.alone`). A `Problem` by itself has none then.
+    Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
+    `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
+    because weights taken from noisy data bias the fit downwards by twice the relative variance.
+    """
+
+    relative: float | Free | None = None
+    floor: float | Free | None = None
+    use_sigma: bool = True
+    tails: Tails = "gaussian"
+    degrees_of_freedom: float = 4.0
+    correlated: Correlated | bool | None = None
+
+    def __post_init__(self) -> None:
+        for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
+            level = getattr(self, field)
+            if isinstance(level, Free):
+                if level.shape != ():
+                    raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
+                for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
+                    _check_range(f"{field}.{end}", float(value), least, LEVELS[1])
+            elif level is not None and not (isinstance(level, int | float) and level == 0):
+                _check_range(field, level, least, LEVELS[1])
+        if self.tails not in get_args(Tails):
+            raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
+        _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
+        if self.correlated is True:
+            object.__setattr__(self, "correlated", Correlated())
+        if not (self.correlated in (False, None) or isinstance(self.correlated, Correlated)):
+            raise ValueError(f"Noise.correlated is {shown(self.correlated)}; it must be true, false or Correlated")
+        if self.correlated and self.tails != "gaussian":
+            raise ValueError(f"Noise.tails is {self.tails!r}; with correlated noise it must be gaussian")
+
+
+def _check_range(field: str, value: Any, low: float, high: float) -> None:
+    if not (isinstance(value, int | float) and low <= value <= high):
+        raise ValueError(f"Noise.{field} is {shown(value)}; it must be a number in [{low:g}, {high:g}]")
+
+
+def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:
+    """Scale of the noise at each datum, in 1/sr; `variance` is the measurement's own."""
+    return jnp.sqrt(variance + (relative * predicted) ** 2 + floor**2)
+
+
+def log_density(z: Array, sigma: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
+    """Normalised log-density of each datum, z = (datum - model) / sigma."""
+    if tails == "gaussian":
+        return -0.5 * z**2 - jnp.log(sigma) - 0.5 * math.log(2 * math.pi)
+    nu = degrees_of_freedom
+    constant = gammaln(0.5 * (nu + 1)) - gammaln(0.5 * nu) - 0.5 * jnp.log(nu * math.pi)
+    return constant - jnp.log(sigma) - 0.5 * (nu + 1) * jnp.log1p(z**2 / nu)
+
+
+def tail_residual(z: Array, tails: Tails, degrees_of_freedom: Array) -> Array:
+    """Smooth residual whose half square is the negative log-density of z, less its value at 0."""
+    if tails == "gaussian":
+        return z
+    nu = degrees_of_freedom
+    return z * jnp.sqrt((nu + 1) / nu * _log1p_ratio(z**2 / nu))
+
+
+def sigma_residual(sigma: Array, lowest: Array) -> Array:
+    """Residual whose half square is log(sigma / lowest) + 1/2; at least 1, so that its slope is finite."""
+    return level_residual(jnp.log(jnp.maximum(sigma / lowest, 1.0)))
+
+
+def level_residual(level: Array) -> Array:
+    """Residual whose half square is a level + 1/2, which is at least 0."""
+    return jnp.sqrt(1.0 + 2.0 * level)
+
+
+def information_weights(tails: Tails, degrees_of_freedom: Array) -> tuple[Array, Array]:
+    """Fisher information of one datum about f / sigma and about log sigma: (1, 2) for a Gaussian."""
+    if tails == "gaussian":
+        return jnp.ones(()), jnp.asarray(2.0)
+    nu = degrees_of_freedom
+    return (nu + 1) / (nu + 3), 2 * nu / (nu + 3)
+
+
+def named_residual(objective: Objective, predicted: Array, values: Array, cosine: Array) -> Array:
+    """Residuals of the literature, model minus datum, that are no likelihood; `cosine` is |cos theta_i|, shape (N, 1).
+
+    cosine_l2: f cos (Ngan 2005); log1p_cos: log(1 + f cos) (Low 2012), with f cos above -1/2; cube_root: the cube root
+    of f cos (after Fores 2012), offset by 1e-6 so that it is smooth at 0.
+    """
+    if objective == "cosine_l2":
+        return (predicted - values) * cosine
+    if objective == "log1p_cos":
+        return jnp.log1p(predicted * cosine) - jnp.log1p(jnp.maximum(values * cosine, -0.5))
+    return jnp.cbrt(predicted * cosine + CUBE_ROOT_OFFSET) - jnp.cbrt(values * cosine + CUBE_ROOT_OFFSET)
+
+
+def _log1p_ratio(x: Array) -> Array:
+    # log1p(x) / x for x >= 0; below the limit four terms leave an error of x^4 / 5, under rounding in float64
+    limit = 1e-4
+    small = x < limit
+    inner = jnp.where(small, x, 0.5 * limit)
+    series = 1.0 - inner * (1 / 2 - inner * (1 / 3 - inner / 4))
+    tame = jnp.where(small, 1.0, x)
+    return jnp.where(small, series, jnp.log1p(tame) / tame)
+
+
+Floats = NDArray[np.float64]
+
+
+class Levels(NamedTuple):
+    """Noise of the used samples: the measurement's own variance, (N, C) or (1,), and the levels of the noise model."""
+
+    variance: Floats
+    relative: float | Free
+    floor: float | Free
+
+    @property
+    def smallest(self) -> Floats:
+        """What sigma cannot fall below, (N, C) or (1,), in 1/sr."""
+        return np.sqrt(self.variance + _lowest(self.floor) ** 2)
+
+    @property
+    def fitted(self) -> bool:
+        """Whether a level is."""
+        return isinstance(self.relative, Free) or isinstance(self.floor, Free)
+
+    @property
+    def varying(self) -> bool:
+        """Whether sigma depends on the parameters, or on what they predict."""
+        return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
+
+    def softness(self, values: Floats) -> Floats:
+        """Of the logarithms of readings (N, C), see `fits.problem.discrepancy.logarithm`."""
+        return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
+
+    def gram(self, process: Process, values: Floats) -> Array | None:
+        """What readings (N, C) tell of a process that they share; None where it depends on parameters."""
+        if self.fitted:
+            return None
+        variance, relative, floor = (jnp.asarray(level) for level in self)
+        sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
+        return process.gram_of(size(values, self.softness(values)) / sigma)
+
+
+def is_assumed(noise: Noise, used: Measurements) -> bool:
+    """Whether nothing is stated of the noise, neither by the data nor by `Noise`, so that `DEFAULT_RELATIVE` holds."""
+    return noise.relative is None and noise.floor is None and (used.sigma is None or not noise.use_sigma)
+
+
+def noise_levels(noise: Noise, used: Measurements) -> Levels:
+    """The levels that `Noise` leaves out, filled in as it says."""
+    sigma = used.sigma if noise.use_sigma else None
+    relative, floor = noise.relative, noise.floor
+    if relative is None:
+        relative = DEFAULT_RELATIVE if is_assumed(noise, used) else 0.0
+    if floor is None:
+        alone = not is_free(relative) and relative == 0
+        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
+    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
+
+
+def _lowest(level: float | Free) -> float:
+    return float(level.arrays()[1]) if isinstance(level, Free) else float(level)
+
+
+def _start(level: float | Free) -> float:
+    return float(level.arrays()[0]) if isinstance(level, Free) else float(level)

@@ -1,0 +1,141 @@
+"""What structure the residuals of a fit have left along the angles of its measurements.
+
+White residuals are what the error bars assume, where a model discrepancy is fitted once they are whitened by its
+covariance. Here is the evidence: per incidence their mean and size, and over all of them the correlation of neighbours
+in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fits.data.neighbours import alike, neighbours
+from fits.data.scans import incidences
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+    from fits.optimise.result import Fit
+
+
+@dataclass(frozen=True)
+class ResidualGroup:
+    """Residuals, in units of sigma, of one incidence: white noise has mean 0 and root mean square 1."""
+
+    theta: float
+    count: int
+    mean: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class ResidualStructure:
+    """What the standardised residuals of a fit look like, over the rows and channels that were fitted."""
+
+    count: int
+    mean: float
+    rms: float
+    beyond_three: float  # share of |residual| > 3; a normal law has 0.0027
+    normal_distance: float  # Kolmogorov-Smirnov distance from the unit normal
+    lag_one: float  # correlation of neighbours in angle; NaN when no plane holds enough points
+    pairs: int
+    lag_one_sigma: float  # lag_one over its standard error under white noise, 1 / sqrt(pairs)
+    by_incidence: tuple[ResidualGroup, ...]
+
+    @property
+    def worst(self) -> ResidualGroup:
+        return max(self.by_incidence, key=lambda group: group.rms)
+
+    @property
+    def independent_share(self) -> float:
+        """Independent readings per reading, (1 - r) / (1 + r) for neighbours correlated by r; 1 where r <= 0."""
+        if not self.lag_one > 0.0:
+            return 1.0
+        return (1.0 - self.lag_one) / (1.0 + self.lag_one)
+
+
+def over_all_rows(fit: "Fit", values: np.ndarray) -> np.ndarray:
+    """Values (used samples, C) of a fit spread over every row of its data, (N, C); NaN in rows that were not used."""
+    mask = fit.problem.data.mask
+    spread = np.full((len(mask), np.shape(values)[1]), np.nan)
+    spread[mask] = values
+    return spread
+
+
+def standardised(fit: "Fit") -> np.ndarray:
+    """Residuals of every row that are independent standard normal if the model holds, (N, C); NaN in unused rows.
+
+    They are in units of the noise; with a model discrepancy, whitened by the covariance of both. A named objective has
+    no noise model: there the unit is the scatter that the fit has left.
+    """
+    return over_all_rows(fit, fit.residuals / _unit(fit))
+
+
+def residual_label(fit: "Fit") -> str:
+    """What `standardised` residuals are, for an axis of a picture."""
+    return "whitened residual" if fit.problem.noise.correlated else misfit_label(fit)
+
+
+def bsdf(fit: "Fit") -> np.ndarray:
+    """What the fit says of the BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
+    from fits.prediction.predict import with_discrepancy
+
+    used = fit.problem.data.used()
+    return over_all_rows(fit, with_discrepancy(fit, used.wi, used.wo, fit.predicted))
+
+
+def misfit(fit: "Fit") -> np.ndarray:
+    """What every reading is off the `bsdf` by, in units of the noise, (N, C); NaN in rows that were not used.
+
+    With a model discrepancy these are smaller than the noise, since it follows the readings: `standardised` are not.
+    """
+    left = np.asarray(fit.problem.call("unshared_at", fit.vector, fit.predicted), float)
+    return over_all_rows(fit, left / _unit(fit))
+
+
+def misfit_label(fit: "Fit") -> str:
+    """What a `misfit` is, for an axis of a picture."""
+    if not fit.is_posterior:
+        return f"residual of {fit.problem.objective} / its scatter"
+    which = "with discrepancy" if fit.problem.noise.correlated else "model"
+    return rf"(data $-$ {which}) / $\sigma$"
+
+
+def _unit(fit: "Fit") -> float:
+    return 1.0 if fit.is_posterior else float(np.sqrt(fit.chi_square / max(fit.degrees_of_freedom, 1)))
+
+
+def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualStructure:
+    """Summary of standardised residuals (N, C) over the rows of `data`; NaN rows are left out.
+
+    Raises:
+        ValueError: no residual is finite.
+    """
+    from scipy import stats
+
+    finite = residuals[np.isfinite(residuals)]
+    if not finite.size:
+        raise ValueError("residuals must hold at least one finite value, got none")
+    groups = []
+    for incidence in incidences(data):
+        values = residuals[incidence.rows]
+        values = values[np.isfinite(values)]
+        if values.size:
+            groups.append(ResidualGroup(incidence.theta, values.size, float(values.mean()), _rms(values)))
+    first, second = neighbours(data, residuals)
+    lag_one = alike(first, second)
+    return ResidualStructure(
+        count=finite.size,
+        mean=float(finite.mean()),
+        rms=_rms(finite),
+        beyond_three=float(np.mean(np.abs(finite) > 3.0)),
+        normal_distance=float(stats.kstest(finite, "norm").statistic),
+        lag_one=lag_one,
+        pairs=first.size,
+        lag_one_sigma=lag_one * float(np.sqrt(first.size)),
+        by_incidence=tuple(groups),
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,61 @@
+"""What reports are made of: a page, its sections, sentences and pictures, as text of HTML."""
+
+import base64
+import html
+from collections.abc import Mapping, Sequence
+from string import Template
+
+Pictures = Mapping[str, bytes]
+
+_PAGE = Template("""<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1"><title>$title</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; border-bottom: 1px solid #ddd; }
+table { border-collapse: collapse; font-size: 13px; margin: 1rem 0; display: block; overflow-x: auto; }
+th, td { padding: 0.2rem 0.8rem 0.2rem 0; text-align: left; vertical-align: top; } td { border-top: 1px solid #eee; }
+.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+caption { text-align: left; font-weight: 600; white-space: nowrap; }
+.pair { display: flex; flex-wrap: wrap; gap: 0 1rem; } .pair figure { flex: 1 1 20rem; min-width: 0; max-width: 31rem; }
+figure { margin: 1rem 0; } img { max-width: 100%; } figcaption, .note { font-size: 13px; color: #555; }
+pre { background: #f6f6f6; padding: 0.8rem; font-size: 12.5px; overflow-x: auto; }
+.verdict { background: #fff6e5; border-left: 4px solid #E69F00; padding: 0.5rem 1rem; }
+.verdict.fine { background: #eef7f2; border-color: #009E73; }
+</style></head><body>
+$body
+</body></html>
+""")
+
+
+def document(title: str, body: Sequence[str]) -> str:
+    """A whole page from its sections."""
+    return _PAGE.substitute(title=html.escape(title), body="\n".join(body))
+
+
+def made_with() -> str:
+    """Versions of what a page was made with, as an HTML fragment."""
+    from fits.reports.results import versions
+
+    words = [f"{package} {version}" for package, version in versions().items()]
+    return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
+
+
+def section(head: str, *parts: str) -> str:
+    """A part of a page under a heading; empty parts are left out."""
+    return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
+
+
+def sentences(words: Sequence[str]) -> str:
+    """A list of sentences."""
+    return "<ul>" + "".join(f"<li>{html.escape(sentence)}</li>" for sentence in words) + "</ul>"
+
+
+def image(images: Pictures, name: str, caption: str) -> str:
+    """A picture with its caption; nothing if there is none of this name."""
+    if name not in images:
+        return ""
+    content = base64.b64encode(images[name]).decode("ascii")
+    caption = html.escape(caption)
+    picture = f'<img alt="{caption}" src="data:image/png;base64,{content}">'
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"

@@ -1,0 +1,302 @@
+"""Pictures of measurements, and what all pictures share. A picture is a matplotlib `Figure`, neither shown nor written.
+
+In-plane data is drawn against the signed polar angle of the viewer, positive on the forward (mirror) side; out of
+plane, as a map of the viewer's hemisphere with forward to the right. Colours are those of Okabe and Ito, which most
+readers with a colour deficiency can tell apart.
+"""
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+
+from fits.data.scans import Incidence, in_plane, incidences, relative_azimuth, signed_angle
+
+if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
+
+INK, GREY = "#222222", "#9a9a9a"
+CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
+ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
+COARSE = 20.0  # degrees between neighbours on a map from which it shows points
+LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
+MOST_CHANNELS = 6  # in one picture, evenly spaced among all
+MOST_INCIDENCES = 9  # in one picture; data with more is shown at evenly spaced ones
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": INK,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+}
+
+
+def data_picture(data: "Measurements") -> Figure:
+    """What a file holds: in-plane values against angle, one panel per channel, and maps where data leaves the plane.
+
+    Of more than six channels some are shown, evenly spaced and with both ends.
+    """
+    shown_channels = np.unique(np.linspace(0, len(data.channels) - 1, MOST_CHANNELS).round().astype(int))
+    data = data.of_channels([data.channels[place] for place in shown_channels])
+    shown = chosen(incidences(data))
+    maps = mapped(data, shown)
+    with mpl.rc_context(STYLE):
+        plots = 1 if in_plane(data).any() else 0
+        heights = [3.6] * plots + [map_height(data, maps, 2.0)] * bool(maps)
+        figure = Figure(figsize=(9.5, sum(heights)), layout="constrained")
+        parts = np.ravel(figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False))
+        if plots:
+            _curves(parts[0].subplots(1, data.values.shape[1], sharey=True, squeeze=False)[0], data, shown)
+            parts[0].supxlabel(ANGLE_LABEL, fontsize="medium")
+        if maps:
+            values = np.where(data.mask, data.values[:, 0], np.nan)
+            norm = value_norm(values[data.mask])
+            panels = parts[-1].subplots(1, len(maps), squeeze=False)[0]
+            for panel, incidence in zip(panels, maps, strict=True):
+                image = hemisphere_map(panel, data, incidence, values, norm, "viridis")
+            parts[-1].colorbar(image, ax=list(panels), label=value_label(data, 0), shrink=0.8)
+    return figure
+
+
+def _curves(panels: Sequence[Axes], data: "Measurements", shown: list[Incidence]) -> None:
+    flat, used = in_plane(data), data.mask
+    for channel, axes in enumerate(panels):
+        for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
+            rows = incidence.rows[flat[incidence.rows]]
+            if not rows.size:
+                continue
+            draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
+            draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
+        value_axis(axes, data.values[flat], value_label(data, channel))
+    if panels[0].get_legend_handles_labels()[0]:
+        panels[0].legend(loc="upper right", ncols=2 if len(shown) > 4 else 1)
+
+
+def value_label(data: "Measurements", channel: int) -> str:
+    """The name of an axis of values; it says which channel where there are several."""
+    return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
+
+
+def chosen(every: list[Incidence]) -> list[Incidence]:
+    """At most `MOST_INCIDENCES` of the incidences, evenly spaced and with both ends."""
+    if len(every) <= MOST_INCIDENCES:
+        return every
+    return [every[index] for index in np.round(np.linspace(0, len(every) - 1, MOST_INCIDENCES)).astype(int)]
+
+
+def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
+    """The incidences among `shown` whose viewers leave the plane of incidence enough to draw a map, at most four."""
+    off_plane = ~in_plane(data) & data.mask
+    spread = [incidence for incidence in shown if np.count_nonzero(off_plane[incidence.rows]) >= 10]
+    return spread if len(spread) <= 4 else [spread[i] for i in np.round(np.linspace(0, len(spread) - 1, 4)).astype(int)]
+
+
+def draw_points(
+    axes: Axes,
+    data: "Measurements",
+    rows: np.ndarray,
+    channel: int,
+    colour: str,
+    label: str | None,
+    sigma: np.ndarray | None,
+) -> None:
+    """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); nothing when `rows` is empty."""
+    if not rows.size:
+        return
+    error = None if sigma is None else np.nan_to_num(sigma[rows, channel])
+    axes.errorbar(
+        signed_angle(data)[rows],
+        data.values[rows, channel],
+        yerr=error,
+        fmt="o",
+        markersize=2.5 if len(rows) > 60 else 3.5,
+        color=colour,
+        markeredgewidth=0.0,
+        elinewidth=0.6,
+        ecolor=mpl.colors.to_rgba(colour, 0.35),
+        label=label,
+        zorder=2,
+    )
+
+
+def value_axis(axes: Axes, values: np.ndarray, label: str) -> None:
+    """A logarithmic axis when the positive values span more than `LOG_ABOVE`, one that starts at zero otherwise."""
+    if is_logarithmic(values):
+        axes.set_yscale("log")
+        positive = values[values > 0.0]
+        low, high = positive.min() / 1.6, positive.max() * 1.6
+        axes.set_ylim(low, high)
+        axes.yaxis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0,) if high > 1e3 * low else (1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(mpl.ticker.StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+    elif values.size and values.min() >= 0.0 and values.max() > 0.0:
+        axes.set_ylim(0.0, 1.1 * values.max())
+    axes.set_ylabel(label)
+    axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(30.0))
+
+
+def is_logarithmic(values: np.ndarray) -> bool:
+    """Whether the positive ones among `values` span more than a factor `LOG_ABOVE`."""
+    positive = values[values > 0.0]
+    return bool(positive.size and positive.max() > LOG_ABOVE * positive.min())
+
+
+def value_norm(values: np.ndarray) -> Normalize:
+    """The colour scale for a map of `values`, by the rule of `value_axis`."""
+    if is_logarithmic(values):
+        positive = values[values > 0.0]
+        return LogNorm(positive.min(), positive.max())
+    return Normalize(min(0.0, float(values.min())), float(values.max()))
+
+
+def hemisphere_map(
+    axes: Axes, data: "Measurements", incidence: Incidence, values: np.ndarray, norm: Normalize, colours: str
+) -> ScalarMappable:
+    """Draws `values` (N,) of one incidence over the viewer's hemisphere: forward to the right, rings every 30 degrees.
+
+    What is NaN, or not positive on a logarithmic scale, is left blank; readings that lie too far apart for a surface
+    between them are drawn as points.
+    """
+    rows = incidence.rows[np.isfinite(values[incidence.rows])]
+    rows = rows[values[rows] > 0.0] if isinstance(norm, LogNorm) else rows
+    radius = np.minimum(data.theta_o, 180.0 - data.theta_o)[rows]  # light that passes is seen from below
+    azimuth = np.radians(relative_azimuth(data)[rows])
+    x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
+    surface = _surface(x, y)
+    image: ScalarMappable
+    if surface is None:
+        image = axes.scatter(x, y, c=values[rows], norm=norm, cmap=colours, s=10.0, linewidths=0.0)
+    else:
+        image = axes.tripcolor(surface, values[rows], norm=norm, cmap=colours, shading="gouraud")
+    below, above = _halves(data, incidence)
+    turn = np.linspace(-np.pi if below else 0.0, np.pi if above else 0.0, 181)
+    for ring in (30.0, 60.0, 90.0):
+        axes.plot(ring * np.cos(turn), ring * np.sin(turn), color=GREY, linewidth=0.5)
+    axes.plot([-incidence.theta], [0.0], "*", color="white", markeredgecolor=INK, markersize=8, clip_on=False)
+    axes.set_aspect("equal")
+    axes.set_xlim(-94.0, 94.0)
+    axes.set_ylim(-94.0 if below else -8.0, 94.0 if above else 8.0)
+    axes.set_axis_off()
+    axes.set_title(f"{incidence.label} (light: star)")
+    return image
+
+
+def map_height(data: "Measurements", shown: list[Incidence], full: float) -> float:
+    """Height for a row of maps: `full` for whole discs, less where every one of them is half a disc."""
+    return full if any(all(_halves(data, incidence)) for incidence in shown) else 0.5 * full + 0.4
+
+
+def _halves(data: "Measurements", incidence: Incidence) -> tuple[bool, bool]:
+    side = np.sin(np.radians(relative_azimuth(data)[incidence.rows]))
+    return bool(side.min() < -0.1), bool(side.max() > 0.1)
+
+
+def _surface(x: np.ndarray, y: np.ndarray) -> Triangulation | None:
+    """Triangles between neighbours on a map, in degrees; None for points on a line or too far apart."""
+    points = np.stack([x, y], axis=-1)
+    if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0), tol=1.0) < 2:
+        return None
+    corners = Triangulation(x, y)
+    sides = points[corners.triangles] - points[np.roll(corners.triangles, 1, axis=1)]
+    longest = np.linalg.norm(sides, axis=-1).max(axis=-1)
+    if np.quantile(longest, 0.75) > COARSE:
+        return None
+    # a triangle with a side much longer than is usual spans what was not measured, such as the retro cone
+    corners.set_mask(longest > 2.5 * np.quantile(longest, 0.75))
+    return corners
+
+
+def ordered_colours(count: int) -> list[str]:
+    """`count` colours that run from dark to light, for values that have an order."""
+    return [mpl.colors.to_hex(mpl.colormaps["viridis"](place)) for place in np.linspace(0.0, 0.85, count)]
+
+
+def channel_colour(channel: str, index: int) -> str:
+    """The channel's own colour for red, green and blue, otherwise the next of the cycle."""
+    return NAMED.get(channel, CYCLE[index % len(CYCLE)])
+
+
+def as_png(figure: Figure, trimmed: bool = True) -> bytes:
+    """The figure as the content of a PNG file. trimmed: without empty margins, else of the size that it has."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, bbox_inches="tight" if trimmed else None)
+    return buffer.getvalue()
+
+
+def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) -> Figure:
+    """What structure standardised residuals (N, C) have: along angle, as a histogram, and between neighbours.
+
+    label: what the residuals are, for the axes.
+    """
+    from scipy import stats
+
+    from fits.data.neighbours import autocorrelation
+    from fits.reports.diagnostics import residual_structure
+
+    structure = residual_structure(data, residuals)
+    finite = residuals[np.isfinite(residuals)]
+    shown = chosen(incidences(data))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 5.6), layout="constrained")
+        panels = figure.subplot_mosaic([["angle", "angle"], ["histogram", "lags"]])
+
+        axes = panels["angle"]
+        axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
+        for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
+            angle, values = signed_angle(data)[incidence.rows], residuals[incidence.rows]
+            for channel in range(values.shape[1]):
+                axes.plot(
+                    angle,
+                    values[:, channel],
+                    "o",
+                    markersize=2.5,
+                    color=colour,
+                    markeredgewidth=0,
+                    label=None if channel else incidence.label,
+                )
+        axes.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
+        axes.legend(ncols=len(shown), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
+
+        axes = panels["histogram"]
+        edge = float(np.clip(np.abs(finite).max(), 4.0, 12.0))
+        grid = np.linspace(-edge, edge, 301)
+        bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
+        axes.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
+        axes.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
+        axes.set(
+            xlabel=label,
+            ylabel="density",
+            title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}",
+        )
+        axes.legend(loc="upper right")
+
+        axes = panels["lags"]
+        correlation = autocorrelation(data, residuals)
+        lags = np.arange(1, len(correlation) + 1)
+        axes.bar(lags, correlation, color=CYCLE[0], width=0.7)
+        if structure.pairs:
+            noise = 2.0 / np.sqrt(structure.pairs)
+            axes.axhspan(-noise, noise, color="#dddddd", zorder=0, label="white noise, 95 %")
+            axes.legend(loc="upper right")
+        axes.set(
+            xlabel="readings apart, in one plane", ylabel="correlation", ylim=(-1.0, 1.0), title="Neighbours in angle"
+        )
+        axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(5.0))
+    return figure

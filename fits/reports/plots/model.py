@@ -1,0 +1,209 @@
+"""Pictures of a fit beside its data: curves per incidence, residuals below, and maps where data leaves the plane."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from fits.data.geometry import Floats, direction
+from fits.data.scans import Incidence, in_plane, incidences, signed_angle
+from fits.prediction.predict import with_discrepancy
+from fits.reports.diagnostics import bsdf, misfit, misfit_label, over_all_rows
+from fits.reports.plots.data import (
+    ANGLE_LABEL,
+    CYCLE,
+    GREY,
+    INK,
+    STYLE,
+    channel_colour,
+    chosen,
+    draw_points,
+    hemisphere_map,
+    map_height,
+    mapped,
+    value_axis,
+    value_label,
+    value_norm,
+)
+
+if TYPE_CHECKING:
+    from fits.optimise.result import Fit
+    from fits.sampling.posterior import Posterior
+
+BAND_DRAWS = 200  # posterior draws behind a band
+STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
+STEP = 1.0  # degrees between the points of a model curve
+FEWEST_IN_PLANE = 3  # readings that make a panel
+
+
+@dataclass(frozen=True)
+class _Curve:
+    """The model along one incidence: viewing angles (M,), values (M, C), and the band's two edges (2, M, C) or None.
+
+    alone: (M, C), of the stack without the model discrepancy, whose the band is; None where there is no discrepancy.
+    """
+
+    angle: Floats
+    values: Floats
+    alone: Floats | None
+    band: Floats | None
+
+
+def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
+    """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
+
+    With a model discrepancy there are two curves, with it and of the stack alone; residuals are of the first.
+
+    fits: one or more fits of the same data by name; the points and their errors are those of the first one.
+    posterior: adds the band that holds 95 % of its draws of the stack alone (not of new readings) around the first.
+    Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
+    None where no incidence has at least three readings in the plane of incidence.
+    """
+    first = next(iter(fits.values()))
+    data = first.problem.data
+    flat = in_plane(data)
+    shown = [
+        one for one in chosen(incidences(data)) if np.count_nonzero((flat & data.mask)[one.rows]) >= FEWEST_IN_PLANE
+    ]
+    if not shown:
+        return None
+    curves = {name: _curves(fit, shown, posterior if fit is first else None) for name, fit in fits.items()}
+    columns = 1 if len(shown) == 1 else 2 if len(shown) <= 4 else 3
+    blocks = -(-len(shown) // columns)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 4.0 * blocks), layout="constrained")
+        grid = figure.add_gridspec(2 * blocks, columns, height_ratios=[3.0, 1.2] * blocks)
+        upper: Axes | None = None
+        lower: Axes | None = None
+        for index, incidence in enumerate(shown):
+            block, column = divmod(index, columns)
+            upper = figure.add_subplot(grid[2 * block, column], sharex=upper)
+            lower = figure.add_subplot(grid[2 * block + 1, column], sharex=upper, sharey=lower)
+            rows = incidence.rows[flat[incidence.rows]]
+            _points(upper, fits, rows)
+            for place, (name, every) in enumerate(curves.items()):
+                _lines(upper, every[index], data.channels, None if len(fits) == 1 else name, place)
+            _residuals(lower, fits, rows)
+            value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
+            upper.set_title(incidence.label)
+            upper.tick_params(labelbottom=False)
+            lower.set_ylabel(_residual_label(first) if column == 0 else "")
+        figure.supxlabel(ANGLE_LABEL, fontsize="medium")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=4)
+    return figure
+
+
+def _residual_label(fit: "Fit") -> str:
+    words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
+    return f"{words}\nwith discrepancy" if fit.problem.noise.correlated else words
+
+
+def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
+    """Data, model and residual over the viewer's hemisphere, a row per incidence; None for data that stays in plane."""
+    data = fit.problem.data
+    shown = mapped(data, chosen(incidences(data)))
+    if not shown:
+        return None
+    values = np.where(data.mask, data.values[:, channel], np.nan)
+    predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
+    norm = value_norm(values[data.mask])
+    reach = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
+    with mpl.rc_context(STYLE):
+        height = map_height(data, shown, 2.4)
+        figure = Figure(figsize=(9.5, height * len(shown) + 0.3), layout="constrained")
+        panels = figure.subplots(len(shown), 3, squeeze=False)
+        for row, incidence in zip(panels, shown, strict=True):
+            image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
+            hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
+            signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-reach, reach), "PuOr")
+            model = "with discrepancy" if fit.problem.noise.correlated else "model"
+            for axes, what in zip(row, ("data", model, "residual"), strict=True):
+                axes.set_title(f"{incidence.label}: {what}")
+        bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
+        figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
+        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=misfit_label(fit), extend="both", **bar)
+    return figure
+
+
+def _points(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
+    fit = next(iter(fits.values()))
+    data, sigma = fit.problem.data, over_all_rows(fit, assumed_sigma(fit))
+    used = data.mask[rows]
+    for channel, name in enumerate(data.channels):
+        several = len(data.channels) > 1
+        colour = channel_colour(name, channel) if several and len(fits) == 1 else INK
+        what = r"data and assumed $\sigma$" if fit.is_posterior else "data"
+        label = f"{what}, {name}" if several else what
+        draw_points(axes, data, rows[used], channel, colour, label, sigma)
+        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
+
+
+def _lines(axes: Axes, curve: _Curve, channels: tuple[str, ...], name: str | None, place: int) -> None:
+    for channel, channel_name in enumerate(channels):
+        own = len(channels) > 1 and name is None
+        colour = channel_colour(channel_name, channel) if own else CYCLE[place % len(CYCLE)]
+        what = name or "model" if curve.alone is None else f"{name or 'model'} with discrepancy"
+        label = what if channel == 0 else None
+        axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=label, zorder=3)
+        which = ""
+        if curve.alone is not None:
+            label, which = ("stack alone" if channel == 0 and place == 0 else None), ", stack alone"
+            axes.plot(curve.angle, curve.alone[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
+        if curve.band is not None:
+            label = f"95 % of the posterior{which}" if channel == 0 else None
+            low, high = curve.band[:, :, channel]
+            axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=label, zorder=2.5)
+
+
+def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
+    axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
+    axes.axhline(0.0, color=INK, linewidth=0.6)
+    for place, fit in enumerate(fits.values()):
+        data, residuals = fit.problem.data, misfit(fit)
+        for channel, name in enumerate(data.channels):
+            own = len(data.channels) > 1 and len(fits) == 1
+            colour = channel_colour(name, channel) if own else CYCLE[place % len(CYCLE)]
+            angle = signed_angle(data)[rows]
+            axes.plot(angle, residuals[rows, channel], "o", markersize=2.2, color=colour, markeredgewidth=0.0)
+
+
+def assumed_sigma(fit: "Fit") -> Floats:
+    """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
+
+    if not fit.is_posterior:
+        return np.full(np.shape(fit.predicted), np.nan)
+    return np.asarray(fit.problem.call("sigma_at", fit.vector, fit.predicted))
+
+
+def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
+    data = fit.problem.data
+    flat, signed = in_plane(data), signed_angle(data)
+    angles, wi, wo = [], [], []
+    for incidence in shown:
+        own = signed[incidence.rows[flat[incidence.rows]]]
+        angle = np.arange(np.floor(own.min()), np.ceil(own.max()) + STEP / 2, STEP)
+        angle = np.clip(angle, -STEEPEST, STEEPEST)
+        angles.append(angle)
+        wi.append(np.tile(direction(incidence.theta, incidence.phi), (len(angle), 1)))
+        wo.append(direction(angle, incidence.phi + 180.0))
+    vectors = fit.vector[None]
+    if posterior is not None:
+        picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
+        vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
+    towards = np.concatenate(wi), np.concatenate(wo)
+    values = np.asarray(fit.problem.predict_at(vectors, *towards))
+    values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
+    band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
+    best = with_discrepancy(fit, *towards, values[0])
+    ends = np.cumsum([len(angle) for angle in angles])
+    curves = []
+    for angle, end in zip(angles, ends, strict=True):
+        own = slice(end - len(angle), end)
+        alone = values[0, own] if fit.problem.noise.correlated else None
+        curves.append(_Curve(angle, best[own], alone, None if band is None else band[:, own]))
+    return curves

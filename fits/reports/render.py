@@ -1,0 +1,201 @@
+"""A picture of a material without a renderer: spheres, lobes in the plane of incidence, and light in by light out."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+import layerjax as lj
+from fits.reports.plots.data import CYCLE, STYLE
+from layerjax.mixture import stacks_of
+
+Prepared = lj.Prepared | lj.Mixture
+
+Floats = NDArray[np.float64]
+
+LIGHTS = {
+    "lit from the front": (-0.4, 0.5, 0.77),
+    "from the side": (-0.85, 0.35, 0.1),
+    "from behind": (0.5, 0.45, -0.74),
+}
+"""Towards the light: x to the right, y up, z towards the viewer."""
+
+SUN, SKY = 0.8, 0.2
+"""What a white diffuse surface shows of the light at normal incidence, and of the sky, which is all around."""
+
+SAMPLES = 2
+"""Points along each side of a pixel."""
+
+SIZES = (16, 1024)
+"""Pixels of a sphere's diameter; more take several GB, and the whole picture has no more across."""
+
+INCIDENCES = (0.0, 30.0, 60.0, 80.0)
+SKY_COSINES, SKY_AZIMUTHS = 24, 24
+"""Directions at which the reflected sky is tabulated."""
+
+INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
+"""Edges of the cells of the matrix picture, degrees."""
+
+DECADES, MATRIX_BELOW = 4.0, np.radians(75.0)
+"""Of its values at most, from the largest among angles below this."""
+
+
+def render(
+    stack: lj.Stack | lj.Mixture,
+    transport: lj.Transport | Literal["auto"] | None = None,
+    *,
+    title: str = "",
+    size: int = 256,
+) -> Figure:
+    """Picture of a material: spheres under a directional light and a constant sky, lobes, and a map of the BSDF.
+
+    The sphere is a thin sheet with the sky on both sides: where it transmits, light from behind shines through. Of
+    three channels the picture is in colour (red, green, blue), else grey by their mean.
+
+    Args:
+        stack: the material; every parameter a number.
+        transport: see `layerjax.prepare`; None: `AddingDoubling`, all orders of scattering.
+        title: what stands above it.
+        size: pixels of a sphere's diameter, in [16, 1024].
+
+    Raises:
+        ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
+            random or does not carry the stack.
+    """
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise ValueError(f"size is {size}, must be in [{SIZES[0]}, {SIZES[1]}] pixels")
+    for part in stacks_of(stack):
+        _require_air_below(part)
+    chosen = lj.AddingDoubling() if transport is None else transport
+    if isinstance(chosen, lj.Transport) and chosen.random:
+        raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
+    prepared = lj.prepare(stack, chosen)
+    maps = _in_plane(prepared, any(part.base is None for part in stacks_of(stack)))
+    lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10.5, 7.2), layout="constrained")
+        if title:
+            figure.suptitle(title)
+        above, below = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.15), squeeze=False))
+        for axes, name in zip(above.subplots(1, len(lights), squeeze=False)[0], lights, strict=True):
+            axes.imshow(_display(sphere(stack, prepared, LIGHTS[name], size)), interpolation="none")
+            axes.set_title(name)
+            axes.set_axis_off()
+        left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
+        _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, "transmitted" in maps)
+        _matrix(right, maps)
+    return figure
+
+
+def _require_air_below(stack: lj.Stack) -> None:
+    interfaces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
+    if stack.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
+        raise ValueError(
+            f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the picture is of a sheet "
+            "in air: close it with an Interface of ior 1, or give it a base"
+        )
+
+
+def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
+    """Radiance of the pixels, (size, size, 3), linear.
+
+    An irradiance of pi `SUN` across the light, a sky of radiance `SKY`, a viewer far away, and a picture 1.04 times as
+    wide as the sphere.
+
+    Args:
+        stack, prepared: the material, and what `layerjax.prepare` made of it.
+        light: towards it, of any length: x to the right, y up, z towards the viewer.
+        size: pixels along each side, each the mean of `SAMPLES` by `SAMPLES` points.
+    """
+    number = SAMPLES * size
+    place = ((np.arange(number) + 0.5) / number * 2.0 - 1.0) * 1.04
+    x, y = np.meshgrid(place, -place)
+    inside = x * x + y * y < 1.0
+    normal = np.stack([x[inside], y[inside], np.sqrt(1.0 - x[inside] ** 2 - y[inside] ** 2)], axis=-1)
+    # fibers along x run around the sphere, as lines of equal height
+    tangent = np.stack([normal[:, 2], np.zeros(len(normal)), -normal[:, 0]], axis=-1)
+    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=-2)
+    wi = frame @ (np.asarray(light) / np.linalg.norm(light))
+    wo = frame[:, :, 2]
+    direct = np.pi * np.asarray(lj.evaluate(prepared, wi, wo)) * np.abs(wi[:, 2:])
+    seen = SUN * direct + SKY * _sky(stack, prepared, wo)
+    colour = seen if seen.shape[-1] == 3 else np.repeat(seen.mean(axis=-1, keepdims=True), 3, axis=-1)
+    picture = np.full((number, number, 3), SKY)
+    picture[inside] = colour
+    return picture.reshape(size, SAMPLES, size, SAMPLES, 3).mean(axis=(1, 3))
+
+
+def _sky(stack: lj.Stack | lj.Mixture, prepared: Prepared, wo: Floats) -> Floats:
+    """Of a sky of radiance 1 all around, what reaches the viewer: by reciprocity what light from there scatters."""
+    cosine = np.sin(0.5 * np.pi * (np.arange(SKY_COSINES) + 0.5) / SKY_COSINES)
+    azimuth = np.linspace(-np.pi, np.pi, SKY_AZIMUTHS + 1)
+    towards = lj.direction(np.arccos(cosine)[:, None], azimuth)
+    energy = sum(np.asarray(part) for part in lj.albedo(prepared, towards)) + np.asarray(lj.unscattered(stack, towards))
+    table = RegularGridInterpolator((cosine, azimuth), energy, bounds_error=False, fill_value=None)
+    near = np.clip(wo[:, 2], cosine[0], cosine[-1])
+    return np.asarray(table(np.stack([near, np.arctan2(wo[:, 1], wo[:, 0])], axis=-1)))
+
+
+def _display(radiance: Floats) -> Floats:
+    """Linear values to those of a screen (IEC 61966-2-1), highlights rolled off above 0.8."""
+    bright = np.maximum(radiance - 0.8, 0.0)
+    shown = np.minimum(radiance, 0.8) + 0.2 * bright / (bright + 0.2)
+    return np.where(shown <= 0.0031308, 12.92 * shown, 1.055 * np.maximum(shown, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
+    """Lobes in the plane of incidence: mean f |cos| by the angle from the normal, the light coming from the left."""
+    angle = np.radians(np.linspace(-180.0, 180.0, 721) if transmits else np.linspace(-90.0, 90.0, 361))
+    wo = lj.direction(angle, 0.0)
+    for incidence, colour in zip(INCIDENCES, CYCLE, strict=False):
+        wi = lj.direction(-np.radians(incidence), 0.0)
+        value = np.asarray(lj.evaluate(prepared, wi, wo) * jnp.abs(wo[:, 2:])).mean(axis=-1)
+        axes.plot(angle, np.sqrt(value), color=colour, label=f"{incidence:.0f}°")
+    axes.set_theta_zero_location("N")  # type: ignore[attr-defined]
+    axes.set_theta_direction(-1)  # type: ignore[attr-defined]
+    if not transmits:
+        axes.set_thetamin(-90)  # type: ignore[attr-defined]
+        axes.set_thetamax(90)  # type: ignore[attr-defined]
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.set_title("√(f |cos θₒ|), 1/√sr, in the plane of incidence", pad=14)
+    axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
+
+
+def _in_plane(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
+    """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
+    wi = lj.direction(-_middle(INCIDENT), 0.0)[:, None]
+    sides = {"reflected": lj.direction(_middle(OUTGOING), 0.0)}
+    if open_below:
+        sides["transmitted"] = lj.direction(np.pi - _middle(OUTGOING), 0.0)
+    maps = {name: np.asarray(lj.evaluate(prepared, wi, wo)).mean(axis=-1) for name, wo in sides.items()}
+    return {name: values for name, values in maps.items() if name == "reflected" or np.any(values > 0)}
+
+
+def _matrix(figure: SubFigure, maps: dict[str, Floats]) -> None:
+    """Incident by outgoing angle, one map for each side; colours go from the least to the largest value off grazing."""
+    off = np.ix_(_middle(INCIDENT) < MATRIX_BELOW, np.abs(_middle(OUTGOING)) < MATRIX_BELOW)
+    largest = max(float(values[off].max()) for values in maps.values()) or 1.0
+    least = min(float(values[off].min()) for values in maps.values())
+    norm = LogNorm(min(max(least, largest * 10.0**-DECADES), 0.5 * largest), largest)
+    panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, values) in zip(panels, maps.items(), strict=True):
+        shown = np.clip(values, norm.vmin, norm.vmax)
+        image = axes.pcolormesh(OUTGOING, INCIDENT, shown, norm=norm, cmap="viridis", rasterized=True)
+        axes.set_ylabel("incidence, degrees")
+        axes.set_title(f"BSDF in the plane of incidence, {name}")
+        axes.grid(visible=False)
+        figure.colorbar(image, ax=axes, label="1/sr", extend="both")
+    panels[-1].set_xlabel("outgoing angle, degrees (+ forward, $-$ backward)")
+
+
+def _middle(edges: Floats) -> Floats:
+    """Angles in the middle between edges in degrees, radians."""
+    return np.radians(0.5 * (edges[1:] + edges[:-1]))

@@ -1,0 +1,81 @@
+"""Parts of a fit as they stand in its directory."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import layerjax as lj
+from fits.data.formats import read
+from fits.data.measurements import Measurements, Source
+from fits.data.spheres import Sphere, Spheres
+
+if TYPE_CHECKING:
+    from fits.optimise.result import Alone
+    from fits.problem.problem import Problem
+    from fits.problem.stack_file import ProblemFile
+
+HELD_OUT = "held_out.csv"
+"""Readings that were held out of a fit, as `write_csv` writes them."""
+
+
+def held_out_of(directory: str | Path) -> Measurements | None:
+    """The readings that the fit of a directory has not seen; None if none were kept."""
+    path = Path(directory) / HELD_OUT
+    return read(path, format="csv") if path.is_file() else None
+
+
+def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurements) -> "Problem":
+    """What was fitted to what: the stack file, with what the fit chose beside it."""
+    from fits.problem.problem import Problem
+    from fits.problem.toml import transport_from_dict
+    from fits.reports.earlier import noise_meant, transport_meant
+
+    source = content["source"] | {"notes": tuple(content["source"]["notes"])}
+    if "transport" in content:  # with the resolution that the fit chose
+        transport = transport_from_dict(content["transport"])
+    else:
+        assert isinstance(given.stack, lj.Stack)  # there were no mixtures
+        transport = transport_meant(given.stack, given.transport)
+    noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
+    noise = noise_meant(noise, [entry["name"] for entry in content["parameters"]])
+    scale = given.scale if given.scale is not None else content["fixed_scale"]
+    data = replace(data, source=Source(**source))
+    return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
+
+
+def stored_number(value: float | str) -> float:
+    """A number; what is not finite stands there as a word."""
+    return float(value)
+
+
+def stored_array(values: list[Any], *shape: int) -> np.ndarray:
+    """Numbers in an array of this shape."""
+    return np.array(values, dtype=float).reshape(shape)
+
+
+def stored_alone(content: dict[str, Any] | None) -> "Alone | None":
+    """The fit without errors that readings share."""
+    from fits.optimise.result import Alone
+
+    if content is None:
+        return None
+
+    return Alone(
+        values={name: stored_number(value) for name, value in content["values"].items()},
+        errors={name: stored_number(value) for name, value in content["errors"].items()},
+        chi_square=stored_number(content["chi_square"]),
+        degrees_of_freedom=content["degrees_of_freedom"],
+        log_likelihood=stored_number(content["log_likelihood"]),
+        alike=stored_number(content["alike"]),
+        pairs=content["pairs"],
+    )
+
+
+def stored_spheres(content: "dict[str, Any] | None") -> Spheres | None:
+    """The spheres that totals were read by."""
+    if content is None:
+        return None
+    both = {name: None if content[name] is None else Sphere(**content[name]) for name in ("reflection", "transmission")}
+    return Spheres(**(content | both))

@@ -1,0 +1,279 @@
+"""Tables of a fit: built once as words, then shown by rich on a terminal or as plain HTML in the report."""
+
+import html
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TextIO
+
+import numpy as np
+
+from fits.optimise.limits import instrument_limits
+from fits.reports.diagnostics import ResidualStructure
+from fits.reports.verdicts import identifiability
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table as Boxed
+
+    from fits.optimise.result import Fit
+    from fits.prediction.compare import Comparison, Row
+    from fits.prediction.model_scores import Foresight
+    from fits.sampling.posterior import Posterior
+
+MOST_MINIMA = 8
+LONGEST_WORD = 30  # letters of a text that is never wrapped
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, column heads, and rows of as many words; `note` stands below.
+
+    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    keys: int = 1
+
+
+def print_table(table: Table, stream: TextIO) -> None:
+    """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none.
+
+    One that does not fit becomes several below each other, so that every column is shown.
+    """
+    from rich.console import Console
+
+    console = Console(file=stream, width=None if stream.isatty() else 120, highlight=False, markup=False)
+    parts = _parts(table, console)
+    for number, part in enumerate(parts, start=1):
+        title = table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"
+        console.print(_boxed(table, part, title, squeezed=_least_width(table, part, console) > console.width))
+    if table.note:
+        console.print(table.note)
+
+
+def _parts(table: Table, console: "Console") -> list[list[int]]:
+    """The columns of the tables that this one is printed as: its keys, and as many of the others as fit."""
+    keys = list(range(table.keys))
+    parts = [keys]
+    for column in range(table.keys, len(table.columns)):
+        if parts[-1] != keys and _least_width(table, [*parts[-1], column], console) > console.width:
+            parts.append(keys)
+        parts[-1] = [*parts[-1], column]
+    return parts
+
+
+def _least_width(table: Table, columns: list[int], console: "Console") -> int:
+    return console.measure(_boxed(table, columns), options=console.options.update(width=10_000)).minimum
+
+
+def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = False) -> "Boxed":
+    """The named columns of a table in a box. Texts may be wrapped, numbers only where the box is to be `squeezed`."""
+    from rich import box
+    from rich.cells import cell_len
+    from rich.table import Table as Boxed
+
+    boxed = Boxed(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index in columns:
+        words = [table.columns[index], *(row[index] for row in table.rows)]
+        longest = max(map(cell_len, words))
+        number = _numeric(table, index)
+        wraps = not number and (index == len(table.columns) - 1 or longest > LONGEST_WORD)
+        boxed.add_column(
+            table.columns[index],
+            justify="right" if number else "left",
+            no_wrap=not (wraps or squeezed),
+            overflow="fold",
+            min_width=None if squeezed else min(longest, 12) if wraps else longest,
+        )
+    for row in table.rows:
+        boxed.add_row(*(row[index] for index in columns))
+    return boxed
+
+
+def html_table(table: Table) -> str:
+    """The table as an HTML fragment, every word escaped."""
+    kinds = [' class="number"' if _numeric(table, index) else "" for index in range(len(table.columns))]
+    head = "".join(f"<th{kind}>{html.escape(word)}</th>" for kind, word in zip(kinds, table.columns, strict=True))
+    body = "".join(
+        "<tr>"
+        + "".join(f"<td{kind}>{html.escape(word)}</td>" for kind, word in zip(kinds, row, strict=True))
+        + "</tr>\n"
+        for row in table.rows
+    )
+    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    caption = f"<caption>{html.escape(table.title)}</caption>" if table.title else ""
+    return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>{note}\n"
+
+
+def parameter_table(fit: "Fit") -> Table:
+    """Value, standard error, unit, bounds and what the data says about each fitted parameter."""
+    verdicts, limits = identifiability(fit), instrument_limits(fit)
+    rows = []
+    for index, (name, value) in enumerate(fit.values.items()):
+        low, high = float(fit.problem.low[index]), float(fit.problem.high[index])
+        error = fit.standard_errors[name]
+        number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
+        rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", verdicts[name]))
+    notes = ["Errors are those of the best minimum alone."] if fit.alternatives else []
+    if not fit.is_posterior:
+        notes.append("The objective is a named residual, not a likelihood: the errors are only indicative.")
+    note = " ".join(notes)
+    return Table(
+        "Fitted parameters", ("parameter", "value", "error", "unit", "bounds", "identified"), tuple(rows), note
+    )
+
+
+def alone_table(fit: "Fit") -> Table:
+    """Values and errors of a fit beside those of the same stack with independent noise."""
+    assert fit.alone is not None
+    rows = []
+    for name, value in fit.alone.values.items():
+        pairs = (fit.values[name], fit.standard_errors[name]), (value, fit.alone.errors[name])
+        rows.append((name, *(word for pair in pairs for word in with_error(*pair)), fit.units[name]))
+    ratio = fit.alone.chi_square / max(fit.alone.degrees_of_freedom, 1)
+    note = f"Chi-square per degree of freedom is {fit.reduced_chi_square:.3g} with and {ratio:.3g} without."
+    columns = ("parameter", "with", "error", "without", "error", "unit")
+    return Table("With and without the model discrepancy", columns, tuple(rows), note)
+
+
+def minima_table(fit: "Fit") -> Table:
+    """The minima that the starts reached, a column each, best first: how many starts, the cost, the values there."""
+    shown = fit.minima[:MOST_MINIMA]
+    equal = {id(minimum) for minimum in fit.alternatives}
+    heads = ["best", *("same cost" if id(minimum) in equal else "higher cost" for minimum in shown[1:])]
+    rows = [
+        ("starts", *(str(minimum.count) for minimum in shown)),
+        ("cost", *(f"{minimum.cost:.6g}" for minimum in shown)),
+        *((name, *(f"{minimum.values[name]:.4g}" for minimum in shown)) for name in fit.values),
+    ]
+    hidden = len(fit.minima) - len(shown)
+    note = f"{hidden} more, with higher cost, are in the result." if hidden else ""
+    return Table("Minima that the starts reached", ("", *heads), tuple(rows), note)
+
+
+def unresolved_table(fit: "Fit") -> Table:
+    """Directions of parameter space that the data do not constrain: how badly, and what they know of each by itself."""
+    rows = []
+    for place, combination in enumerate(fit.unresolved, 1):
+        weights, alone = combination.weights, combination.alone
+        size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
+        mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
+        known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
+        rows.append((str(place), size, "unconstrained" if combination.open else "weak", mixture, known))
+    note = (
+        "Standard errors from the likelihood only, in units of the prior range; where they exceed it, only bounds and "
+        "priors decide. A parameter's own error along a direction is its weight times that. Last column: the error of "
+        "each parameter with the others fixed, in its own unit."
+    )
+    columns = ("direction", "error", "", "along", "each with the others fixed")
+    return Table("Directions that the data do not constrain", columns, tuple(rows), note if rows else "")
+
+
+def posterior_table(posterior: "Posterior") -> Table:
+    """Median, 68 % interval, mean, unit, autocorrelation time and effective sample size of each parameter."""
+    summary = posterior.summary()
+    time, effective = (
+        np.ravel(posterior.autocorrelation_time),
+        np.broadcast_to(posterior.effective_samples, len(posterior.names)),
+    )
+    rows = []
+    for index, name in enumerate(posterior.names):
+        median, low, high, mean, deviation = summary[name]
+        width = (high - low) / 2.0
+        words = (with_error(number, width)[0] for number in (median, low, high, mean))
+        unit = posterior.fit.units[name]
+        rows.append((name, *words, f"{deviation:.2g}", unit, f"{time[index]:.0f}", f"{effective[index]:.0f}"))
+    columns = ("parameter", "median", "16 %", "84 %", "mean", "sd", "unit", "autocorr. steps", "effective samples")
+    note = f"Of all {len(posterior.modes)} modes together." if posterior.modes else ""
+    return Table("Posterior", columns, tuple(rows), note)
+
+
+def incidence_table(structure: ResidualStructure) -> Table:
+    """Residuals of each incidence in units of sigma."""
+    rows = [
+        (degrees(group.theta), str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
+        for group in structure.by_incidence
+    ]
+    note = "In units of the assumed sigma: a model that explains the data has mean 0 and rms 1 at every incidence."
+    return Table("Residuals by incidence", ("incidence", "readings", "mean", "rms"), tuple(shortened(rows, 40)), note)
+
+
+_ORDERS = {
+    "left_out": "the score of what is left out",
+    "loo": "leave-one-out",
+    "aic": "AIC",
+    "chi_square": "chi-square",
+}
+
+
+def comparison_table(comparison: "Comparison") -> Table:
+    """One row per fit, the best first: how well it explains the data, with how many parameters, and how far behind."""
+    compared = comparison.rows
+    aic, bic = min(row.aic for row in compared), min(row.bic for row in compared)
+    columns: list[tuple[str, Callable[[Row], str]]] = [
+        ("fit", lambda row: row.name),
+        ("parameters", lambda row: str(row.parameters)),
+        ("chi2/dof", lambda row: f"{row.reduced_chi_square:.4g}"),
+        ("chi2", lambda row: f"{row.chi_square:.5g}"),
+    ]
+    if math.isfinite(aic):
+        columns += [
+            ("log-lik.", lambda row: f"{row.log_likelihood:.2f}"),
+            ("AIC - best", lambda row: f"{row.aic - aic:.1f}"),
+            ("BIC - best", lambda row: f"{row.bic - bic:.1f}"),
+        ]
+    if all(math.isfinite(row.loo) for row in compared):
+        columns += [("LOO behind best", lambda row: f"{row.loo_behind:.1f} ± {row.loo_behind_error:.1f}")]
+    if compared[0].foresight is not None:
+        columns += [
+            ("left out: score", lambda row: f"{_seen(row).score:.1f}"),
+            ("behind best", lambda row: f"{_seen(row).behind:.1f} ± {_seen(row).behind_error:.1f}"),
+            ("weight", lambda row: f"{_seen(row).weight:.2f}"),
+            ("log evidence", lambda row: f"{_seen(row).evidence.log:.1f} ± {_seen(row).evidence.error:.1f}"),
+            ("probability", lambda row: f"{_seen(row).probability:.2g}"),
+        ]
+    columns += [
+        ("converged", lambda row: "yes" if row.converged else "NO"),
+        ("at a bound", lambda row: ", ".join(row.at_bound)),
+    ]
+    rows = tuple(tuple(word(row) for _, word in columns) for row in compared)
+    order = _ORDERS[comparison.sorted_by]
+    note = " ".join(f"{line[0].upper()}{line[1:]}." for line in (f"sorted by {order}, best first", *comparison.notes))
+    return Table("Comparison", tuple(head for head, _ in columns), rows, note)
+
+
+def _seen(row: "Row") -> "Foresight":
+    assert row.foresight is not None
+    return row.foresight
+
+
+def degrees(angle: float) -> str:
+    """An angle in degrees as a word, to 0.01 at most: ``"89.85°"``, ``"30°"``."""
+    return f"{round(float(angle), 2) + 0.0:g}°"  # the sum makes 0 of -0
+
+
+def with_error(value: float, error: float) -> tuple[str, str]:
+    """Value and error as words, both to two digits of the error; ``("0.532", "0.021")``."""
+    if not (math.isfinite(error) and error > 0.0):
+        return f"{value:.6g}", "unknown"
+    digits = 1 - math.floor(math.log10(error))
+    if not -3 <= digits <= 9:
+        return f"{value:.6g}", f"{error:.2g}"
+    return f"{value:.{max(digits, 0)}f}", f"{error:.{max(digits, 0)}f}"
+
+
+def shortened(rows: Sequence[tuple[str, ...]], most: int) -> Sequence[tuple[str, ...]]:
+    """The first and the last of so many rows, and how many are left out between them."""
+    if len(rows) <= most:
+        return rows
+    gap = (f"... {len(rows) - most} more", *[""] * (len(rows[0]) - 1))
+    return [*rows[: most // 2], gap, *rows[len(rows) - most // 2 :]]
+
+
+def _numeric(table: Table, column: int) -> bool:
+    words = [row[column] for row in table.rows if row[column]]
+    return bool(words) and all(word.rstrip("°%").lstrip("+-")[:1].isdigit() or word == "unknown" for word in words)

@@ -1,0 +1,142 @@
+"""An ensemble of walkers moved by emcee, in unconstrained coordinates, where the box has no walls.
+
+Where an evaluation is cheap, half the steps are stretch moves, and half independent proposals from an approximation,
+the fit's own or one learned from the chain (`laplace`). Where it is costly, most are delayed acceptance by a surrogate.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import emcee
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from fits.optimise.result import Fit
+from fits.problem.model import Model
+from fits.problem.problem import Problem
+from fits.progress import Progress
+from fits.sampling.chain import MemoryChain
+from fits.sampling.convergence import last_checks
+from fits.sampling.delayed_acceptance import DelayedAcceptance
+from fits.sampling.design import Design, Kept, Walked
+from fits.sampling.laplace import Approximation, first_positions
+from fits.sampling.mixture import MODES, Mixture
+from fits.sampling.surrogate import evaluate_many
+
+INDEPENDENT = 0.5
+BY_SURROGATE, BESIDE = 0.8, 0.1  # share of its moves, and of each of the other two beside them
+COSTLY = 200e-6  # seconds an evaluation: below, walks of a surrogate and their compilation take longer than they save
+TRIES, ENOUGH = 3, 0.1  # that it is timed at least, and seconds after which it is timed no more
+
+Floats = NDArray[np.float64]
+Proposals = Approximation | Mixture
+
+
+class Ensemble:
+    """Moves the walkers of a chain about the optimum of a fit."""
+
+    def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
+        self.problem, self.chain, self.seed = fit.problem, chain, seed
+        self.initial: Proposals = Mixture.of(fit) or Approximation.of(fit)
+        self._delayed: DelayedAcceptance | None = None
+        self._read_moves()
+
+    def decide(self, surrogate: bool, kept: Kept, progress: Progress | None) -> None:
+        """Before the first step, and for all: whether proposals come from a surrogate, which is built if so."""
+        moves: dict[str, Any] = {"surrogate": surrogate, "words": ""}
+        moves |= modes_of(self.initial)
+        if surrogate:
+            built = Design(self.problem, self.chain.shape[0], self.seed, kept, progress).build(self.initial)
+            moves["words"] = built.words
+            if built.walked is not None:
+                moves |= built.walked.arrays()
+        self.chain.decide(moves)
+        self._read_moves()
+        kept.remove()
+
+    @property
+    def has_modes(self) -> bool:
+        """Whether the posterior has several, between which walkers leap by the mixture of all."""
+        return bool(modes_of(self.initial))
+
+    def _read_moves(self) -> None:
+        walked = Walked.from_arrays(self.problem.model, self.chain.moves)
+        self._delayed = walked and walked.moves()
+
+    def advance(self, step: int, tell: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `tell` of each."""
+        chain = self.chain
+        state = chain.get_last_sample() if chain.iteration else self._first_state()
+        # walkers are drawn from a density of full rank: emcee need not look whether they are
+        for _ in self.sampler().sample(state, iterations=step - chain.iteration, skip_initial_state_check=True):
+            tell()
+
+    def sampler(self) -> emcee.EnsembleSampler:
+        """emcee with the moves of the steps up to the next check."""
+        independent = emcee.moves.MHMove(adapted(self.chain, self.initial).propose)
+        moves = [(independent, INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
+        if self._delayed is not None:
+            by_surrogate = emcee.moves.MHMove(self._delayed.propose)
+            moves = [(by_surrogate, BY_SURROGATE), (independent, BESIDE), (emcee.moves.StretchMove(), BESIDE)]
+        walkers, count = self.chain.shape
+        return emcee.EnsembleSampler(
+            walkers, count, self._log_posteriors, moves=moves, vectorize=True, backend=self.chain
+        )
+
+    def _log_posteriors(self, positions: Floats) -> Floats:
+        if self._delayed is not None:  # the program that the surrogate was built with: compiled already
+            return evaluate_many(self.problem, positions, self.chain.shape[0])[1]
+        return np.asarray(self.problem.call(log_posteriors, positions), float)
+
+    def _first_state(self) -> emcee.State:
+        def finite(positions: Floats) -> bool:
+            return bool(np.all(np.isfinite(self._log_posteriors(positions))))
+
+        generator = np.random.RandomState(self.seed)
+        positions = first_positions(self.initial.draw, finite, self.chain.shape[0], generator)
+        return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
+
+
+def modes_of(proposals: Proposals | None) -> dict[str, Any]:
+    """What a chain keeps of the modes of its posterior; nothing, where one is known."""
+    several = isinstance(proposals, Mixture) and proposals.mode_count > 1
+    return proposals.arrays(MODES) if isinstance(proposals, Mixture) and several else {}
+
+
+def adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
+    """The fit's approximation, or one learned from the second half of the chain up to its last check if that is closer.
+
+    As checks grow apart, so the adaptation fades; and it depends on whole checks only, so that a resumed chain is the
+    same.
+    """
+    _, check = last_checks(chain.iteration)
+    if not check:
+        return initial
+    positions = chain.chain[check // 2 : check]
+    positions = positions.reshape(-1, positions.shape[-1])
+    candidates: list[Proposals] = [initial, Approximation.learned(positions)]
+    if isinstance(initial, Mixture):
+        candidates.append(initial.refined(positions))
+    return max(candidates, key=lambda candidate: candidate.mean_log_density(positions))
+
+
+def log_posteriors(model: Model, positions: Array) -> Array:
+    """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
+    return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
+
+
+def is_costly(problem: Problem, positions: Floats) -> bool:
+    """Whether a log-posterior takes more than COSTLY by the clock, at its best, in a program compiled before.
+
+    One look under that ends it, and the others may be slow: another process may have had the processor.
+    """
+    began, tries = time.perf_counter(), 0
+    while tries < TRIES or time.perf_counter() - began < ENOUGH:
+        before, tries = time.perf_counter(), tries + 1
+        np.asarray(problem.call(log_posteriors, positions))
+        if time.perf_counter() - before <= COSTLY * len(positions):
+            return False
+    return True

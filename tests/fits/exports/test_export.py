@@ -1,0 +1,237 @@
+"""Files of materials: what each says when it is read again, beside what the stack gives."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+from fits.cli.parser import main
+from fits.data.formats._square import Between
+from fits.data.formats.rgl_table import read_table
+from fits.data.measurements import Measurements
+from fits.exports import merl
+from fits.exports.contents import pairs
+from fits.exports.export import ENDINGS
+from fits.exports.material import Material, material_of
+from tests.helpers.commands import refused
+from tests.helpers.merl import centre_pairs
+
+METAL = lj.Stack([], lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.4, 2.2], 0.15))
+GLOSSY = lj.Stack([lj.Interface(1.5, 0.05)], lj.Lambertian([0.5, 0.3, 0.1]))
+FIBERS = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.5, (1.0, 0.4, 0.0)))], lj.Lambertian(0.3))
+TILTED = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("surface", 0.5, (0.3, 0.1, 1.0)))], lj.Lambertian(0.3))
+HAZE = lj.Stack([lj.Medium(0.7, [0.9, 0.8, 0.7], lj.HenyeyGreenstein(0.3))])
+
+
+def written(material: object, tmp_path: Path, to: str, **options: object) -> tuple[Path, tuple[str, ...]]:
+    """Also that what takes long says how far it is."""
+    path = tmp_path / f"material{ENDINGS[to]}"
+    told: list[tuple[str, int, int]] = []
+
+    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        assert total is not None
+        told.append((stage, done, total))
+
+    done = fits.export(material, path, to, progress=progress, **options)  # type: ignore[arg-type]
+    assert done.path == path
+    assert bool(told) == (to != "csv")
+    for stage, total in {(stage, total) for stage, _, total in told}:
+        assert [(stage, step, total) for step in range(total)] == [one for one in told if one[0] == stage]
+    return path, done.notes
+
+
+def agrees(data: Measurements, stack: lj.Stack, transport: lj.Transport, tolerance: float) -> None:
+    """Readings are the values of the stack at their own directions."""
+    true = np.asarray(lj.evaluate(stack, data.wi, data.wo, transport))
+    np.testing.assert_allclose(data.values, np.broadcast_to(true, data.values.shape), rtol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("stack", "transport", "share"),
+    [
+        (METAL, lj.SingleScattering(), 1.0),
+        (GLOSSY, lj.Statistical(), 1.0),
+        (FIBERS, lj.SingleScattering(), 0.98),
+        (TILTED, lj.SingleScattering(), 0.98),
+    ],
+    ids=["metal", "glossy", "fibers", "tilted flakes"],
+)
+def test_an_rgl_file_holds_the_stack(tmp_path: Path, stack: lj.Stack, transport: lj.Transport, share: float) -> None:
+    """To 1 %, and to 0.3 % in the median; share: of pairs that are, where azimuths of the light are nodes as well."""
+    path, notes = written(stack, tmp_path, "rgl", transport=transport)
+    agrees(fits.read(path, bins=500), stack, transport, 2e-5)  # at its nodes, of float32
+    wi, wo = pairs()
+    data = fits.read(path, geometry=fits.Geometry(wi, wo))
+    true = np.asarray(lj.evaluate(stack, wi, wo, transport))
+    error = np.max(abs(data.values[:, : true.shape[1]] / true - 1.0), axis=1)
+    assert np.median(error) < 0.003
+    assert np.mean(error < 0.01) >= share
+    assert any("in the median" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("phase", "median", "most"),
+    [
+        (lj.SGGX("fiber", 0.3, (1.0, 0.4, 0.0)), 0.002, 0.023),
+        (lj.SGGX("fiber", 0.1, (1.0, 0.4, 0.0)), 0.009, 0.18),
+        (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085),
+    ],
+    ids=["fibers 0.3", "fibers 0.1", "haze"],
+)
+def test_narrow_lobes_are_held_as_well_as_the_page_says(
+    tmp_path: Path, phase: lj.PhaseFunction, median: float, most: float
+) -> None:
+    """Of lobes that are not about the mirror direction: the figures of docs/formats.md, to what they are rounded to."""
+    stack = lj.Stack([lj.Medium(1.0, 0.9, phase)])
+    path, _ = written(stack, tmp_path, "rgl", transport=lj.SingleScattering())
+    wi, wo = pairs()
+    read = fits.read(path, geometry=fits.Geometry(wi, wo)).values[:, 0]
+    true = np.asarray(lj.evaluate(stack, wi, wo, lj.SingleScattering()))[:, 0]
+    error = np.abs(read / true - 1.0)
+    assert np.median(error) < 1.05 * median
+    assert 0.5 * most < np.quantile(error, 0.99) < 1.05 * most
+
+
+def test_azimuths_are_held_as_far_as_the_stack_needs_them(tmp_path: Path) -> None:
+    turns = []
+    for stack in (METAL, FIBERS, TILTED):
+        table = read_table(written(stack, tmp_path, "rgl", transport=lj.SingleScattering(), force=True)[0])
+        turns.append((len(table.phi_i), table.turns))
+    assert turns == [(1, 1), (25, 2), (49, 1)]
+
+
+def test_a_spectral_file_has_its_wavelengths(tmp_path: Path) -> None:
+    path, _ = written(METAL, tmp_path, "rgl", transport=lj.SingleScattering(), wavelengths=[450, 550, 650])
+    data = fits.read(path, bins=100)
+    assert data.channels == ("450 nm", "550 nm", "650 nm")
+    agrees(data, METAL, lj.SingleScattering(), 2e-5)
+
+
+def test_what_is_drawn_from_an_rgl_file_is_drawn_as_light_goes(tmp_path: Path) -> None:
+    table = read_table(written(METAL, tmp_path, "rgl", transport=lj.SingleScattering())[0])
+    # luminance times the density of half vectors, over f cos: one number for each direction of the light
+    _, theta_i, theta_m, phi_m = table.nodes()
+    place = len(theta_i) // 2
+    row, column = np.meshgrid(np.arange(2, 94, 7), np.arange(2, 94, 7), indexing="ij")
+    at = (place, row, column)
+    theta, phi = theta_m[at], phi_m[at]
+    facing = np.sin(theta_i[place]) * np.sin(theta) * np.cos(phi) + np.cos(theta_i[place]) * np.cos(theta)
+    above = 2 * facing * np.cos(theta) - np.cos(theta_i[place]) > 0.05
+    u = np.sqrt(theta * 2 / np.pi)
+    _, _, density = table.density.undrawn(u.ravel(), ((phi + np.pi) / 2 / np.pi).ravel(), _only(place, u.size))
+    jacobian = 2 * np.pi**2 * u * np.sin(theta) * 4 * facing
+    drawn = table.luminance[0, place][row, column] * density.reshape(u.shape) / jacobian
+    factor = table.factor(theta.ravel(), phi.ravel(), np.full(u.size, theta_i[place]), np.zeros(u.size))
+    light = table.values[0, place].mean(axis=0)[row, column] * factor.reshape(u.shape)
+    ratio = (drawn / light)[above]
+    assert above.sum() > 50
+    np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.02)
+
+
+def _only(table: int, count: int) -> Between:
+    return Between(np.full((count, 1), table), np.ones((count, 1)))
+
+
+def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path: Path) -> None:
+    path, notes = written(METAL, tmp_path, "merl", transport=lj.SingleScattering())
+    table = np.fromfile(path, "<f8", offset=12).reshape(3, 90, 90, 180)
+    bins = np.random.default_rng(1).integers(0, (60, 60, 180), (200, 3))
+    wi, wo = centre_pairs(bins)
+    seen = (wi[:, 2] > 0.1) & (wo[:, 2] > 0.1)
+    true = np.asarray(lj.evaluate(METAL, wi[seen], wo[seen], lj.SingleScattering()))
+    stored = table[:, *bins[seen].T].T * np.array([1.0, 1.15, 1.66]) / 1500.0
+    np.testing.assert_allclose(stored, true, rtol=1e-9)
+    agrees(fits.read(path), METAL, lj.SingleScattering(), 1e-9)
+    assert any("in the median" in note for note in notes)
+    assert not any("passes through" in note for note in notes)
+
+
+def test_a_merl_table_says_that_light_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Material, "values", lambda self, wi, wo, stage="": np.ones((len(wi), 3)))
+    notes = merl.contents(material_of(HAZE, lj.SingleScattering())).notes
+    assert any("passes through is left out" in note for note in notes)
+
+
+@pytest.mark.parametrize(("stack", "total"), [(HAZE, 1), (FIBERS, 24)], ids=["haze", "fibers"])
+def test_a_zemax_file_holds_the_stack(tmp_path: Path, stack: lj.Stack, total: int) -> None:
+    path, notes = written(stack, tmp_path, "zemax", transport=lj.SingleScattering())
+    data = fits.read(path)
+    true = np.asarray(lj.evaluate(stack, data.wi, data.wo, lj.SingleScattering()))
+    if data.channels == ("X", "Y", "Z"):
+        # white of D65 by the matrix that the standard gives (IEC 61966-2-1)
+        white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+        true = true @ white.T
+        assert any("passes through is left out" in note for note in notes)
+    used = data.mask
+    np.testing.assert_allclose(data.values[used], true[used], rtol=1e-5)
+    totals = [float(line.split()[1]) for line in path.read_text().splitlines() if line.startswith("TIS")]
+    assert len(totals) == total * 18 * len(data.channels)
+    reflected = np.asarray(lj.albedo(stack, lj.direction(0.0, np.pi), lj.SingleScattering())[0])
+    if total == 24:
+        assert totals[0] == pytest.approx(float(reflected[0]), abs=1e-6)
+
+
+def test_slices_hold_the_stack_on_both_sides(tmp_path: Path) -> None:
+    path, _ = written(HAZE, tmp_path, "csv", transport=lj.SingleScattering())
+    data = fits.read(path)
+    assert (data.theta_o > 90).any()
+    agrees(data, HAZE, lj.SingleScattering(), 1e-12)
+
+
+def test_a_fit_is_written_by_its_best_values(tmp_path: Path, coat_fit: fits.Fit) -> None:
+    path, _ = written(coat_fit, tmp_path, "csv")
+    agrees(fits.read(path), coat_fit.stack, coat_fit.problem.transport, 1e-12)
+
+
+FAULTS = {
+    "format": (METAL, {"to": "obj"}, "to is 'obj', must be one of rgl, merl"),
+    "ending": (METAL, {"to": "merl", "name": "x.bsdf"}, "must end in .binary"),
+    "axis": (TILTED, {"to": "merl", "name": "x.binary"}, "an axis in this stack is not the normal"),
+    "channels": (lj.Stack([], lj.Lambertian([0.1, 0.2])), {"to": "rgl"}, "this stack has 2 channels: give"),
+    "merl channels": (lj.Stack([], lj.Lambertian([0.1, 0.2])), {"to": "merl", "name": "x.binary"}, "has 2 channels"),
+    "zemax channels": (lj.Stack([], lj.Lambertian([0.1, 0.2])), {"to": "zemax"}, "this stack has 2"),
+    "wavelengths": (METAL, {"to": "rgl", "wavelengths": [450, 550]}, "2 given, must be one for each of 3"),
+    "order": (METAL, {"to": "rgl", "wavelengths": [650, 550, 450]}, "must be above 0 and ascend"),
+    "no spectrum": (METAL, {"to": "zemax", "wavelengths": [450, 550, 650]}, "a file for 'zemax' has none"),
+    "random": (METAL, {"to": "rgl", "transport": lj.RandomWalk(paths=8)}, "RandomWalk is random"),
+    "free": (lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0))), {"to": "rgl"}, "this stack describes a family"),
+    "no stack": ("copper", {"to": "rgl"}, "material is 'copper', must be a Stack, a Mixture or a Fit"),
+}
+
+
+@pytest.mark.parametrize(("material", "options", "message"), FAULTS.values(), ids=FAULTS)
+def test_what_cannot_be_written_is_named(
+    tmp_path: Path, material: object, options: dict[str, object], message: str
+) -> None:
+    options = dict(options)
+    path = tmp_path / str(options.pop("name", "x.bsdf"))
+    with pytest.raises(ValueError, match=message):
+        fits.export(material, path, **options)  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_map_of_stacks_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="map"):
+        fits.export(lj.Stack([], lj.Conductor(0.2, 3.9, jax.numpy.full((2, 2), 0.1))), tmp_path / "x.bsdf", "rgl")
+
+
+def test_what_is_there_stays(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("mine")
+    with pytest.raises(ValueError, match="exists already"):
+        fits.export(METAL, tmp_path / "x.csv", "csv")
+    assert (tmp_path / "x.csv").read_text() == "mine"
+
+
+def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"]) == 0
+    assert "readings" in capsys.readouterr().out
+    assert len(fits.read(work / "coat.csv")) > 1000
+    assert "exists already" in refused(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"], capsys, work)
+    assert "must end in .bsdf" in refused(["export", "coat.toml", "--to", "rgl", "--out", "coat.txt"], capsys, work)
+    with pytest.raises(SystemExit):
+        main(["export", "coat.toml", "--to", "rgl", "--out", "coat.bsdf", "--wavelengths", "0"])
+    assert "0 given, must be a number >= 1" in capsys.readouterr().err
+    assert "neither a .toml file" in refused(["export", "silk", "--to", "rgl", "--out", "silk.bsdf"], capsys, work)

@@ -1,0 +1,334 @@
+"""Fits against scipy's and against answers known in closed form."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
+from fits.data.geometry import slices
+from fits.optimise.descent import PROMISE
+from fits.optimise.fit import fit, fit_problem, start_points
+from fits.optimise.identifiability import Combination
+from fits.problem.compilation import _run
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
+from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
+from fits.reports import verdicts
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
+
+COUNT = 300
+
+
+def noisy_line(a: float, b: float, sigma: float = 0.05, seed: int = 0):
+    noise = np.random.default_rng(seed).standard_normal((COUNT, 1))
+    return measured((design(COUNT) @ [a, b])[:, None] + sigma * noise, sigma)
+
+
+def named(result) -> dict[str, float]:
+    return {name.strip("[']"): value for name, value in result.values.items()}
+
+
+@pytest.fixture(scope="module")
+def lobe_fit():
+    return fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=16)
+
+
+def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
+    """Same minimum and same J'J as scipy's finite-difference solver: to 1e-3 of the errors, and 1e-3 in them."""
+    data, names = noisy_lobe(0), [name.strip("[']") for name in lobe_fit.problem.names]
+
+    def residuals(vector):
+        predicted = lobe(dict(zip(names, vector, strict=True)), data.wi, data.wo)
+        return ((predicted - data.values) / data.sigma).ravel()
+
+    reference = least_squares(residuals, [LOBE[name] for name in names], x_scale="jac", jac="3-point", gtol=1e-12)
+    covariance = np.linalg.inv(reference.jac.T @ reference.jac)
+    errors = np.sqrt(np.diagonal(covariance))
+    assert lobe_fit.converged
+    assert np.all(np.abs(lobe_fit.vector - reference.x) < 1e-3 * errors)
+    assert lobe_fit.chi_square == pytest.approx(2 * reference.cost, rel=1e-8)
+    np.testing.assert_allclose(lobe_fit.errors, errors, rtol=1e-3)
+    np.testing.assert_allclose(lobe_fit.correlation, covariance / np.outer(errors, errors), atol=2e-3)
+    assert lobe_fit.reduced_chi_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / 594))
+    assert not lobe_fit.at_bound
+    assert not any(combination.open for combination in lobe_fit.unresolved)
+
+
+def test_starts_are_counted(lobe_fit) -> None:
+    counts = [minimum.count for minimum in lobe_fit.minima]
+    costs = [minimum.cost for minimum in lobe_fit.minima]
+    assert costs == sorted(costs)
+    assert sum(counts) <= 16
+    assert counts[0] >= 4
+    assert f"{counts[0]} of 16 starts" in lobe_fit.status
+    assert lobe_fit.minima[0].values == pytest.approx(lobe_fit.values)
+
+
+def test_new_data_do_not_recompile(lobe_fit) -> None:
+    before = _run._cache_size()
+    other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=16, seed=3)
+    assert _run._cache_size() == before
+    assert other.values != lobe_fit.values
+
+
+def test_repeats_scatter_as_their_errors_say() -> None:
+    """Pulls of 100 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.4 and 0.28."""
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    values = np.stack([noisy_lobe(seed).values for seed in range(100)])
+    repeats = fit_many(problem, values, starts=8)
+    truth = np.array([LOBE[name.strip("[']")] for name in problem.names])
+    pulls = (repeats.vectors - truth) / repeats.standard_errors
+    assert repeats.converged.all()
+    assert np.all(np.abs(pulls.mean(axis=0)) < 0.4)
+    assert np.all(np.abs(pulls.std(axis=0) - 1.0) < 0.29)
+
+
+def test_starts_are_seeded_and_fill_the_box() -> None:
+    problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
+    points = start_points(problem, 33, 5)
+    np.testing.assert_array_equal(points, start_points(problem, 33, 5))
+    np.testing.assert_allclose(problem.model.box.from_unit(jnp.asarray(points[0])), problem.start)
+    assert np.all(np.abs(points[1:].mean(axis=0) - 0.5) < 0.03)  # random points: 0.05 standard deviations
+    assert not np.array_equal(points[1:], start_points(problem, 33, 6)[1:])
+
+
+@pytest.mark.parametrize("solver", ["least_squares", "bounded"])
+def test_a_parameter_beyond_its_bound_is_held_there(solver: str) -> None:
+    """a is best at 1.5 but may not exceed 1: b is then the one-parameter regression, with its error."""
+    data = noisy_line(1.5, 0.5)
+    result = fit({"a": Free(0.5, 0.0, 1.0), "b": Free(0.1, -1.0, 3.0)}, data, transport=line, starts=4, solver=solver)
+    x = design(COUNT)[:, 1]
+    assert result.at_bound == ("['a']",)
+    assert named(result)["a"] == 1.0
+    assert named(result)["b"] == pytest.approx(x @ (data.values[:, 0] - 1.0) / (x @ x), rel=1e-6)
+    assert result.standard_errors["['b']"] == pytest.approx(0.05 / np.sqrt(x @ x), rel=1e-6)
+    assert np.isnan(result.standard_errors["['a']"])
+    assert "at a bound: ['a']" in result.status
+
+
+def test_a_value_near_its_bound_is_not_at_it() -> None:
+    """The optimum lies 1e-4 of the box inside: an interior minimum, with its ordinary error."""
+    data = noisy_line(1.0, 0.5)
+    free = np.linalg.lstsq(design(COUNT), data.values[:, 0], rcond=None)[0]
+    result = fit({"a": Free(0.5, -1.0, free[0] + 2e-4), "b": Free(0.1, -1.0, 3.0)}, data, transport=line, starts=4)
+    assert result.at_bound == ()
+    np.testing.assert_allclose(result.vector, free, atol=1e-6)
+
+
+def test_the_bounded_solver_finds_the_same_minimum(lobe_fit) -> None:
+    other = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=2, solver="bounded")
+    assert np.all(np.abs(other.vector - lobe_fit.vector) < 0.02 * lobe_fit.errors)
+
+
+def test_a_product_leaves_its_direction_open() -> None:
+    """Only a times b matters: log a minus log b is open, their sum is known, and no error comes out small."""
+
+    def product(stack, wi, wo):
+        return (stack["a"] * stack["b"] * wo[:, 2])[:, None]
+
+    data = measured(design(COUNT)[:, 1:] * 0.25, 0.01)
+    stack = {"a": Free(0.5, 0.1, 1.0, LogUniform()), "b": Free(0.5, 0.1, 1.0, LogUniform())}
+    result = fit(stack, data, transport=product, starts=4)
+    (combination,) = result.unresolved
+    assert combination.open
+    assert combination.error > 1e3
+    weights = combination.weights
+    assert weights["['a']"] == pytest.approx(-weights["['b']"], rel=1e-4)
+    assert abs(weights["['a']"]) == pytest.approx(np.sqrt(0.5), rel=1e-4)
+    assert result.condition_number > 1e6
+    assert all(error > 0.5 for error in result.standard_errors.values())
+    assert named(result)["a"] * named(result)["b"] == pytest.approx(0.25, rel=1e-6)
+
+
+def test_a_prior_closes_an_open_direction() -> None:
+    def total(stack, wi, wo):
+        return (stack["a"] + stack["b"] + 0 * wo[:, 2])[:, None]
+
+    stack = {"a": Free(0.1, -2.0, 2.0, Normal(0.3, 0.2)), "b": Free(0.1, -2.0, 2.0)}
+    result = fit(stack, measured(np.full((COUNT, 1), 1.0), 0.01), transport=total, starts=4)
+    assert result.standard_errors["['a']"] == pytest.approx(0.2, rel=1e-6)
+    left = np.sqrt(2.0 * PROMISE) * 0.2  # a step that promises less ends the fit
+    assert named(result) == pytest.approx({"a": 0.3, "b": 0.7}, abs=left)
+    (combination,) = result.unresolved  # it is the prior that decides, and the data are said not to
+    assert combination.open
+
+
+def test_a_parameter_without_effect_is_not_determined() -> None:
+    result = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, noisy_line(1.0, 0.5), transport=line, starts=2)
+    assert result.standard_errors["['c']"] == np.inf
+    assert result.condition_number == np.inf
+    assert np.isfinite(result.standard_errors["['a']"])
+    assert result.unresolved == (Combination(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
+    assert result.without_influence == ("['c']",)
+    assert result.at_bound == ()
+    assert "the data leave 1 direction(s) unresolved" in result.status
+    assert verdicts.identifiability(result)["['c']"] == "NO INFLUENCE on the data"
+
+
+@pytest.mark.parametrize("strength", [0.0, 1e-300, 1e-170, 1e-30])
+def test_errors_do_not_overflow_where_hardly_anything_is_known(strength: float) -> None:
+    """An influence of any size: a warning would be an error here."""
+
+    def faint(stack, wi, wo):
+        return line(stack, wi, wo) + strength * (stack["c"] + stack["d"]) * wo[:, :1]
+
+    free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0)}
+    result = fit(free, noisy_line(1.0, 0.5), transport=faint, starts=2)
+    assert result.without_influence == ("['c']", "['d']")
+    assert result.standard_errors["['c']"] == np.inf
+    assert result.standard_errors["['a']"] == pytest.approx(
+        fit(LINE, noisy_line(1.0, 0.5), transport=line, starts=1).standard_errors["['a']"], rel=1e-6
+    )
+    assert np.isfinite(result.covariance).all()
+
+
+def test_two_stacks_that_explain_the_data_equally_well_are_both_reported() -> None:
+    def pair(stack, wi, wo):
+        return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
+
+    cosine = design(COUNT)[:, 1:]
+    exact = np.exp(-0.3 / cosine) + np.exp(-1.5 / cosine)
+    data = measured(exact + 0.01 * np.random.default_rng(0).standard_normal(exact.shape), 0.01)
+    result = fit({"p": Free(0.5, 0.0, 3.0), "q": Free(0.6, 0.0, 3.0)}, data, transport=pair, starts=8)
+    assert len(result.minima) >= 2
+    assert len(result.alternatives) == 1
+    best, other = result.values, result.alternatives[0].values
+    assert other["['p']"] == pytest.approx(best["['q']"], rel=1e-4)
+    assert other["['q']"] == pytest.approx(best["['p']"], rel=1e-4)
+
+
+@pytest.mark.parametrize("tails", ["gaussian", "student"])
+def test_free_noise_levels_are_recovered(tails: str) -> None:
+    """Maximum likelihood of a line with constant noise: known in closed form for Gaussian noise."""
+    generator = np.random.default_rng(2)
+    noise = generator.standard_normal((COUNT, 1)) if tails == "gaussian" else generator.standard_t(4.0, (COUNT, 1))
+    data = measured((design(COUNT) @ [1.0, 0.5])[:, None] + 0.07 * noise)
+    level = Noise(relative=0.0, floor=Free(0.5, 1e-4, 2.0), tails=tails)
+    result = fit(LINE, data, transport=line, noise=level, starts=8)
+    assert result.converged
+    sigma, error = result.values["noise.floor"], result.standard_errors["noise.floor"]
+    if tails == "gaussian":
+        regression, sum_of_squares = np.linalg.lstsq(design(COUNT), data.values[:, 0], rcond=None)[:2]
+        np.testing.assert_allclose(result.vector[:2], regression, rtol=1e-5)
+        assert sigma == pytest.approx(np.sqrt(sum_of_squares[0] / COUNT), rel=1e-5)
+        assert error == pytest.approx(sigma / np.sqrt(2 * COUNT), rel=1e-5)
+    assert abs(sigma - 0.07) < 4 * error
+    assert result.units["noise.floor"] == "1/sr"
+
+
+def test_student_tails_shrug_off_outliers() -> None:
+    data = noisy_line(1.0, 0.5)
+    spoiled = data.values.copy()
+    spoiled[::20] += 3.0
+    result = fit(LINE, measured(spoiled, 0.05), transport=line, noise=Noise(tails="student"), starts=4)
+    assert abs(named(result)["a"] - 1.0) < 4 * result.standard_errors["['a']"]
+    gaussian = fit(LINE, measured(spoiled, 0.05), transport=line, starts=4)
+    assert abs(named(gaussian)["a"] - 1.0) > 4 * gaussian.standard_errors["['a']"]
+
+
+def test_a_scale_with_its_prior() -> None:
+    """Only scale times (a, b) is known; the prior on the logarithm decides the scale, and gives its error."""
+    scale = Free(1.0, 0.5, 2.0, LogNormal(1.1, 0.05))
+    result = fit(LINE, noisy_line(1.0, 0.5), transport=line, scale=scale, starts=4)
+    assert result.scale == pytest.approx(1.1, rel=1e-6)
+    assert result.standard_errors["scale"] == pytest.approx(0.05 * 1.1, rel=1e-4)
+    regression = np.linalg.lstsq(design(COUNT), noisy_line(1.0, 0.5).values[:, 0], rcond=None)[0]
+    np.testing.assert_allclose(result.vector[:2] * result.scale, regression, rtol=1e-5)
+
+
+def test_a_named_residual_is_no_posterior() -> None:
+    data = noisy_line(1.0, 0.5)
+    result = fit(LINE, data, transport=line, objective="cosine_l2", starts=4)
+    weighted = design(COUNT) * np.abs(data.wi[:, 2:])
+    target = data.values[:, 0] * np.abs(data.wi[:, 2])
+    regression, sum_of_squares = np.linalg.lstsq(weighted, target, rcond=None)[:2]
+    covariance = np.linalg.inv(weighted.T @ weighted) * sum_of_squares[0] / (COUNT - 2)
+    np.testing.assert_allclose(result.vector, regression, rtol=1e-6)
+    np.testing.assert_allclose(result.errors, np.sqrt(np.diagonal(covariance)), rtol=1e-6)
+    assert not result.is_posterior
+    assert np.isnan(result.log_likelihood)
+    assert "no likelihood" in result.status
+
+
+def test_starts_that_fail_are_counted_and_not_believed() -> None:
+    def broken(stack, wi, wo):
+        value = line(stack, wi, wo)
+        return jnp.where(stack["a"] > 2.0, jnp.nan, value)
+
+    result = fit(LINE, noisy_line(1.0, 0.5), transport=broken, starts=16)
+    assert result.converged
+    assert 1 < result.minima[0].count < 16
+    assert f"{16 - result.minima[0].count} of 16 starts failed" in result.status
+
+    result = fit({"a": Free(2.5, 2.1, 3.0), "b": LINE["b"]}, noisy_line(1.0, 0.5), transport=broken, starts=2)
+    assert not result.converged
+    assert np.all(np.isinf(result.errors))
+    assert result.status.startswith("not converged")
+
+
+def test_a_medium_over_a_base_is_recovered() -> None:
+    """A layerjax stack, in three channels, from simulated slices."""
+    truth = lj.Stack(
+        [lj.Medium(thickness=0.6, albedo=[0.9, 0.7, 0.5], phase=lj.HenyeyGreenstein(g=0.3))],
+        base=lj.Lambertian(albedo=0.4),
+    )
+    free = lj.Stack(
+        [
+            lj.Medium(
+                thickness=Free(1.0, 0.05, 5.0),
+                albedo=Free([0.5, 0.5, 0.5], 0.0, 1.0),
+                phase=lj.HenyeyGreenstein(g=Free(0.0, -0.9, 0.9)),
+            )
+        ],
+        base=lj.Lambertian(albedo=Free(0.5, 0.0, 1.0)),
+    )
+    single = lj.SingleScattering()
+    view = slices(incidence=[10, 40, 60], azimuth=[0, 90])
+    data = simulate(truth, view, transport=single, noise=0.02, seed=3)
+    calls = []
+    result = fit(free, data, transport=single, starts=9, progress=lambda *arguments: calls.append(arguments))
+    assert result.converged
+    assert result.units["layers[0].thickness"] == "optical depth"
+    expected = [0.6, 0.9, 0.7, 0.5, 0.3, 0.4]
+    assert np.all(np.abs(result.vector - expected) < 4 * result.errors)
+    assert result.predicted.shape == data.values.shape
+    assert float(result.stack.base.albedo) == result.values["base.albedo"]
+    assert [call[:3] for call in calls] == [("fit", done, 9) for done in range(1, 10)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"starts": 0}, "starts is 0; it must be at least 1"), ({"solver": "newton"}, "solver is 'newton'")],
+)
+def test_refused(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit_problem(Problem(LINE, noisy_line(1.0, 0.5), line), **options)
+
+
+def test_jaxopt_and_the_sampler_wait_until_it_is_needed() -> None:
+    unused = "[m for m in ('jaxopt', 'arviz', 'emcee', 'h5py') if m in sys.modules]"
+    code = f"import sys, fits.optimise.fit; print({unused})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("transport", [lj.ENDF(), lj.WeidlichWilkie()])
+def test_what_is_known_of_the_stack_stays_known_in_a_fit(transport):
+    """A dye that scatters nothing: these transports refuse a medium whose albedo might be anything."""
+
+    def coat(depth):
+        return lj.Stack([lj.Interface(1.5, 0.2), lj.Medium(depth, 0.0)], lj.Conductor(0.2, 3.9, 0.3))
+
+    geometry = slices(incidence=(30,), outgoing=(-20, 20))
+    data = simulate(coat(0.3), geometry, transport=transport, noise=0.01)
+    problem = Problem(coat(Free(0.3, 0.0, 1.0)), data, transport)
+    exact = simulate(coat(0.3), geometry, transport=transport).values
+    np.testing.assert_allclose(problem.predict([0.3]), exact, rtol=1e-9)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(problem.build([0.3]).stack))

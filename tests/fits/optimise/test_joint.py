@@ -1,0 +1,238 @@
+"""Several measurements in one likelihood: against least squares in closed form, and against each alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.data.geometry import slices
+from fits.optimise.discrepancy import counting
+from fits.optimise.fit import fit
+from fits.prediction.compare import compare
+from fits.prediction.cross_validation import leave_out
+from fits.prediction.evidence import evidence
+from fits.prediction.predict import predict
+from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.joint import Joint
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free, LogNormal, Normal
+from fits.problem.problem import Problem
+from fits.reports.html import report
+from fits.reports.results import save_fit
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import sample
+from tests.helpers.models import LINE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
+
+SIGMA = {"first": 0.05, "second": 0.02}
+COUNTS = {"first": 100, "second": 40}
+TRUE = {"first": (1.0, 0.5), "second": (0.2, 0.5)}
+"""Two lines with one slope."""
+PRIOR = Normal(0.4, 0.01)
+SLOPE, OFFSET = "['b']", "['a']"
+
+
+def data(name: str):
+    noise = np.random.default_rng(len(name)).standard_normal((COUNTS[name], 1))
+    return measured((design(COUNTS[name]) @ TRUE[name])[:, None] + SIGMA[name] * noise, SIGMA[name])
+
+
+def problem(name: str, prior=None) -> Problem:
+    return Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0, prior)}, data(name), line)
+
+
+def least_squares(prior: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Slope and the two offsets in closed form, with their covariance."""
+    rows, targets = [], []
+    for index, name in enumerate(TRUE):
+        offset, cosine = design(COUNTS[name]).T
+        columns = np.zeros((COUNTS[name], 3))
+        columns[:, 0], columns[:, 1 + index] = cosine, offset
+        rows.append(columns / SIGMA[name])
+        targets.append(data(name).values[:, 0] / SIGMA[name])
+    if prior:
+        rows.append(np.array([[1.0, 0.0, 0.0]]) / PRIOR.sd)
+        targets.append([PRIOR.mean / PRIOR.sd])
+    a, b = np.concatenate(rows), np.concatenate(targets)
+    covariance = np.linalg.inv(a.T @ a)
+    return covariance @ a.T @ b, covariance
+
+
+@pytest.fixture(scope="module")
+def joint():
+    return fit(Joint({name: problem(name) for name in TRUE}, shared=[SLOPE]), starts=2)
+
+
+def order(found) -> list[int]:
+    return [found.problem.names.index(name) for name in (SLOPE, f"first.{OFFSET}", f"second.{OFFSET}")]
+
+
+def test_it_is_least_squares(joint):
+    expected, covariance = least_squares(prior=False)
+    at = order(joint)
+    np.testing.assert_allclose(joint.vector[at], expected, atol=1e-6)
+    np.testing.assert_allclose(joint.covariance[np.ix_(at, at)], covariance, rtol=1e-6)
+    np.testing.assert_allclose(joint.errors[at], np.sqrt(np.diagonal(covariance)), rtol=1e-6)
+    assert joint.degrees_of_freedom == sum(COUNTS.values()) - 3
+    residuals = np.concatenate([joint.part(name).residuals for name in TRUE])
+    np.testing.assert_allclose(joint.residuals, residuals)
+    assert joint.chi_square == pytest.approx(np.sum(residuals**2))
+    assert joint.log_likelihood == pytest.approx(sum(joint.part(name).log_likelihood for name in TRUE))
+
+
+def test_the_prior_of_what_is_shared_counts_once():
+    found = fit(Joint({name: problem(name, PRIOR) for name in TRUE}, shared=[SLOPE]), starts=1)
+    expected, covariance = least_squares(prior=True)
+    np.testing.assert_allclose(found.vector[order(found)], expected, atol=1e-5)
+    np.testing.assert_allclose(found.covariance[np.ix_(order(found), order(found))], covariance, rtol=1e-6)
+    assert np.asarray(found.problem.log_prior(found.vector)) == pytest.approx(
+        sum(float(p.log_prior(found.part(name).vector)) for name, p in found.problem.parts.items())
+        - float(np.log(1 / (PRIOR.sd * np.sqrt(2 * np.pi))) - 0.5 * ((found.vector[0] - PRIOR.mean) / PRIOR.sd) ** 2),
+        rel=1e-9,
+    )
+
+
+def test_a_part_is_a_fit_of_its_own(joint):
+    first = joint.part("first")
+    assert set(first.values) == {OFFSET, SLOPE}
+    assert first.values[SLOPE] == joint.values[SLOPE]
+    assert first.standard_errors[OFFSET] == joint.standard_errors[f"first.{OFFSET}"]
+    np.testing.assert_allclose(first.predicted[:, 0], design(COUNTS["first"]) @ [first.stack["a"], first.stack["b"]])
+    assert first.minima[0].values == first.values
+    for write in (lambda: report(joint, path="never written"), lambda: save_fit(joint, "never written")):
+        with pytest.raises(ValueError, match=r"of a joint fit it takes a part: fit.part\(...\) of first, second"):
+            write()
+    with pytest.raises(ValueError, match="part 'third' is not one of first, second"):
+        joint.part("third")
+
+
+def test_a_part_is_not_asked_without_the_others(joint):
+    first = joint.part("first")
+    for ask in (sample, evidence, leave_out):
+        with pytest.raises(ValueError, match=f"{ask.__name__}: 'first' is a part of a joint fit"):
+            ask(first)
+    with pytest.raises(ValueError, match="leave_out: it takes a fit of one measurement by itself, not a joint one"):
+        leave_out(joint)
+
+
+def test_what_tells_of_one_measurement_asks_for_a_part(joint):
+    chain = np.tile(joint.vector, (20, 2, 1))
+    posterior = Posterior(joint, chain, chain[..., 0], np.ones(3), 1.0, converged=True)
+    asks = {
+        "compare": lambda: compare({"one": joint, "other": joint}),
+        "scale": lambda: joint.scale,
+        "inference_data": lambda: posterior.inference_data,
+    }
+    for name, ask in asks.items():
+        with pytest.raises(
+            ValueError, match=rf"{name}: of a joint fit it takes a part: fit.part\(...\) of first, second"
+        ):
+            ask()
+    assert joint.part("first").scale == 1.0
+
+
+def test_a_part_predicts_with_what_all_of_them_say(joint):
+    at = slices(incidence=(10,))
+    seen = predict(joint.part("first"), at, draws=4000)
+    columns = np.stack([at.wo[:, 2], np.ones(len(at)), np.zeros(len(at))], axis=-1)
+    _, covariance = least_squares(prior=False)
+    sd = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    np.testing.assert_allclose(seen.sd[:, 0], sd, rtol=0.06)  # of 4000 draws by weight
+
+
+def test_the_posterior_is_that_of_all(joint):
+    found = sample(joint, ess=4000, seed=1)
+    expected, covariance = least_squares(prior=False)
+    summary = [found.summary()[joint.problem.names[k]] for k in order(joint)]
+    np.testing.assert_allclose([one[4] for one in summary], np.sqrt(np.diagonal(covariance)), rtol=0.06)
+    np.testing.assert_allclose(
+        [one[3] for one in summary], expected, atol=5 * np.sqrt(np.max(np.diagonal(covariance)) / 4000)
+    )
+    part = found.part("second")
+    assert part.names == joint.part("second").problem.names
+    np.testing.assert_allclose(part.summary()[SLOPE], found.summary()[SLOPE], rtol=1e-12)
+    assert part.inference_data.posterior_predictive["value"].shape[-2:] == (COUNTS["second"], 1)
+
+
+def test_a_surrogate_moves_a_chain_of_several_measurements(joint):
+    found = sample(joint, walkers=16, max_steps=100, surrogate=True, allow_short=True)
+    assert found.status.startswith("proposals from a surrogate of degree 2")
+    expected, covariance = least_squares(prior=False)
+    errors = np.sqrt(np.diagonal(covariance))
+    np.testing.assert_allclose(np.median(found.samples, axis=0)[order(joint)], expected, atol=np.min(errors))
+
+
+def test_measurements_that_share_nothing_are_each_alone():
+    """One with levels of noise that are fitted, one with errors that readings share."""
+    values = design(60) @ [0.9, 0.4]
+    noise = np.random.default_rng(3).standard_normal((2, 60)) * [[0.03], [0.05]]
+    level, shared = (measured((values * (1 + part))[:, None]) for part in noise)
+    problems = {
+        "level": Problem(LINE, level, line, Noise(relative=Free(0.1, 0.001, 1.0, LogNormal(0.05, 2.0)))),
+        "shared": Problem(LINE, shared, line, Noise(relative=0.02, correlated=Correlated(half=10.0, difference=10.0))),
+    }
+    together = fit(Joint(problems), starts=3)
+    for name, one in problems.items():
+        alone = fit(LINE, one.data, transport=line, noise=one.noise, starts=3)
+        np.testing.assert_allclose(together.part(name).vector, alone.vector, rtol=1e-4)
+        np.testing.assert_allclose(together.part(name).errors, alone.errors, rtol=1e-3)
+        np.testing.assert_allclose(together.part(name).residuals, alone.residuals, atol=1e-3)
+
+
+def test_what_is_new_in_one_measurement_is_not_shared():
+    """Errors that readings of one of them share have names that begin as those of levels of noise do."""
+    noise = Noise(relative=Free(0.1, 0.01, 1.0))
+    both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
+    changed = both.with_problems({"first": counting(both.parts["first"])})
+    added = {f"first.noise.correlated.{name}" for name in ("amplitude", "half", "difference", "growth")}
+    assert set(changed.names) == set(both.names) | added
+    assert changed.names[:2] == (SLOPE, "noise.relative")
+
+
+def test_each_measurement_is_differentiated_by_its_own_parameters():
+    """By counts of operations: a Jacobian of three costs the sum of theirs."""
+
+    def dear(stack, wi, wo):
+        return sum(lobe(stack | {"gain": stack["gain"] * share}, wi, wo) for share in np.linspace(0.0, 0.2, 10))
+
+    alone = Problem(LOBE_STACK, noisy_lobe(0), dear)
+    several = Joint(dict.fromkeys(("a", "b", "c"), alone), shared=["['alpha']"])
+
+    def jacobian(model):
+        def value(vector):
+            (data, *_), _ = model.linear_parts(vector)
+            return data
+
+        return lambda x: jax.vmap(lambda t: jax.jvp(value, (x,), (t,))[1])(jnp.eye(x.size))
+
+    def flops(problem):
+        program = jax.jit(jacobian(problem.model)).lower(jnp.asarray(problem.start))
+        return program.cost_analysis()["flops"]
+
+    assert len(several.names) == 16
+    assert flops(several) < 1.2 * 3 * flops(alone)
+
+
+def test_what_does_not_go_together_is_refused():
+    first, second = (problem(name) for name in TRUE)
+    with pytest.raises(ValueError, match=r"Joint.parts is \['a'\]; it must name at least two problems"):
+        Joint({"a": first})
+    with pytest.raises(ValueError, match="no problem has a free parameter 'scale'"):
+        Joint({"a": first, "b": second}, shared=["scale"])
+    fixed = Problem({"a": Free(0.9, -1.0, 3.0), "b": 0.5}, data("second"), line)
+    with pytest.raises(ValueError, match=r"\['b'\] is not free in 'b'; it must be in every problem"):
+        Joint({"a": first, "b": fixed}, shared=[SLOPE])
+    other = Problem({"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 2.0)}, data("second"), line)
+    with pytest.raises(ValueError, match=r"\['b'\] has other bounds or another prior in 'b' than in 'a'"):
+        Joint({"a": first, "b": other}, shared=[SLOPE])
+    named = Problem(LINE, data("second"), line, objective="cosine_l2")
+    with pytest.raises(ValueError, match="objective is 'cosine_l2'; it must be 'likelihood'"):
+        Joint({"a": first, "b": named})
+    both = Joint({"a": first, "b": second})
+    with pytest.raises(ValueError, match="data is given beside a Joint"):
+        fit(both, data("first"))
+    with pytest.raises(ValueError, match="transport is given beside a Joint"):
+        fit(both, transport=line)
+    with pytest.raises(ValueError, match="data is None"):
+        fit(LINE)
+    with pytest.raises(AttributeError, match="Joint has no data"):
+        _ = both.data

@@ -1,0 +1,154 @@
+"""The lowest end of all starts is the fit, however many steps it took; no stack ends above what it contains."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from fits.data.formats import read
+from fits.data.geometry import slices
+from fits.optimise import multi_start as starts_module
+from fits.optimise.bounded import cost_and_gradient
+from fits.optimise.fit import fit
+from fits.optimise.multi_start import WORTH, run_starts
+from fits.optimise.result import ENDED
+from fits.optimise.starts_file import End, StartsFile
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free
+from fits.problem.priors import LogUniform
+from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
+from fits.problem.stack_file import read_problem
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, directions, line, line_data, lobe, measured, noisy_lobe
+from tests.helpers.places import EXAMPLES
+
+COATINGS = EXAMPLES / "arizona_black_coatings"
+
+# outer stack, the stack it contains, how the parameters of that one are called in it
+NESTED = (
+    ("hazy_coat_over_diffuse", "flake_coat_over_diffuse", {"layers[0]": "layers[1]"}),
+    ("flake_coat_over_vmf_diffuse", "flake_coat_over_diffuse", {}),
+    ("flake_coat_over_conductor", "rough_conductor", {}),
+)
+STEEL = "nite_on_blasted_steel1008_650nm_inplane.csv"
+
+
+def read_incidences(name, degrees):
+    data = read(COATINGS / name)
+    if degrees is None:
+        return data
+    found = np.degrees(np.arccos(data.wi[:, 2]))
+    return data.where(np.any(np.abs(found[:, None] - degrees) < 1.0, axis=1), "other incidences are left out")
+
+
+def fitted(name, data, count):
+    given = read_problem(EXAMPLES / f"{name}.toml")
+    # the cheapest: what is asked is about starts, whatever carries the light
+    options = {"transport": lj.SingleScattering(), "noise": given.noise, "scale": given.scale}
+    return fit(given.stack, data, starts=count, **options)
+
+
+def cost_at(problem: Problem, values):
+    """Of the stack with these values, and everything else at the end of its range that is nearest to nothing."""
+    vector = np.array([values.get(name, low) for name, low in zip(problem.names, problem.low, strict=True)])
+    return float(problem.call(cost_and_gradient, problem.model.box.to_unit(jnp.asarray(vector)))[0])
+
+
+@pytest.mark.parametrize(
+    ("pair", "name", "degrees", "count"),
+    [
+        (NESTED[0], STEEL, (10.0, 50.0), 8),
+        *(
+            pytest.param(pair, path.name, degrees, 32, marks=pytest.mark.slow)
+            for pair in NESTED
+            for path in sorted(COATINGS.glob("*.csv"))
+            for degrees in ((10.0, 50.0), None)
+        ),
+    ],
+)
+def test_a_stack_never_ends_above_what_it_contains(pair, name, degrees, count):
+    outer, inner, renamed = pair
+    data = read_incidences(name, degrees)
+    whole, part = fitted(outer, data, count), fitted(inner, data, count)
+    values = dict(part.values)
+    for old, new in renamed.items():
+        values = {parameter.replace(old, new): value for parameter, value in values.items()}
+    # to what a start that goes on is worth
+    assert whole.minima[0].cost <= cost_at(whole.problem, values) + WORTH
+
+
+@pytest.mark.parametrize("name", [STEEL, "aeroglaze_650nm_inplane.csv"])
+def test_a_race_ends_where_all_starts_do(name, monkeypatch):
+    """Of stacks with several minima; few steps tell which starts go on, and the others are not followed."""
+    given = read_problem(EXAMPLES / "hazy_coat_over_diffuse.toml")
+    data = read_incidences(name, (10.0, 50.0))
+    problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, correlated=False), given.scale)
+    points = starts_module.start_points(problem, 8, 0)
+    monkeypatch.setattr(starts_module, "EARLY", 10)
+    ends, every = starts_module.race(problem, points), run_starts(problem, points, "least_squares", lambda *told: None)
+    assert min(end.cost for end in ends) <= min(end.cost for end in every) + WORTH
+    left = [end for end in ends if end.unfinished]
+    assert 1 <= len(left) <= len(points) - starts_module.FRONT
+    assert {end.steps for end in left} == {20}  # with sigma held, and free
+    assert sum(end.steps for end in ends) < sum(end.steps for end in every)
+
+
+def test_the_lowest_end_is_the_fit_though_it_ran_out_of_steps(monkeypatch):
+    """A few steps, and no further round: none has converged, all are counted, and the lowest is told."""
+    monkeypatch.setattr(starts_module, "MOST_STEPS", 4)
+    monkeypatch.setattr(starts_module, "MOST_ROUNDS", 1)
+    calls = []
+    # a stack of its own, so that the program is compiled with this number of steps
+    exact = lobe(LOBE, directions(200, 1), directions(200, 2))
+    data = measured(exact, 0.01 * exact)
+    result = fit(LOBE_STACK, data, transport=lambda *a: lobe(*a), starts=6, progress=lambda *a: calls.append(a))
+    seen = min(float(call[3].split()[-1]) for call in calls)
+    assert result.minima[0].cost <= seen * (1 + 1e-5)
+    assert sum(result.ended.values()) == 6
+    assert set(result.ended) <= set(ENDED)
+
+
+def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
+    """Two steps a round, and as many rounds as it takes: the same minimum."""
+    monkeypatch.setattr(starts_module, "MOST_STEPS", 2)
+    monkeypatch.setattr(starts_module, "MOST_ROUNDS", 200)
+    slowly = fit(LOBE_STACK, noisy_lobe(0), transport=lambda *a: lobe(*a), starts=1)
+    monkeypatch.undo()
+    at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
+    assert slowly.converged
+    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)
+
+
+class Dimmed:
+    """A transport that shows as an object in memory."""
+
+    def __call__(self, stack, wi, wo):
+        return 0.5 * line(stack, wi, wo)
+
+
+@pytest.mark.parametrize("made", [lambda: jax.jit(lambda *a: line(*a)), Dimmed], ids=["compiled", "object"])
+def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path):
+    data, points, path = line_data(), np.full((1, 2), 0.5), tmp_path / "starts"
+    transports = made(), made()  # both at once, so that they differ in place
+    first, second = (Problem(LINE, data, one) for one in transports)
+    with StartsFile(path, first, points, "least_squares") as kept:
+        kept.add(0, End(np.array([1.0, 0.5]), 1.0, 5, True, False))
+    with StartsFile(path, second, points, "least_squares") as kept:
+        assert list(kept.ends) == [0]
+
+
+def test_a_fit_does_not_end_on_a_plateau():
+    """Of backward scattering `Statistical` knows nothing: the only start comes to rest where g is below 0."""
+    noise = Noise(relative=0.02, floor=1e-6, correlated=False)
+    haze, metal = lj.Medium(0.84, 1.0, lj.HenyeyGreenstein(0.13)), lj.Conductor(0.4, 3.2, 0.37)
+    data = simulate(lj.Stack([haze], metal), slices([10.0, 30.0, 50.0, 70.0]), lj.Statistical(), 0.02, 1e-6, seed=1)
+    thickness, index = Free(0.1, 1e-3, 5.0, LogUniform()), Free(1.5, 0.05, 9.0, LogUniform())
+    haze = lj.Medium(thickness, 1.0, lj.HenyeyGreenstein(Free(0.3, -0.6, 0.9)))
+    metal = lj.Conductor(index, Free(0.5, 0.01, 9.0, LogUniform()), Free(0.3, 0.02, 1.0))
+    found = fit(lj.Stack([haze], metal), data, transport=lj.Statistical(), noise=noise, starts=1)
+    truth = {"layers[0].thickness": 0.84, "layers[0].phase.g": 0.13, "base.ior": 0.4, "base.k": 3.2, "base.alpha": 0.37}
+    assert found.minima[0].cost <= cost_at(found.problem, truth)
+    assert not found.without_influence

@@ -1,0 +1,219 @@
+"""The resolution of a fit follows from the noise of its data, and is told with the error that it leaves."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import layerjax as lj
+from benchmarks.measuring.repeats import fit_many
+from fits._files import read_json, write_json
+from fits.data.geometry import slices
+from fits.data.scans import incidences, signed_angle
+from fits.optimise import multi_start as starts_module
+from fits.optimise import refinement
+from fits.optimise import resolution as resolution_module
+from fits.optimise.fit import fit
+from fits.optimise.resolution import ENOUGH, LEAST_SCATTER, resolutions, spread
+from fits.optimise.result import Fit
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free
+from fits.problem.problem import Problem
+from fits.problem.simulate import simulate
+from fits.reports import results, verdicts
+from fits.reports.diagnostics import residual_structure, standardised
+from fits.reports.html import page
+from fits.reports.plots.model import curves_picture
+from tests.helpers.models import LINE, TRUTH, line, line_data
+
+GEOMETRY = slices(incidence=(20, 50), outgoing=np.arange(-60, 61, 20))
+NARROW, WIDE = 0.15, 0.45
+COARSE = lj.AddingDoubling(nodes=6, modes=12, ordinates=(6, 8))
+
+
+def lacquered(alpha):
+    """A metal under a lacquer: the lobe behind the interface is what nodes must resolve."""
+    return lj.Stack([lj.Interface(ior=1.5, alpha=0.3)], base=lj.Conductor(ior=0.2, k=3.0, alpha=alpha))
+
+
+STACK = lacquered(Free(WIDE, 0.05, 0.8))  # wide where it starts: 6 nodes will do there
+
+
+def measured(alpha, noise):
+    return simulate(lacquered(alpha), GEOMETRY, transport=lj.AddingDoubling(nodes=32, modes=48), noise=noise, seed=0)
+
+
+@pytest.fixture(scope="module")
+def sharp():
+    return measured(NARROW, 0.003)
+
+
+@pytest.fixture(scope="module")
+def refined(sharp, tmp_path_factory) -> tuple[Fit, Path]:
+    kept = tmp_path_factory.mktemp("starts") / "kept"
+    return fit(STACK, sharp, starts=2, checkpoint=kept), kept
+
+
+def test_a_fit_is_refined_until_its_error_is_a_tenth_of_the_noise(refined, sharp):
+    found, _ = refined
+    transport = found.problem.transport
+    assert isinstance(transport, lj.AddingDoubling)
+    assert transport.nodes > COARSE.nodes
+    assert found.numerical_error <= ENOUGH
+    assert found.resolution == f"{transport.nodes} nodes, {transport.modes} modes"
+    assert f"numerical error of the model: {found.numerical_error:.2g} sigma at most" in found.status
+    # against the resolution that made the data, the error is what is said, within the factor of one more rung
+    exact = lj.evaluate(
+        lacquered(found.values["base.alpha"]), sharp.wi, sharp.wo, lj.AddingDoubling(nodes=32, modes=48)
+    )
+    assert np.max(np.abs(found.predicted - exact) / sharp.sigma) < 2.0 * ENOUGH
+    assert abs(found.values["base.alpha"] - NARROW) < 3.0 * found.standard_errors["base.alpha"]
+    assert found.converged
+    assert found.minima[0].count == 2
+
+
+def as_fine(transport, other):
+    """In nodes and modes: no medium here asks for ordinates."""
+    return (transport.nodes, transport.modes) == (other.nodes, other.modes)
+
+
+def test_a_coarse_one_stays_where_it_will_do():
+    found = fit(STACK, measured(WIDE, 0.05), starts=2)
+    assert as_fine(found.problem.transport, COARSE)
+    assert found.numerical_error <= ENOUGH
+
+
+def test_a_resolution_that_is_given_stays_and_its_error_is_told(sharp):
+    found = fit(STACK, sharp, transport=COARSE, starts=1)
+    assert found.problem.transport == COARSE
+    assert found.numerical_error > ENOUGH
+    assert "sigma at most at 6 nodes, 12 modes, as given" in found.status
+    sentences, fine = verdicts.in_short(found, residual_structure(found.problem.data, standardised(found)))
+    assert not fine
+    assert any("numerical error" in sentence for sentence in sentences)
+
+
+def test_the_finest_resolution_is_told(sharp, monkeypatch):
+    monkeypatch.setattr(resolution_module, "FINEST_NODES", 6)
+    monkeypatch.setattr(resolution_module, "FINEST_MODES", 12)
+    found = fit(STACK, sharp, starts=1)
+    assert as_fine(found.problem.transport, COARSE)
+    assert re.search(r"up to .* sigma at 6 nodes, 12 modes, the finest tried", found.status)
+
+
+def test_a_fit_goes_on_with_the_starts_that_are_done(refined, sharp, monkeypatch):
+    found, kept = refined
+    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    again = fit(STACK, sharp, starts=2, checkpoint=kept)
+    np.testing.assert_array_equal(again.vector, found.vector)
+    assert again.problem.transport == found.problem.transport
+
+
+def test_a_result_keeps_its_resolution(refined, tmp_path):
+    found, _ = refined
+    results.save_fit(found, tmp_path / "fit")
+    opened = results.load_fit(tmp_path / "fit")
+    assert opened.problem.transport == found.problem.transport
+    assert (opened.resolution, opened.numerical_error) == (found.resolution, found.numerical_error)
+    older = read_json(tmp_path / "fit" / results.FIT)
+    for key in ("transport", "resolution", "numerical_error"):
+        del older[key]
+    write_json(tmp_path / "fit" / results.FIT, older, force=True)
+    opened = results.load_fit(tmp_path / "fit")
+    assert opened.resolution is None
+    assert opened.numerical_error is None
+
+
+def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
+    found, _ = refined
+    text = page(found, None, {})
+    assert f"AddingDoubling, {found.resolution}" in text
+    assert verdicts.numerical_error(found) in text
+    figure = curves_picture({"fit": found})
+    (curve,) = (line for line in figure.axes[0].lines if line.get_label() == "model")
+    rows = incidences(found.problem.data)[0].rows
+    drawn = np.interp(signed_angle(found.problem.data)[rows], *curve.get_data())
+    np.testing.assert_allclose(drawn, found.predicted[rows, 0], rtol=1e-6)
+
+
+def test_repeats_have_the_resolution_of_the_start(sharp):
+    values = sharp.used().values[None]
+    open_one, coarse = (fit_many(problem, values) for problem in (Problem(STACK, sharp), Problem(STACK, sharp, COARSE)))
+    assert open_one.converged.all()
+    np.testing.assert_array_equal(open_one.vectors, coarse.vectors)
+
+
+def coated(index, alpha, axis=None):
+    flakes = lj.SGGX("surface", alpha=alpha, axis=axis)
+    return lj.Stack([lj.Interface(ior=index, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=flakes)])
+
+
+def test_what_auto_is_does_not_follow_from_the_start():
+    """An interface that starts without effect is one, and a roughness counts with its value at the start."""
+    geometry = slices(incidence=(20,), outgoing=(0, 30))
+    data = simulate(lj.Stack([], base=lj.Lambertian(albedo=0.5)), geometry, noise=0.1)
+    passing = resolutions(Problem(coated(Free(1.0, 1.0, 2.0), Free(0.1, 0.05, 1.0)), data))
+    assert passing.open
+    assert not passing.tilted
+    assert passing.chosen.nodes > passing.far.nodes == resolution_module.FAR["nodes"]
+    bare = lj.Stack([lj.Medium(thickness=Free(0.0, 0.0, 1.0), albedo=0.0)], base=lj.Lambertian(albedo=0.5))
+    assert resolutions(Problem(bare, data)) is None
+
+
+def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
+    """What is as fine as it gets stays, and the other goes on."""
+    here = lj.AddingDoubling(nodes=12, modes=18, ordinates=(6, 8))
+    known = resolution_module.Resolutions(lj.AddingDoubling(), here, tilted=False)
+    finer = known.finer(here)
+    assert known.in_words(finer) == "16 nodes, 24 modes"
+    assert list(map(known.in_words, known.partly_finer(here, finer))) == ["12 nodes, 24 modes", "16 nodes, 18 modes"]
+    monkeypatch.setattr(resolution_module, "FINEST_NODES", 12)
+    only = known.finer(here)
+    assert known.in_words(only) == "12 nodes, 24 modes"
+    assert known.partly_finer(here, only) == []
+
+    class Alike(refinement.Values):
+        """A model that nodes change nothing of: its error falls with the modes."""
+
+        def __init__(self):
+            self._known = {}
+
+        def error(self, transport, other):
+            return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
+
+    monkeypatch.undo()
+    needed, error, finest = refinement._needed(known, here, Alike(), lambda *_: None)
+    assert (needed.nodes, finest) == (12, False)
+    assert needed.modes > 30
+    assert error <= ENOUGH
+
+
+def test_what_is_given_in_part_stays():
+    given = lj.AddingDoubling(modes=4)
+    chosen = lj.AddingDoubling(nodes=12, modes=4, ordinates=(6, 8))
+    known = resolution_module.Resolutions(given, chosen, tilted=False)
+    assert known.open
+    assert known.in_words(known.finer(chosen)) == "16 nodes, 4 modes"
+    tilted = resolution_module.Resolutions(lj.AddingDoubling(nodes=8, modes=8), chosen, tilted=True)
+    assert tilted.open
+    assert tilted.in_words(tilted.finer(chosen)) == "8 cosines, 12 azimuths"
+
+
+def test_errors_count_in_fitted_noise_levels():
+    floor = Noise(floor=Free(0.05, 0.01, 1.0), use_sigma=False)
+    problem = Problem(LINE, line_data(), line, floor)
+    vector = np.array([*TRUTH, 0.2])
+    np.testing.assert_allclose(spread(problem, vector, np.asarray(problem.predict(vector))), 0.2)
+
+
+def test_errors_count_in_the_scatter_about_a_named_objective():
+    data = line_data()
+    problem = Problem(LINE, data, line, objective="cosine_l2")
+    predicted = np.asarray(problem.predict(TRUTH))
+    cosine = data.wi[:, 2:]
+    scatter = np.sqrt(np.sum((cosine * (predicted - data.values)) ** 2) / (len(data) - 2))
+    np.testing.assert_allclose(spread(problem, TRUTH, predicted), scatter)
+    # noise-free data, which any error would be large beside
+    least = LEAST_SCATTER * np.sqrt(np.mean((cosine * data.values) ** 2))
+    np.testing.assert_allclose(spread(problem, TRUTH, data.values), least)

@@ -1,0 +1,109 @@
+"""Comparison of fits: the criteria written out, and which stack wins."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fits.optimise.fit import fit
+from fits.prediction.compare import compare
+from fits.problem.parameters import Free
+from fits.sampling.sample import sample
+from tests.helpers.models import design, line, measured
+
+COUNT = 120
+LINE = {"a": Free(0.9, -1.0, 3.0), "b": Free(0.1, -1.0, 3.0)}
+FLAT = {"a": Free(0.9, -1.0, 3.0), "b": 0.0}
+NOISE = 0.05 * np.random.default_rng(0).standard_normal((COUNT, 1))
+DATA = measured((design(COUNT) @ [1.0, 0.2])[:, None] + NOISE, 0.05)
+
+
+@pytest.fixture(scope="module")
+def fits() -> dict:
+    return {name: fit(stack, DATA, transport=line, starts=2) for name, stack in (("flat", FLAT), ("line", LINE))}
+
+
+def test_criteria_are_those_of_the_books(fits: dict) -> None:
+    comparison = compare(fits)
+    assert comparison.sorted_by == "aic"
+    assert [row.name for row in comparison.rows] == ["line", "flat"]
+    for row, columns in zip(comparison.rows, (2, 1), strict=True):
+        x = design(COUNT)[:, :columns]
+        rest = DATA.values[:, 0] - x @ np.linalg.lstsq(x, DATA.values[:, 0], rcond=None)[0]
+        likelihood = stats.norm.logpdf(rest, 0, 0.05).sum()
+        assert row.chi_square == pytest.approx(np.sum(rest**2) / 0.05**2, rel=1e-8)
+        assert row.degrees_of_freedom == COUNT - columns
+        assert row.log_likelihood == pytest.approx(likelihood, rel=1e-8)
+        assert row.aic == pytest.approx(2 * columns - 2 * likelihood, rel=1e-8)
+        assert row.bic == pytest.approx(columns * math.log(COUNT) - 2 * likelihood, rel=1e-8)
+        assert math.isnan(row.loo)
+
+
+def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
+    """Exact leave-one-out of a linear model with known noise; flat priors are wide enough to be left out."""
+    posteriors = {name: sample(entry, walkers=16, seed=0) for name, entry in fits.items()}
+    comparison = compare(posteriors)
+    assert comparison.sorted_by == "loo"
+    assert [row.name for row in comparison.rows] == ["line", "flat"]
+    for row, columns in zip(comparison.rows, (2, 1), strict=True):
+        x, y = design(COUNT)[:, :columns], DATA.values[:, 0]
+        leverage = np.einsum("ij,jk,ik->i", x, np.linalg.inv(x.T @ x), x)
+        fitted = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+        exact = stats.norm.logpdf(fitted / (1 - leverage), 0, 0.05 / np.sqrt(1 - leverage)).sum()
+        # what leaving out costs goes with the variance of the samples: 4 of its standard errors
+        cost = stats.norm.logpdf(fitted, 0, 0.05).sum() - exact
+        error = np.sqrt(2 / posteriors[row.name].effective_samples.min())
+        assert row.loo == pytest.approx(exact, abs=4 * error * cost)
+        assert row.unreliable == 0
+    assert comparison.rows[0].loo_behind == 0
+    assert comparison.rows[1].loo_behind > 3 * comparison.rows[1].loo_behind_error
+    assert comparison.verdict[0].startswith("The data prefer line to flat: it expects new data")
+
+
+def test_the_verdict_says_what_the_data_prefer(fits: dict) -> None:
+    def verdict(other: dict) -> str:
+        (sentence,) = compare({"line": fits["line"], "other": fit(other, DATA, transport=line, starts=2)}).verdict
+        return sentence
+
+    rows = compare(fits).rows
+    aic, bic = rows[1].aic - rows[0].aic, rows[1].bic - rows[0].bic
+    assert verdict(FLAT) == f"The data prefer line to other: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+    slope, error = fits["line"].values["['b']"], fits["line"].standard_errors["['b']"]
+    nearly = verdict({"a": Free(0.9, -1.0, 3.0), "b": slope + 0.4 * error})
+    aic, bic = 2 - 0.16, math.log(COUNT) - 0.16  # a parameter less, for 0.4 standard errors
+    assert nearly == f"The data do not tell other from line: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+
+
+def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
+    """Errors stated ten times too small: differences in log-likelihood shrink by the best one's reduced chi-square."""
+    poor = measured(DATA.values, 0.005)
+    comparison = compare({name: fit(stack, poor, transport=line) for name, stack in (("flat", FLAT), ("line", LINE))})
+    best, other = comparison.rows
+    assert 80 < best.reduced_chi_square < 130
+    gain = (other.chi_square - best.chi_square) / best.reduced_chi_square
+    words = f"AIC lower by {gain - 2:.1f}, BIC by {gain - math.log(COUNT):.1f} (the scatter that line leaves counted"
+    assert words in comparison.verdict[0]
+
+
+def test_what_differs_is_said(fits: dict) -> None:
+    scaled = fit(LINE, DATA, transport=line, scale=1.1, starts=2)
+    notes = compare({"line": fits["line"], "scaled": scaled}).notes
+    assert any(note.startswith("the fits differ in scale") for note in notes)
+    poor = measured(DATA.values, 0.005)
+    notes = compare({"one": fit(FLAT, poor, transport=line, starts=1), "two": fit(FLAT, poor, transport=line)}).notes
+    assert any("no candidate explains the data" in note for note in notes)
+
+
+def test_different_data_or_objectives_are_refused(fits: dict) -> None:
+    other = fit(LINE, measured(DATA.values + 0.01, 0.05), transport=line, starts=1)
+    with pytest.raises(ValueError, match="'line' and 'other' were fitted to different data"):
+        compare({"line": fits["line"], "other": other})
+    named = fit(LINE, DATA, transport=line, objective="log1p_cos", starts=1)
+    with pytest.raises(ValueError, match="only fits of one objective"):
+        compare({"line": fits["line"], "named": named})
+    with pytest.raises(ValueError, match="at least 2"):
+        compare({"line": fits["line"]})
+    both = compare({"a": named, "b": named})
+    assert both.sorted_by == "chi_square"
+    assert math.isnan(both.rows[0].aic)

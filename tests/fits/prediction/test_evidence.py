@@ -1,0 +1,97 @@
+"""The evidence of posteriors that are no ellipsoids, beside quadrature over the box, and beside dynesty."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import logsumexp
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.optimise.fit import fit
+from fits.prediction.evidence import evidence
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free, Normal
+from fits.problem.problem import Problem
+from tests.helpers.models import line
+
+GEOMETRY = slices([10.0, 50.0], np.arange(-75.0, 76.0, 10.0))
+SIGMA = 0.1
+
+
+def product(stack, wi, wo):
+    return (stack["a"] * stack["b"] + 0.0 * wo[:, 2])[:, None]
+
+
+def measured(transport, stack: dict[str, float]) -> Measurements:
+    exact = np.asarray(transport(stack, GEOMETRY.wi, GEOMETRY.wo))
+    values = exact + SIGMA * np.random.default_rng(0).standard_normal(exact.shape)
+    return Measurements(
+        GEOMETRY.wi, GEOMETRY.wo, values, np.full_like(values, SIGMA), np.ones(len(values), bool), ("value",)
+    )
+
+
+CASES = {
+    "a hyperbola": (product, {"a": Free(1.0, 0.1, 5.0), "b": Free(1.0, 0.1, 5.0)}, {"a": 1.0, "b": 0.8}),
+    "beyond a bound": (line, {"a": Free(0.5, 0.0, 1.0), "b": Free(0.1, -1.0, 3.0)}, {"a": 1.02, "b": 0.5}),
+    "nothing known": (product, {"a": Free(0.1, 0.0, 1.0), "b": Free(0.1, 0.0, 1.0)}, {"a": 0.0, "b": 0.0}),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_it_is_the_integral_over_the_box(name: str) -> None:
+    transport, stack, truth = CASES[name]
+    found = fit(stack, measured(transport, truth), transport=transport, noise=Noise(correlated=False), starts=2)
+    problem: Problem = found.problem
+    count = 1500
+    sides = [np.linspace(low, high, count + 1) for low, high in zip(problem.low, problem.high, strict=True)]
+    a, b = np.meshgrid(*(0.5 * (side[1:] + side[:-1]) for side in sides), indexing="ij")
+    design = line if transport is line else product
+    values, x = problem.data.values[:, 0], np.asarray(design({"a": 1.0, "b": 1.0}, GEOMETRY.wi, GEOMETRY.wo))[:, 0]
+    first, second = (a, b) if transport is line else (0.0, a * b)
+    x = x - 1.0 if transport is line else x
+    # of values - first - second x, by its moments
+    squares = (
+        values @ values
+        + first * first * x.size
+        + second * second * (x @ x)
+        - 2.0 * first * values.sum()
+        - 2.0 * second * (x @ values)
+        + 2.0 * first * second * x.sum()
+    )
+    logs = -0.5 * squares / SIGMA**2 - values.size * np.log(SIGMA * np.sqrt(2.0 * np.pi))
+    exact = float(logsumexp(logs) - 2.0 * np.log(count))
+    estimate = evidence(found)
+    assert estimate.reliable
+    assert abs(estimate.log - exact) < 4.0 * estimate.error
+    assert estimate.error < 0.1
+
+
+@pytest.mark.peers
+def test_it_is_that_of_nested_sampling() -> None:
+    dynesty = pytest.importorskip("dynesty")
+
+    def lobe(stack, wi, wo):
+        half = wi + wo
+        size = (half**2).sum(axis=-1)
+        return (stack["a"] + stack["b"] * (half[:, 2] ** 2 / size) ** (1.0 / stack["c"]))[:, None]
+
+    stack = {"a": Free(0.3, 0.0, 2.0, Normal(0.3, 0.3)), "b": Free(1.0, 0.0, 5.0), "c": Free(0.2, 0.01, 2.0)}
+    data = measured(lobe, {"a": 0.3, "b": 0.4, "c": 0.3})
+    found = fit(stack, data, transport=lobe, noise=Noise(correlated=False), starts=4)
+    problem = found.problem
+    likelihood = jax.jit(problem.log_likelihood)
+    prior = stats.truncnorm((0.0 - 0.3) / 0.3, (2.0 - 0.3) / 0.3, 0.3, 0.3)
+
+    def transform(unit: np.ndarray) -> np.ndarray:
+        return np.array([prior.ppf(unit[0]), *(problem.low[1:] + unit[1:] * (problem.high - problem.low)[1:])])
+
+    sampler = dynesty.NestedSampler(
+        lambda x: float(likelihood(x)), transform, 3, nlive=500, rstate=np.random.default_rng(0)
+    )
+    sampler.run_nested(print_progress=False, dlogz=0.05)
+    estimate = evidence(found)
+    assert estimate.reliable
+    error = np.hypot(estimate.error, sampler.results.logzerr[-1])
+    assert abs(estimate.log - sampler.results.logz[-1]) < 4.0 * error
+    assert error < 0.3

@@ -1,0 +1,252 @@
+"""What is foretold of what is left out, evidence and weights, beside linear regression, where all of them are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits.prediction.conditional import without
+from scipy import stats
+from scipy.special import logsumexp
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.optimise.fit import fit
+from fits.optimise.result import Fit
+from fits.prediction.average import average
+from fits.prediction.compare import compare
+from fits.prediction.cross_validation import LeftOut, groups_of, leave_out
+from fits.prediction.evidence import Evidence, evidence, posterior_draws
+from fits.prediction.model_scores import foresights, stacking, together
+from fits.prediction.predict import predict
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free, LogUniform, Normal
+from fits.problem.problem import Problem
+from fits.reports import tables
+from fits.sampling.mixture import Mixture
+from tests.helpers.models import line
+
+SIGMA = 0.05
+GEOMETRY = slices([10.0, 30.0, 50.0], np.arange(-75.0, 76.0, 10.0))
+STACK = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": Free(0.1, -4.0, 5.0, Normal(0.5, 0.4))}
+FLAT = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": 0.0}
+
+
+def readings(seed: int = 0) -> Measurements:
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+    values = exact + SIGMA * np.random.default_rng(seed).standard_normal(exact.shape)
+    sigma = np.full_like(values, SIGMA)
+    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, sigma, np.ones(len(values), bool), ("value",))
+
+
+@pytest.fixture(scope="module")
+def found() -> Fit:
+    return fit(STACK, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Fit:
+    return fit(FLAT, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+
+
+def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the parameters, from these rows and the priors."""
+    data = readings()
+    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)[rows]
+    precision = columns.T @ columns / SIGMA**2 + np.diag(1.0 / np.array([0.5, 0.4]) ** 2)
+    pulled = columns.T @ data.values[rows, 0] / SIGMA**2 + np.array([1.0, 0.5]) / np.array([0.5, 0.4]) ** 2
+    return np.linalg.solve(precision, pulled), np.linalg.inv(precision)
+
+
+def test_rows_that_are_left_out_count_for_nothing(found: Fit) -> None:
+    rows = np.arange(len(readings())) % 3 == 0
+    left = without(found.problem, rows)
+    fewer = Problem(STACK, readings().where(~rows), line, Noise(correlated=False))
+    for vector in (found.vector, np.array([0.0, 2.0])):
+        gaps = [float(of.log_likelihood(vector) - of.log_likelihood([1.0, 0.5])) for of in (left, fewer)]
+        assert gaps[0] == pytest.approx(gaps[1], abs=1e-6)
+
+
+def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
+    rows = np.arange(len(readings())) % 3 == 0
+    noise = Noise(correlated=True)
+    whole, fewer = (Problem(STACK, data, line, noise) for data in (readings(), readings().where(~rows)))
+    # of so few readings all are nodes, in both
+    for of in (whole, fewer):
+        np.testing.assert_allclose(np.max(of.model.process.weights, axis=-1), 1.0, atol=1e-6)
+    left = without(whole, rows)
+    moved = whole.start * np.array([1.1, 0.7, 1.5, 0.8, 1.2, 0.6])
+    gaps = [float(of.log_likelihood(moved) - of.log_likelihood(of.start)) for of in (left, fewer)]
+    assert gaps[0] == pytest.approx(gaps[1], abs=1e-3)
+
+
+def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
+    left, data = leave_out(found, draws=2000), readings()
+    assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")
+    assert left.converged
+    for rows in left.rows:
+        others = np.setdiff1d(np.arange(len(data)), rows)
+        mean, covariance = regression(others)
+        columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
+        width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
+        expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
+        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
+    assert left.score == pytest.approx(left.by_group.sum())
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_what_leaves_a_ridge_open_is_foretold(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a level times a scale the product alone is known; draws for all readings spare the ridge without some."""
+    data = readings(1)
+    level = replace(data, values=1.0 + data.values - np.asarray(line({"a": 1.0, "b": 0.5}, data.wi, data.wo)))
+    stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
+    open_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(correlated=False), starts=2)
+    draws = posterior_draws(open_fit) if known else None
+    followed: list[Fit] = []
+    monkeypatch.setattr(Mixture, "of", lambda fit, of=Mixture.of: followed.append(fit) or of(fit))
+    left = leave_out(open_fit, draws=2000, known=draws)
+    assert len(followed) == (0 if known else 3)
+    for rows in left.rows:
+        others = np.setdiff1d(np.arange(len(level)), rows)
+        values, width = level.values[:, 0], SIGMA * np.sqrt(1.0 + 1.0 / len(others))
+        expected = stats.norm.logpdf(values[rows], values[others].mean(), width)
+        np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
+
+
+def test_few_incidences_are_left_out_by_stretches() -> None:
+    data = readings()
+    one = data.where(np.abs(data.theta_i - 10.0) < 1.0).used()
+    groups = groups_of(one)
+    assert sorted(np.concatenate(list(groups.values()))) == list(range(len(one)))
+    assert len(groups) == 5
+    for rows in groups.values():
+        assert np.ptp(one.theta_o[rows] * np.sign(one.wo[rows, 0])) < 40.0
+
+
+def test_readings_in_no_group_say_nothing_of_what_is_foretold() -> None:
+    """Of one incidence a scan, and three readings of another plane, too few to leave some of them out."""
+    data = readings()
+    scan = np.abs(data.theta_i - 10.0) < 1.0
+    aside = np.flatnonzero(scan)[:3]
+    wo = data.wo.copy()
+    wo[aside] = wo[aside][:, [1, 0, 2]]
+    few = replace(data, wo=wo).where(scan)
+    left = leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+    alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
+    assert alone.size == 3
+    assert np.all(left.log_density[alone] == 0.0)
+    assert left.score == pytest.approx(left.by_group.sum())
+
+
+@pytest.mark.parametrize("stack", ["line", "flat"])
+def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> None:
+    data = readings()
+    columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)
+    prior = np.diag(np.array([0.5, 0.4]) ** 2)
+    mean = columns @ [1.0, 0.5]
+    if stack == "flat":
+        columns, prior, mean = columns[:, :1], prior[:1, :1], np.ones(len(data))
+    covariance = columns @ prior @ columns.T + SIGMA**2 * np.eye(len(data))
+    expected = stats.multivariate_normal(mean, covariance).logpdf(data.values[:, 0])
+    got = evidence(found if stack == "line" else flat, draws=4000)
+    assert got.reliable
+    assert got.error < 0.03
+    # bounds cut less than 1e-8 of the priors off
+    assert got.log == pytest.approx(expected, abs=5.0 * got.error)
+
+
+def test_weights_of_stacking_are_the_best() -> None:
+    generator = np.random.default_rng(0)
+    densities = generator.standard_normal((3, 200)) + np.array([[0.3], [0.2], [-5.0]])
+    weights = stacking(densities)
+
+    def score(w: np.ndarray) -> float:
+        return float(np.mean(logsumexp(densities + np.log(w)[:, None], axis=0)))
+
+    others = generator.dirichlet(np.ones(3), 2000)
+    assert score(weights) >= max(map(score, others)) - 1e-9
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(stacking(np.array([[0.0, 0.0], [-50.0, -50.0]])), [1.0, 0.0], atol=1e-6)
+
+
+def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
+    compared = compare({"flat": flat, "line": found}, refit=True)
+    assert compared.sorted_by == "left_out"
+    best, other = compared.rows
+    assert (best.name, other.name) == ("line", "flat")
+    assert best.foresight.behind == 0.0
+    assert other.foresight.behind == pytest.approx(best.foresight.score - other.foresight.score)
+    assert best.foresight.weight + other.foresight.weight == pytest.approx(1.0)
+    odds = np.exp(best.foresight.evidence.log - other.foresight.evidence.log)
+    assert best.foresight.probability / other.foresight.probability == pytest.approx(odds)
+    assert "foretells incidences that are left out" in compared.verdict[0]
+    table = tables.comparison_table(compared)
+    assert {"left out: score", "weight", "log evidence", "probability"} <= set(table.columns)
+
+
+def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
+    candidates, at = {"line": found, "flat": flat}, readings()
+    alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
+    one = predict(found, at, draws=1000)
+    np.testing.assert_allclose(alone.reading.mean, one.reading.mean, atol=0.01)
+    np.testing.assert_allclose(alone.log_density(at.values), one.log_density(at.values), atol=1e-6)
+    both = predict(average(candidates, {"line": 3.0, "flat": 1.0}), at, draws=4000)
+    parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
+    np.testing.assert_allclose(both.log_density(at.values), np.log(0.75 * parts[0] + 0.25 * parts[1]), atol=0.05)
+
+
+def test_more_fits_than_draws_are_averaged(found: Fit) -> None:
+    many = {f"{number}": found for number in range(9)}
+    both = predict(average(many, dict.fromkeys(many, 1.0)), readings(), draws=4)
+    assert len(both.values) == 4 * 2  # of those that are drawn at all, two
+    np.testing.assert_allclose(both.mean, found.predicted, atol=5.0 * SIGMA)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [({"line": 1.0}, "it must give each of line, flat"), ({"line": -1.0, "flat": 2.0}, "a number of at least 0")],
+)
+def test_bad_weights_are_refused(found: Fit, flat: Fit, weights: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        average({"line": found, "flat": flat}, weights)
+
+
+def test_averages_are_weighted_by_stacking(found: Fit, flat: Fit) -> None:
+    both = average({"line": found, "flat": flat})
+    weights = {name: seen.weight for name, seen in foresights({"line": found, "flat": flat}).items()}
+    assert both.weights == pytest.approx(weights)
+    assert predict(both, readings()).scores.count == readings().values.size
+    with pytest.raises(ValueError, match="there is no fit to average"):
+        average({})
+
+
+def test_fits_that_say_nothing_of_readings_are_refused() -> None:
+    free = {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
+    named = fit(free, readings(), transport=line, objective="cube_root", starts=1)
+    with pytest.raises(ValueError, match="a fit of 'cube_root' has no noise model"):
+        leave_out(named)
+    with pytest.raises(ValueError, match="a fit of 'cube_root' has none"):
+        evidence(named)
+    data = readings()
+    few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
+    with pytest.raises(ValueError, match="too few to leave some of them out"):
+        leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+
+
+@pytest.mark.parametrize(
+    ("gaps", "told"),
+    [
+        ((30.0, 200.0, 900.0), True),  # 1130 +- 780, but worse everywhere
+        ((2.0, 200.0, 900.0), False),
+        ((5.0, 6.0, 7.0), True),  # 18 +- 1.7
+        ((-1.0, 0.5, 2.0), False),
+    ],
+)
+def test_what_is_worse_everywhere_is_told_apart(gaps: tuple[float, ...], told: bool) -> None:
+    """Three groups of ten readings, over which a gap is spread evenly."""
+    rows = tuple(np.split(np.arange(30), 3))
+    best = LeftOut(("1", "2", "3"), rows, np.zeros((30, 1)), True)
+    other = LeftOut(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
+    known = Evidence(0.0, 0.1, 0.1)
+    seen = together({"best": best, "other": other}, {"best": known, "other": known})["other"]
+    assert (seen.surely_behind > 0.0) == told
+    assert seen.least_behind == pytest.approx(min(gaps) / 10.0)

@@ -1,0 +1,221 @@
+"""Predictions beside what is known of them, and their scores by readings that were not fitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from fits.data.geometry import slices
+from fits.data.measurements import Measurements
+from fits.data.selection import select
+from fits.optimise.fit import fit
+from fits.optimise.result import Fit
+from fits.prediction.predict import predict
+from fits.prediction.prediction import scores
+from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free
+from fits.problem.problem import Problem
+from fits.reports.predictions import UNRELIABLE, scores_table
+from fits.sampling.sample import sample
+from tests.helpers.models import COUNT, design, directions, line, line_fit, measured
+
+STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
+GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
+SIGMA = 0.02
+
+
+def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
+    """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
+    generator = np.random.default_rng(seed)
+    count = len(GEOMETRY)
+    empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
+    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 12.0, 12.0, 0.0))
+    model = Problem(STACK, empty, line, noise).model
+    exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
+    process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
+    assert process is not None
+    assert at is not None
+    white = generator.standard_normal((1, len(process.where)))
+    lack = np.asarray(process.drawn(white, at))
+    values = exact * (np.exp(lack) + sigma * generator.standard_normal(exact.shape))
+    return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
+
+
+def without_noise(seed: int, wrong: float) -> Measurements:
+    """The BSDF behind `readings`: its discrepancy is drawn before the noise."""
+    return readings(seed, wrong, sigma=0.0)
+
+
+def split(data: Measurements) -> tuple[Measurements, Measurements]:
+    held = select(data, "incidence=30,70")
+    return data.where(~held), data.where(held)
+
+
+def test_bands_of_a_line_are_those_of_regression() -> None:
+    found = line_fit()
+    data = found.problem.data
+    at = predict(found, data, draws=4000)
+    columns = design(COUNT)
+    covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
+    expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
+    # 4,000 draws, of some 5,000 that are worth it: 1.5 % of a standard deviation, at 4 standard errors
+    np.testing.assert_allclose(at.model.sd[:, 0], expected, rtol=0.06)
+    np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
+    np.testing.assert_allclose(at.model.mean, found.predicted, atol=0.1 * expected.max())
+    wide = at.reading.quantiles[-1] - at.reading.quantiles[0]
+    np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
+
+
+def test_a_posterior_says_the_same() -> None:
+    found = line_fit()
+    posterior = sample(found, walkers=16, max_steps=4000, progress=None)
+    at, by_fit = (predict(of, found.problem.data, draws=1000) for of in (posterior, found))
+    np.testing.assert_allclose(at.reading.sd, by_fit.reading.sd, rtol=0.08)
+    np.testing.assert_allclose(at.model.mean, by_fit.model.mean, atol=0.2 * by_fit.model.sd.max())
+    assert at.reliable
+    assert by_fit.reliable
+
+
+def test_draws_that_may_miss_a_part_are_said_to() -> None:
+    found = line_fit()
+    at = predict(found, found.problem.data)
+    assert UNRELIABLE not in scores_table(at, found.problem.data, "").note
+    lost = replace(at, shape=0.8)
+    assert not lost.reliable
+    assert UNRELIABLE in scores_table(lost, found.problem.data, "").note
+
+
+@pytest.mark.slow
+def test_wrong_models_need_shared_errors() -> None:
+    """Of 10 sets whose model is wrong by 10 %: the bands hold what they say, those of noise alone do not."""
+    held: dict[bool, list[float]] = {True: [], False: []}
+    better = []
+    for seed in range(10):
+        fitted, unseen = split(readings(seed, 0.1))
+        found = {}
+        for shared in held:
+            noise = Noise(relative=SIGMA, floor=1e-4, correlated=shared)
+            found[shared] = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen).scores
+            held[shared].append(found[shared].coverage[0.95])
+        better.append(found[True].log_score - found[False].log_score)
+    # 82 unseen readings a set are alike: the standard error of the mean of 10 sets is about 0.03
+    assert 0.86 < np.mean(held[True]) < 0.99
+    assert np.mean(held[False]) < 0.7
+    assert np.mean(better) > 1.0
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
+    fitted, unseen = split(readings(3, 0.1))
+    noise = Noise(relative=SIGMA, floor=1e-4, correlated=shared)
+    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen)
+    assert np.array_equal(at.mean, at.model.mean) != shared
+    # by 2,048 draws: the standard error of a quantile is at most 0.06 sd, at 4 or 5 of them
+    for level, of_bsdf, of_reading in zip(at.levels, at.bsdf.quantiles, at.reading.quantiles, strict=True):
+        np.testing.assert_allclose(at.quantile(level), of_bsdf, atol=0.3 * at.sd.max())
+        np.testing.assert_allclose(at.rank(at.reading_quantile(level)), level, atol=1e-9)
+        np.testing.assert_allclose(at.reading_quantile(level), of_reading, atol=0.25 * at.reading.sd.max())
+    low, high = (at.reading_quantile(level) for level in (0.025, 0.975))
+    expected = np.mean((unseen.used().values > low) & (unseen.used().values < high))
+    assert at.scores.coverage[0.95] == pytest.approx(expected)
+    assert at.scores == scores(at, unseen)
+
+
+def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
+    """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
+    inside: dict[str, list[float]] = {"bsdf": [], "model": []}
+    closer = []
+    for seed in range(2):
+        fitted, _ = split(readings(seed, 0.1))
+        _, truth = split(without_noise(seed, 0.1))
+        noise = Noise(relative=SIGMA, floor=1e-4, correlated=True)
+        at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), truth)
+        exact = truth.used().values
+        for name, held in inside.items():
+            band = getattr(at, name)
+            held.append(float(np.mean((band.quantiles[0] < exact) & (exact < band.quantiles[-1]))))
+        np.testing.assert_array_equal(at.mean, at.bsdf.mean)
+        np.testing.assert_array_equal(at.sd, at.bsdf.sd)
+        # a measurement adds independent noise: of the logarithm, which is the relative deviation here
+        np.testing.assert_allclose(at.scales**2, at.unknown**2 + SIGMA**2, rtol=1e-3)
+        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.model.mean / exact - 1.0)))
+    # neighbours are alike: a set of 82 is worth some ten, whose share scatters by 0.07, the mean of 2 by 0.05
+    assert np.mean(inside["bsdf"]) > 0.85
+    assert np.mean(inside["model"]) < 0.7
+    assert np.mean(closer) < 0.9
+
+
+def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
+    """There is nothing to see: whatever number stands there is made up."""
+    for at in (slices([95.0]), slices([90.0]), slices([30.0], [10.0, 120.0])):
+        with pytest.raises(ValueError, match=r"sees nothing of an opaque stack; its polar angle must be in \[0, 90\)"):
+            predict(coat_fit, at)
+    assert np.all(predict(coat_fit, slices([89.9]), draws=8).mean > 0.0)
+
+
+def test_right_models_lose_little_by_it() -> None:
+    fitted, unseen = split(readings(1, 0.0))
+    noise = Noise(relative=SIGMA, floor=1e-4, correlated=True)
+    found = fit(STACK, fitted, transport=line, noise=noise, starts=2)
+    assert found.values["noise.correlated.amplitude"] < SIGMA
+    got = predict(found, unseen).scores
+    assert got.coverage[0.95] > 0.9
+    assert got.median_error < SIGMA
+
+
+def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
+    fitted, _ = split(readings(2, 0.0))
+    sigma = SIGMA * fitted.values
+    known = Measurements(fitted.wi, fitted.wo, fitted.values, sigma, fitted.mask, fitted.channels)
+    found = fit(STACK, known, transport=line, starts=2)
+    at = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
+    np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
+    again = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
+    np.testing.assert_array_equal(at.reading.quantiles, again.reading.quantiles)
+
+
+def test_bad_requests_are_refused() -> None:
+    found = line_fit()
+    with pytest.raises(ValueError, match=r"level is 1.0; it must be in \(0, 1\)"):
+        predict(found, found.problem.data, levels=(0.5, 1.0))
+    directions = predict(found, slices([30.0]), draws=2)
+    for quantile in (directions.quantile, directions.reading_quantile):
+        with pytest.raises(ValueError, match=r"level is 0.0; it must be in \(0, 1\)"):
+            quantile(0.0)
+    with pytest.raises(ValueError, match="directions alone were predicted"):
+        _ = directions.scores
+    with pytest.raises(ValueError, match=r"draws is 1; it must be at least 2"):
+        predict(found, found.problem.data, draws=1)
+    named = fit(STACK, found.problem.data, transport=line, objective="cube_root", starts=1)
+    with pytest.raises(ValueError, match=r"a fit of 'cube_root' has no noise model"):
+        predict(named, found.problem.data)
+    data = found.problem.data
+    colours = Measurements(data.wi, data.wo, np.tile(data.values, 3), None, data.mask, ("r", "g", "b"))
+    with pytest.raises(ValueError, match=r"the readings have the channels r, g, b, the fit c0"):
+        predict(found, colours)
+    at = predict(found, slices([30.0]))
+    with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
+        scores(at, found.problem.data)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.001])
+def test_of_a_product_the_bands_hold_though_its_factors_are_open(sigma) -> None:
+    """The posterior is a hyperbola, the narrower the less noise there is, far from what a fit's covariance tells."""
+
+    def product(stack, wi, wo):
+        return (stack["a"] * stack["b"] * (1.0 + 0.5 * wo[:, 2]))[:, None]
+
+    exact = np.asarray(product({"a": 2.0, "b": 0.45}, directions(100, 1), directions(100, 2)))
+    noise = sigma * np.random.default_rng(0).standard_normal(exact.shape)
+    data = measured(exact + noise, sigma)
+    found = fit({"a": Free(1.0, 0.1, 10.0), "b": Free(0.9, 0.0, 10.0)}, data, transport=product, starts=4)
+    at = predict(found, data, draws=1000)
+    expected = exact[:, 0] * sigma / np.sqrt(np.sum(exact**2))
+    ratio = at.model.sd[:, 0] / expected
+    # weights that are reliable are worth some hundred draws, 4 standard errors of whose deviation are 0.2; others make
+    # bands wider, never narrower
+    assert np.all(ratio > 0.8)
+    assert np.all(ratio < (1.2 if at.reliable else 10.0))
+    assert np.all(np.abs(at.model.mean - found.predicted)[:, 0] < at.model.sd[:, 0])

@@ -1,0 +1,97 @@
+"""What a notebook shows of results: their numbers, what is to be minded, and no word as HTML."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fits
+from fits.data.measurements import Measurements
+from fits.optimise.result import Fit
+from fits.sampling.posterior import Posterior
+from tests.helpers.models import LINE, line, line_data
+
+A, B = "['a']", "['b']"
+
+
+def rows(html: str) -> list[list[str]]:
+    """Words of the cells of all tables, row by row; the fragment must be well-formed."""
+    return [["".join(cell.itertext()) for cell in row] for row in ET.fromstring(f"<div>{html}</div>").iter("tr")]
+
+
+def text(html: str) -> str:
+    return "".join(ET.fromstring(f"<div>{html}</div>").itertext())
+
+
+def chain(fit: Fit, converged: bool) -> Posterior:
+    """Independent draws about the best values: 500 steps of 8 walkers."""
+    spread = np.random.default_rng(0).standard_normal((500, 8, len(fit.vector)))
+    steps = fit.vector + fit.errors * spread
+    time = np.full(len(fit.vector), 1.0)
+    return Posterior(fit, steps, np.zeros(steps.shape[:2]), time, acceptance=0.4, converged=converged)
+
+
+def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
+    shown = coat_fit._repr_html_()
+    head, *found = rows(shown)
+    assert head == ["parameter", "value", "error", "unit", "bounds", "identified"]
+    assert [row[0] for row in found] == ["layers[0].thickness", "base.albedo"]
+    for row in found:
+        assert float(row[1]) == pytest.approx(coat_fit.values[row[0]], rel=0.01)
+        assert float(row[2]) == pytest.approx(coat_fit.standard_errors[row[0]], rel=0.05)
+    assert found[1][4] == "0 to 1"
+    assert f"Chi-square per degree of freedom: {coat_fit.reduced_chi_square:.3g}" in text(shown)
+
+
+def test_what_is_open_is_told(result: Fit) -> None:
+    bound = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]))
+    found = {row[0]: row for row in rows(bound._repr_html_())}
+    assert found[A][-1] == "AT BOUND"
+    assert found[A][2] == "unknown"
+    assert f"At a bound: {A}." in text(bound._repr_html_())
+    combination = fits.Combination(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
+    loose = replace(result, unresolved=(combination,))._repr_html_()
+    assert f"The data do not separate {A} and {B}" in text(loose)
+    assert any(row[2:4] == ["unconstrained", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
+
+
+def test_a_joint_fit_is_shown_by_measurement_and_names_are_no_html() -> None:
+    name = "<b>first</b> & last"
+    problems = {key: fits.Problem(LINE, line_data(seed=seed), line) for seed, key in enumerate([name, "second"])}
+    shown = fits.fit(fits.Joint(problems, shared=["['a']"]), starts=1)._repr_html_()
+    assert "<b>" not in shown
+    assert [head.text for head in ET.fromstring(f"<div>{shown}</div>").iter("h4")] == [name, "second"]
+    assert sum(row[0] == "['b']" for row in rows(shown)) == 2
+
+
+def test_a_posterior_has_estimates_only_if_its_chain_is_long_enough(result: Fit) -> None:
+    long, short = chain(result, True)._repr_html_(), chain(result, False)._repr_html_()
+    head, *found = rows(long)
+    assert head[:2] == ["parameter", "median"]
+    assert "unit" in head
+    for row, name in zip(found, result.values, strict=True):
+        assert float(row[1]) == pytest.approx(result.values[name], abs=0.1 * result.standard_errors[name])
+    assert "8 walkers made 500 steps" in text(long)
+    assert rows(short) == []
+    assert "it gives no estimates yet" in text(short)
+
+
+def test_a_comparison_is_its_verdict_and_its_table(result: Fit) -> None:
+    flat = fits.fit({"a": fits.Free(0.9, -1.0, 3.0), "b": 0.0}, line_data(), transport=line, starts=1)
+    shown = fits.compare({"sloped <line>": result, "flat": flat})._repr_html_()
+    assert [row[0] for row in rows(shown)] == ["fit", "sloped <line>", "flat"]
+    assert "prefer sloped <line>" in text(shown)
+
+
+def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -> None:
+    assert (
+        repr(coat_data)
+        == f"<Measurements: {len(coat_data)} readings, 10 of them masked, of value, from simulated data>"
+    )
+    assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"
+    assert repr(result).startswith(f"<Fit to 100 readings: ['a'] {result.vector[0]:.4g} ± ")
+    assert repr(chain(result, True)) == "<Posterior of ['a'], ['b']: 500 steps of 8 walkers, converged>"
+    for shown in (result, chain(result, False), coat_data):
+        assert "\n" not in repr(shown)
+        assert len(repr(shown)) < 200

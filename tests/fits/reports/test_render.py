@@ -1,0 +1,84 @@
+"""Pictures of materials: what a pixel shows, and the command."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import layerjax as lj
+from fits.cli.parser import main
+from fits.reports.render import SKY, SUN, _display, _sky, render, sphere
+from fits.reports.results import save_fit
+
+WHITE = lj.Stack([], lj.Lambertian(1.0))
+SINGLE = lj.SingleScattering()
+
+
+def test_a_white_sphere_shows_the_cosine() -> None:
+    """The pixel in the middle, lit from the viewer and from 60 degrees; a pixel is flat to 1e-3."""
+    for light, cosine in (((0.0, 0.0, 1.0), 1.0), ((np.sqrt(0.75), 0.0, 0.5), 0.5)):
+        picture = _display(sphere(WHITE, lj.prepare(WHITE, SINGLE), light, 65))
+        np.testing.assert_allclose(picture[32, 32], _display(np.asarray(SUN * cosine + SKY)), atol=2e-3)
+    np.testing.assert_allclose(picture[0, 0], _display(np.asarray(SKY)))  # beside the sphere
+
+
+def test_what_loses_nothing_cannot_be_seen_under_a_sky() -> None:
+    """A lossless haze returns the sky; 1e-3 for the angles between those of the table."""
+    haze = lj.Stack([lj.Medium(1.0, 1.0, lj.HenyeyGreenstein(0.5))])
+    solved = lj.prepare(haze, lj.AddingDoubling(nodes=12, modes=8))
+    wo = np.asarray(lj.direction(np.radians([0.0, 20.0, 50.0, 80.0]), 1.0))
+    np.testing.assert_allclose(_sky(haze, solved, wo), 1.0, atol=1e-3)
+
+
+def test_an_opaque_material_has_no_picture_from_behind() -> None:
+    figure = render(WHITE, SINGLE, title="white", size=16)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert "lit from the front" in titles
+    assert "from behind" not in titles
+    assert not any("transmitted" in title for title in titles)
+
+
+def test_bad_arguments_are_named() -> None:
+    for size in (4, 1025, 100_000):
+        with pytest.raises(ValueError, match=rf"size is {size}, must be in \[16, 1024\] pixels"):
+            render(WHITE, SINGLE, size=size)
+    with pytest.raises(ValueError, match=r"layers: the stack ends in a medium of index 1\.5, .* Interface of ior 1"):
+        render(lj.Stack([lj.Interface(1.5, 0.2)]), size=16)
+    with pytest.raises(ValueError, match="transport: RandomWalk is random"):
+        render(WHITE, lj.RandomWalk(), size=16)
+
+
+def test_the_command(tmp_path, capsys) -> None:
+    stack = tmp_path / "haze.toml"
+    stack.write_text(
+        'transport = "SingleScattering"\n[[layers]]\nkind = "Medium"\n'
+        'thickness = { start = 0.5, low = 0.0, high = 2.0 }\n[base]\nkind = "Lambertian"\nalbedo = 0.5\n'
+    )
+    picture = tmp_path / "haze.png"
+    assert main(["render", str(stack), "--out", str(picture), "--size", "16"]) == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    for words, complaint in (
+        ([str(stack), "--out", str(picture)], "exists already"),
+        (["fabric", "--out", str(tmp_path / "a.png"), "--size", "100000"], "size is 100000, must be in [16, 1024]"),
+        (["fabrik", "--out", str(tmp_path / "a.png")], "neither a .toml file nor one of the gallery: window_shade"),
+        (["fabric", "--out", str(tmp_path / "a.jpg")], "pictures can be written as .png only"),
+    ):
+        assert main(["render", *words]) == 2
+        assert complaint in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["haze.png", "haze.toml"]
+
+
+def test_the_best_of_a_fit_is_drawn(tmp_path, coat_fit, monkeypatch) -> None:
+    drawn = []
+
+    def draw(stack, transport, **_):
+        drawn.append((stack, transport))
+        return Figure()
+
+    monkeypatch.setattr("fits.reports.render.render", draw)
+    save_fit(coat_fit, tmp_path / "result")
+    assert main(["render", str(tmp_path / "result"), "--out", str(tmp_path / "coat.png")]) == 0
+    assert (tmp_path / "coat.png").exists()
+    ((stack, transport),) = drawn
+    assert eqx.tree_equal(stack, coat_fit.stack, rtol=1e-12)
+    assert transport == coat_fit.problem.transport

@@ -1,0 +1,301 @@
+"""The report says what was fitted and how far to trust it; its pictures show what is there."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import layerjax as lj
+from fits.data.geometry import direction, slices
+from fits.data.measurements import Measurements, Source
+from fits.data.neighbours import autocorrelation
+from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
+from fits.optimise.fit import fit
+from fits.optimise.identifiability import Combination
+from fits.optimise.result import Fit
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free
+from fits.reports import tables, verdicts
+from fits.reports.agreement import explains
+from fits.reports.diagnostics import residual_structure, standardised
+from fits.reports.html import report
+from fits.reports.plots import data as pictures
+from fits.reports.plots import model as model_pictures
+from fits.reports.plots import parameters as parameter_pictures
+
+
+def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:
+    count = len(theta_i)
+    wi, wo = direction(theta_i, phi_i), direction(theta_o, phi_o)
+    return Measurements(wi, wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
+
+
+def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
+    phi_i = np.array([180.0, 180.0, 37.0, 300.0, 180.0, 180.0])
+    phi_o = np.array([0.0, 180.0, 217.0, 120.0, 60.0, 120.0])
+    data = measurements([30.0] * 6, phi_i.tolist(), [20.0] * 6, phi_o.tolist())
+    np.testing.assert_allclose(signed_angle(data), [20, -20, 20, 20, 20, -20], atol=1e-9)
+    np.testing.assert_allclose(relative_azimuth(data), [0, 180, 0, 0, 60, 120], atol=1e-9)
+    np.testing.assert_array_equal(in_plane(data), [True, True, True, True, False, False])
+
+
+def test_light_along_the_normal_has_the_planes_of_the_slices() -> None:
+    geometry = slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0))
+    count = len(geometry)
+    data = Measurements(geometry.wi, geometry.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
+    np.testing.assert_allclose(signed_angle(data), [-40, 0, 40], atol=1e-9)
+    assert in_plane(data).all()
+
+
+def test_incidences_are_told_apart_by_both_angles() -> None:
+    data = measurements([10, 30, 10, 30, 10], [180, 180, 0, 180, 180.0], [5] * 5, [0] * 5)
+    found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
+    assert found == [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]
+
+
+def test_incidences_are_not_told_apart_by_what_an_instrument_jitters() -> None:
+    theta = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0]
+    phi = [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
+    data = measurements(theta, phi, [5] * 8, [0] * 8)
+    found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
+    assert [rows for _, _, rows in found] == [[4, 5], [0, 1, 2], [3], [6], [7]]
+    np.testing.assert_allclose([theta for theta, _, _ in found], [0.15, 30.27, 30.74, 50.0, 50.0], atol=0.005)
+    np.testing.assert_allclose([phi for _, phi, _ in found[1:]], [0.0, 0.0, 90.0, 90.6], atol=0.005)
+
+
+def series(correlation: float, count: int, seed: int) -> np.ndarray:
+    """A stationary autoregressive series of unit variance."""
+    draws = np.random.default_rng(seed).standard_normal(count)
+    values = [draws[0]]
+    for draw in draws[1:]:
+        values.append(correlation * values[-1] + np.sqrt(1 - correlation**2) * draw)
+    return np.array(values)
+
+
+def long_track(count: int) -> Measurements:
+    angle = np.linspace(-80, 80, count)
+    return measurements([30] * count, [180] * count, np.abs(angle).tolist(), np.where(angle < 0, 180.0, 0.0).tolist())
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_the_correlation_of_neighbours_is_recovered(correlation: float) -> None:
+    count = 4000
+    shuffled = np.random.default_rng(0).permutation(count)
+    data = long_track(count)
+    data = replace(data, wo=data.wo[shuffled])
+    residuals = series(correlation, count, seed=5)[shuffled, None]
+    structure = residual_structure(data, residuals)
+    # the standard error of a lag-one correlation r is sqrt((1 - r^2) / n)
+    assert abs(structure.lag_one - correlation) < 4 * np.sqrt((1 - correlation**2) / count)
+    assert structure.pairs == count - 1
+    assert (structure.lag_one_sigma > 4) == (correlation > 0)
+    assert abs(autocorrelation(data, residuals)[1] - correlation**2) < 0.08
+
+
+def test_independent_share_is_what_the_mean_of_a_correlated_series_says() -> None:
+    means = [series(0.6, 400, seed).mean() for seed in range(1500)]
+    share = residual_structure(long_track(4000), series(0.6, 4000, seed=1)[:, None]).independent_share
+    # Var(mean) = 1 / (n share); 1500 means give the variance to sqrt(2 / 1500) = 4 %, 4000 readings the share to 5 %
+    assert share == pytest.approx(1 / (400 * np.var(means)), rel=0.2)
+
+
+def test_masked_rows_have_no_residual_and_bias_is_structure(coat_fit: Fit) -> None:
+    residuals = standardised(coat_fit)
+    assert np.isnan(residuals[-10:]).all()
+    assert np.isfinite(residuals[:-10]).all()
+    structure = residual_structure(coat_fit.problem.data, residuals)
+    assert structure.count == len(residuals) - 10
+    assert structure.rms**2 * structure.count == pytest.approx(coat_fit.chi_square)
+    # a shift by 2 sigma correlates white neighbours by 4 / (4 + 1)
+    shifted = residual_structure(coat_fit.problem.data, residuals + 2.0)
+    assert shifted.lag_one == pytest.approx(0.8, abs=0.1)
+    assert shifted.mean == pytest.approx(structure.mean + 2.0)
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "words"),
+    [
+        (0.53217, 0.0214, ("0.532", "0.021")),
+        (1234.567, 12.0, ("1235", "12")),
+        (0.5, float("nan"), ("0.5", "unknown")),
+        (1e-7, 2.5e-9, ("1e-07", "2.5e-09")),
+        (123456.0, 34567.0, ("123456", "34567")),
+    ],
+)
+def test_numbers_stand_to_two_digits_of_their_error(value: float, error: float, words: tuple[str, str]) -> None:
+    assert tables.with_error(value, error) == words
+
+
+class Altered:
+    """A fit with some of its answers replaced."""
+
+    def __init__(self, fit: Fit, **answers: object):
+        self.__dict__.update(answers)
+        self._fit = fit
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._fit, name)
+
+
+def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
+    data, residuals = coat_fit.problem.data, standardised(coat_fit)
+    good = " ".join(explains(coat_fit, residual_structure(data, residuals)))
+    assert "what the stated noise predicts" in good
+    assert "too small" not in good
+    bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
+    words = " ".join(explains(bad, residual_structure(data, 3 * residuals)))
+    assert "too small by a factor of about 3 (3 for the size of the residuals)" in words
+    sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
+    assert fine
+    values = data.used().values
+    errors = np.sort(np.abs(coat_fit.predicted / values - 1.0).ravel())
+    half, most = map(float, re.findall(r"([\d.e-]+) %", sentences[0])[::2])
+    assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
+    assert not verdicts.in_short(bad, residual_structure(data, 3 * residuals))[1]
+
+
+def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
+    first, second = coat_fit.problem.names
+    together = Combination(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
+    undecided = Altered(coat_fit, unresolved=(together,), at_bound=(second,))
+    words = " ".join(verdicts.determines(undecided))
+    assert "1 of 2 principal directions of parameter space are constrained by the data to no better than 10 %" in words
+    assert f"At a bound: {second}" in words
+    (row,) = tables.unresolved_table(undecided).rows
+    assert row == ("1", "0.3", "weak", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
+    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
+    (line,) = (line for line in verdicts.outcome(undecided, structure) if line.startswith("The data"))
+    assert line == f"The data do not separate {first} and {second}."
+    several = Altered(coat_fit, unresolved=(together, together, together))
+    (line,) = (line for line in verdicts.outcome(several, structure) if line.startswith("The data"))
+    assert line.endswith("(and more).")  # still one line
+    short, fine = verdicts.in_short(undecided, structure)
+    assert f"The data do not separate {first} and {second}." in short
+    assert not fine
+    assert verdicts.identifiability(undecided)[first] == "weakly constrained: see direction 1"
+    assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
+    apart = Altered(coat_fit, correlation=np.eye(2))
+    assert verdicts.identifiability(apart)[first] == "yes"
+    unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
+    assert f"The data do not determine {first}." in verdicts.outcome(unseen, structure)
+    assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "unconstrained")
+    assert verdicts.identifiability(unseen)[first] == "unconstrained by the data: see direction 1"
+
+
+def test_a_small_share_in_a_loose_direction_does_not_make_a_parameter_loose(coat_fit: Fit) -> None:
+    """alpha 0.284 +- 0.017 was called loose for a weight of 0.028: it is known to 2 % of its range."""
+    first, second = coat_fit.problem.names
+    mostly = Combination(0.6, {first: 0.9996, second: 0.028}, {first: 0.01, second: 0.02})
+    apart = Altered(coat_fit, unresolved=(mostly,), correlation=np.eye(2))
+    assert verdicts.identifiability(apart) == {first: "weakly constrained: see direction 1", second: "yes"}
+    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
+    assert f"The data weakly constrain {first}." in verdicts.in_short(apart, structure)[0]
+    # of two directions, the one that a parameter owes more of its variance
+    other = Combination(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
+    both = Altered(coat_fit, unresolved=(mostly, other), correlation=np.eye(2))
+    words = verdicts.identifiability(both)
+    assert words == {first: "weakly constrained: see direction 1", second: "weakly constrained: see direction 2"}
+    # a box and a half across, of which a parameter has a third
+    wide = Combination(1.5, {first: 0.94, second: 0.34}, {first: 0.01, second: 0.02})
+    words = verdicts.identifiability(Altered(coat_fit, unresolved=(wide,), correlation=np.eye(2)))
+    assert words[first].startswith("unconstrained by the data")
+    assert words[second].startswith("weakly constrained")
+
+
+def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
+    strange = Source("<coat> & paint.csv", "csv", "brdf_cos", ("a note",), "Somebody's laboratory")
+    named = replace(coat_fit, problem=replace(coat_fit.problem, data=replace(coat_fit.problem.data, source=strange)))
+    report(named, path=tmp_path / "report.html", others={"the other": coat_fit})
+    text = (tmp_path / "report.html").read_text()
+    for word in ("&lt;coat&gt; &amp; paint.csv", "brdf_cos", "a note", "Somebody&#x27;s laboratory", "10 masked"):
+        assert word in text, word
+    for word in (
+        "layers[0].thickness",
+        "base.albedo",
+        "optical depth",
+        "Chi-square per degree of freedom",
+        "condition number",
+    ):
+        assert word in text, word
+    for word in ("Not sampled", "Comparison", "the other", "starts", "kind = &quot;Lambertian&quot;", "jax "):
+        assert word in text, word
+    assert "<coat>" not in text
+    pictured = re.findall(r'src="([^"]{30})', text)
+    assert len(pictured) == 6  # stack, curves, maps, residuals, correlation, comparison
+    assert all(start.startswith("data:image/png;base64,") for start in pictured)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_the_report_replaces_an_earlier_one_only_by_force(coat_fit: Fit, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    path.write_text("mine")
+    with pytest.raises(ValueError, match="exists"):
+        report(coat_fit, path=path, force=False)
+    assert path.read_text() == "mine"
+
+
+def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
+    values = np.repeat(coat_data.values, 3, axis=1)
+    data = replace(coat_data, values=values, sigma=None, channels=("red", "green", "blue"))
+    stack = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(Free(0.5, 0.0, 1.0)))
+    grey = fit(stack, data, transport=lj.SingleScattering(), noise=Noise(relative=0.03), starts=1)
+    figure = model_pictures.curves_picture({"grey": grey})
+    assert isinstance(figure, Figure)
+    curves = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 100]
+    assert len(curves) == 3
+
+
+def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
+    figure = model_pictures.curves_picture({"model": coat_fit})
+    assert isinstance(figure, Figure)
+    assert len(figure.axes) == 4  # two incidences, each with its residuals
+    upper, lower = figure.axes[:2]
+    assert upper.get_title(loc="left") == "θᵢ = 10°"
+    assert "1/sr" in upper.get_ylabel()
+    assert "degrees" in figure.get_supxlabel()
+    line = next(line for line in upper.lines if line.get_label() == "model")
+    data, used = coat_fit.problem.data, coat_fit.problem.data.mask
+    rows = np.flatnonzero(used & in_plane(data) & (data.theta_i == 10))
+    expected = np.full(len(used), np.nan)
+    expected[used] = coat_fit.predicted[:, 0]
+    drawn = np.interp(signed_angle(data)[rows], *line.get_data())
+    # the angles of the data are points of the curve
+    np.testing.assert_allclose(drawn, expected[rows], rtol=1e-6)
+    shown = np.concatenate([np.asarray(line.get_ydata()) for line in lower.lines if len(line.get_xdata()) > 2])
+    assert np.nanmax(np.abs(shown)) <= np.abs(coat_fit.residuals).max() + 1e-12
+
+
+def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
+    assert isinstance(model_pictures.maps_picture(coat_fit), Figure)
+    data = coat_fit.problem.data
+    flat = replace(coat_fit, problem=replace(coat_fit.problem, data=data.where(in_plane(data))))
+    assert len(pictures.data_picture(data).axes) == 4  # curves, two maps and their colour bar
+    kept = in_plane(data)
+    only = replace(data, wi=data.wi[kept], wo=data.wo[kept], values=data.values[kept], sigma=None, mask=data.mask[kept])
+    assert model_pictures.maps_picture(replace(flat, problem=replace(coat_fit.problem, data=only))) is None
+    assert len(pictures.data_picture(only).axes) == 1
+
+
+@pytest.mark.parametrize("azimuth", [60.0, (0.0, 90.0), tuple(range(0, 180, 10))])
+def test_data_out_of_plane_is_drawn_however_it_lies(azimuth: float | tuple[float, ...]) -> None:
+    geometry = slices(incidence=(0, 40), azimuth=azimuth)
+    count = len(geometry)
+    data = Measurements(geometry.wi, geometry.wo, np.zeros((count, 1)), None, np.ones(count, bool), ("value",))
+    assert pictures.as_png(pictures.data_picture(data)).startswith(b"\x89PNG")
+
+
+def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
+    assert pictures.is_logarithmic(np.array([0.0, 0.01, 0.2]))
+    assert not pictures.is_logarithmic(np.array([0.0, 0.1, 0.2]))
+    assert not pictures.is_logarithmic(np.array([0.0]))
+
+
+def test_the_stack_is_drawn_with_its_numbers(coat_fit: Fit) -> None:
+    figure = parameter_pictures.stack_picture(coat_fit.stack)
+    words = " ".join(text.get_text() for text in figure.axes[0].texts)
+    assert f"{coat_fit.values['base.albedo']:.4g}" in words
+    assert "HenyeyGreenstein: g 0" in words

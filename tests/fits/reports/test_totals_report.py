@@ -1,0 +1,141 @@
+"""Fits of totals in result directories, reports and on the command line."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+from fits.cli.parser import main
+from fits.data.formats import totals_csv
+from fits.reports.data_tables import data_table, source_table
+from fits.reports.plots.totals import totals_picture
+from tests.helpers.commands import refused
+
+SPHERES = fits.Spheres(fits.Sphere(100.0, 20.0, 5.0, 8.0, 0.95), fits.Sphere(90.0, 20.0, wall=0.97), 0.98, True)
+STACK = """\
+transport = "SingleScattering"
+[[layers]]
+kind = "Medium"
+thickness = { start = 0.5, low = 0.01, high = 5.0 }
+albedo = 0.0
+[base]
+kind = "Lambertian"
+albedo = { start = 0.5, low = 0.0, high = 1.0 }
+"""
+CSV = """\
+theta_i,total_reflectance,total_reflectance_sigma
+0,0.30,0.003
+60,0.21,0.003
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "slab.toml").write_text(STACK)
+    (tmp_path / "totals.csv").write_text(CSV)
+    return tmp_path
+
+
+def test_totals_come_back_from_a_file(tmp_path: Path) -> None:
+    given = fits.Totals.of(
+        [0.0, 60.0], reflectance=[[0.1, 0.2], [0.3, 0.4]], unscattered=[[0.5, 0.6], [0.7, 0.8]], channels=("a", "b nm")
+    )
+    totals_csv.write(given, tmp_path / "t.csv")
+    read = fits.read(tmp_path / "t.csv")
+    assert (read.kinds, read.channels) == (given.kinds, given.channels)
+    for name in ("wi", "wo", "values", "sigma"):
+        np.testing.assert_allclose(getattr(read, name), getattr(given, name), atol=1e-15)
+    with pytest.raises(ValueError, match="exists"):
+        totals_csv.write(given, tmp_path / "t.csv")
+    with pytest.raises(ValueError, match="rows that are not used"):
+        totals_csv.write(given.where(np.array([True, True, True, False])), tmp_path / "masked.csv")
+    with pytest.raises(ValueError, match="'a_std' of a channel would not come back"):
+        totals_csv.write(fits.Totals.of(reflectance=0.1, channels=("a_std",)), tmp_path / "named.csv")
+
+
+def test_a_fit_by_spheres_is_kept_and_reported(tmp_path: Path) -> None:
+    totals = fits.Totals.of(reflectance=[[0.2, 0.3, 0.25]], transmittance=[[0.4, 0.4, 0.41]], spheres=SPHERES)
+    free = lj.Stack([lj.Medium(fits.Free((0.7,) * 3, 0.01, 5.0), fits.Free(0.5, 0.0, 1.0))])
+    fit = fits.fit(free, totals, transport=lj.SingleScattering(), starts=1)
+    fits.save_fit(fit, tmp_path / "kept")
+    loaded = fits.load_fit(tmp_path / "kept")
+    assert loaded.problem.data.spheres == SPHERES
+    np.testing.assert_allclose(loaded.predicted, fit.predicted, rtol=1e-12)
+    fits.report(loaded, path=tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text()
+    assert "as two integrating spheres read them" in page
+    assert "Shares of the light, with one sigma" in page
+    assert "In the plane of incidence" not in page
+
+
+def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    monkeypatch.chdir(folder)
+    assert main(["info", "totals.csv"]) == 0
+    assert "totals, shares of the light" in capsys.readouterr().out
+    assert (folder / "totals.png").is_file()
+    assert main(["fit", "totals.csv", "--stack", "slab.toml", "--out", "result", "--starts", "1"]) == 0
+    assert "layers[0].thickness" in capsys.readouterr().out
+    assert (folder / "result" / "report.html").is_file()
+    assert main(["convert", "totals.csv", "copy.csv"]) == 0
+    np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
+    capsys.readouterr()
+    for words, message in (
+        (
+            ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r", "--only", "incidence=0"],
+            "--only chooses nothing",
+        ),
+        (["fit", "totals.csv", "--stack", "slab.toml", "--out", "r", "--mask-grazing", "50"], "--mask-grazing chooses"),
+        (["info", "totals.csv", "--quantity", "brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
+        (["search", "totals.csv", "--out", "r"], "a search takes values along directions"),
+    ):
+        assert message in refused(words, capsys, folder)
+
+
+def test_readings_of_spheres_are_not_converted_to_what_tells_of_none(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+) -> None:
+    monkeypatch.chdir(folder)
+    sphere = "200 25 12 1 0.96"
+    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
+    assert "slab.rxt: integrating spheres" in refused(["convert", "slab.rxt", "slab.csv"], capsys, folder)
+
+
+def test_many_channels_have_a_range(tmp_path: Path) -> None:
+    names = tuple(f"{nm} nm" for nm in range(400, 700, 10))
+    totals = fits.Totals.of(reflectance=np.linspace(0.1, 0.5, 30)[None], channels=names)
+    assert data_table(totals).rows == (("reflectance", "0°", "0.1", "0.5"),)
+    assert dict(source_table(totals).rows)["values came as"] == "totals, shares of the light"
+    panel = totals_picture(totals).axes[0]
+    assert len(panel.get_xticks()) == 10
+    assert panel.get_xticklabels()[0].get_text() == "400 nm"
+
+
+def test_an_angle_has_one_colour_in_all_panels_and_is_in_the_legend() -> None:
+    """Reflectance at 8 and 60 degrees, transmittance at 60 and 0."""
+    every = fits.Totals.of([8.0, 60.0, 0.0], reflectance=np.full((3, 2), 0.4), transmittance=np.full((3, 2), 0.3))
+    kept = [0, 1, 4, 5]
+    arrays = {name: getattr(every, name)[kept] for name in ("wi", "wo", "values", "sigma", "mask")}
+    some = replace(every, **arrays, kinds=tuple(every.kinds[row] for row in kept))
+    picture = totals_picture(some, SimpleNamespace(predicted=some.values))
+    words = {text.get_text() for text in picture.legends[0].get_texts()}
+    assert words == {f"{what} at {angle}°" for what in ("read", "fit") for angle in (0, 8, 60)}
+    colours: dict[str, set[str]] = {}
+    for axes in picture.axes:
+        for line, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            if label.startswith("fit"):
+                colours.setdefault(label, set()).add(line.get_color())
+    assert all(len(one) == 1 for one in colours.values())
+    assert len(set.union(*colours.values())) == 3
+
+
+def test_a_stack_of_one_channel_beside_data_of_three(tmp_path: Path) -> None:
+    geometry = fits.slices((10.0, 40.0), np.arange(-60.0, 61.0, 20.0))
+    values = np.full((len(geometry), 3), 0.1) * (1.0 + 0.01 * np.random.default_rng(0).standard_normal((1, 3)))
+    data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(geometry), bool), ("r", "g", "b"))
+    fit = fits.fit(lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0))), data, starts=1)
+    assert fit.predicted.shape == values.shape
+    fits.report(fit, path=tmp_path / "report.html")

@@ -1,0 +1,190 @@
+"""Posteriors with two modes, whose moments, shares and evidence are known by sums over a grid."""
+
+import math
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import fits
+import layerjax as lj
+from fits.optimise.fit import fit
+from fits.optimise.result import Fit
+from fits.prediction.importance import weighted
+from fits.problem.parameters import Free, Normal
+from fits.reports import verdicts
+from fits.reports.diagnostics import residual_structure, standardised
+from fits.reports.tables import parameter_table, posterior_table
+from fits.sampling.chain import MemoryChain
+from fits.sampling.convergence import autocorrelation_times, long_enough, r_hat
+from fits.sampling.mixture import Mixture
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import Sampler, load, sample
+from tests.helpers.models import COUNT, design, measured
+
+SIGMA, HIGH = 0.01, 3.0
+COSINE = design(COUNT)[:, 1:]
+EXACT = np.exp(-0.3 / COSINE) + np.exp(-1.5 / COSINE)
+DATA = measured(EXACT + SIGMA * np.random.default_rng(0).standard_normal(EXACT.shape), SIGMA)
+NARROW = 0.8
+"""Of a normal prior on the first of two numbers, which makes one mode likelier."""
+
+
+def pair(stack, wi, wo):
+    """The same whichever of its two numbers is which."""
+    return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
+
+
+@pytest.fixture(scope="module", params=["alike", "with a prior"])
+def fitted(request: pytest.FixtureRequest) -> Fit:
+    prior = {} if request.param == "alike" else {"prior": Normal(0.3, NARROW)}
+    stack = {"p": Free(0.5, 0.0, HIGH, **prior), "q": Free(0.6, 0.0, HIGH)}
+    return fit(stack, DATA, transport=pair, starts=8)
+
+
+@pytest.fixture(scope="module")
+def summed(fitted: Fit) -> tuple[float, float, float, float]:
+    """By a fine grid: mean and deviation of p, the share of the mode where it is the larger, and the log-evidence."""
+    x = np.linspace(0.0, HIGH, 3001)
+    near = [x[np.abs(x - centre) < 0.1] for centre in (0.3, 1.5)]
+    parts = []
+    for p, q in (near, near[::-1]):
+        f = np.exp(-p[:, None] / COSINE[:, 0])[:, None] + np.exp(-q[:, None] / COSINE[:, 0])[None]
+        height = np.sum(stats.norm.logpdf(DATA.values[:, 0], f, SIGMA), axis=-1) - 2.0 * math.log(HIGH)
+        if isinstance(fitted.problem.stack["p"].prior, Normal):
+            whole = stats.norm(0.3, NARROW)
+            height += (math.log(HIGH) + whole.logpdf(p) - math.log(whole.cdf(HIGH) - whole.cdf(0.0)))[:, None]
+        parts.append((p, height))
+    assert all(
+        height.max() - np.concatenate([height[[0, -1]].ravel(), height[:, [0, -1]].ravel()]).max() > 12.0
+        for _, height in parts
+    )
+    top = max(height.max() for _, height in parts)
+    weights = [np.exp(height - top).sum(axis=1) for _, height in parts]
+    total = sum(weight.sum() for weight in weights)
+    mean = sum(float(weight @ p) for (p, _), weight in zip(parts, weights, strict=True)) / total
+    square = sum(float(weight @ p**2) for (p, _), weight in zip(parts, weights, strict=True)) / total
+    step = x[1] - x[0]
+    return mean, math.sqrt(square - mean**2), float(weights[1].sum() / total), top + math.log(total * step**2)
+
+
+Sums = tuple[float, float, float, float]
+
+
+def test_the_evidence_is_that_of_all_modes(fitted: Fit, summed: Sums) -> None:
+    *_, log_evidence = summed
+    found = fits.evidence(fitted)
+    assert found.reliable
+    assert found.log == pytest.approx(log_evidence, abs=4.0 * found.error)
+    assert found.error < 0.05  # one mode alone of two alike is 0.69 off
+
+
+def test_draws_by_weight_are_of_all_modes(fitted: Fit, summed: Sums) -> None:
+    """Those that predictions are made with."""
+    *_, share, _ = summed
+    draws = weighted(fitted, 1000, np.random.RandomState(0)).resampled(np.random.RandomState(1), 1000)
+    mixture = Mixture.of(fitted)
+    assert mixture is not None
+    larger = mixture.centre[mixture.mode_of(draws), 0] > 0.3
+    assert np.mean(larger) == pytest.approx(share, abs=4.0 * math.sqrt(share * (1.0 - share) / 500.0))
+
+
+@pytest.mark.parametrize("sampler", ["emcee", "nuts"])
+def test_chains_visit_all_modes_as_often_as_they_are_likely(
+    fitted: Fit, summed: Sums, sampler: Sampler, tmp_path: Path
+) -> None:
+    if sampler == "nuts":
+        pytest.importorskip("blackjax")
+    mean, deviation, share, _ = summed
+    posterior = sample(fitted, sampler=sampler, seed=1, path=tmp_path / "chain.h5")
+    assert posterior.converged
+    _, _, _, average, spread = posterior.summary()["['p']"]
+    error = 4.0 / math.sqrt(posterior.effective_samples.min())
+    assert average == pytest.approx(mean, abs=error * deviation)
+    # a single mode has a deviation a hundred times smaller
+    assert spread == pytest.approx(deviation, rel=error)
+    assert np.max(posterior.r_hat) < 1.02
+    shares = {round(mode.values["['p']"], 1): mode.share for mode in posterior.modes}
+    assert shares == {1.5: pytest.approx(share, abs=error), 0.3: pytest.approx(1.0 - share, abs=error)}
+    assert all(0.0 < mode.error < 0.5 * error for mode in posterior.modes)
+    assert any("The posterior has 2 modes" in line for line in verdicts.sampled(posterior))
+    assert "2 modes" in posterior_table(posterior).note
+    assert "2 modes" in repr(posterior)
+    assert load(fitted, tmp_path / "chain.h5").modes == posterior.modes
+
+
+def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
+    assert len(fitted.alternatives) == 1
+    lines, sure = verdicts.in_short(fitted, residual_structure(fitted.problem.data, standardised(fitted)))
+    words = "standard errors are those of the best one alone"
+    assert not sure
+    assert any(words in line for line in lines)
+    assert any(words in line for line in verdicts.minima(fitted))
+    assert parameter_table(fitted).note == "Errors are those of the best minimum alone."
+    assert "the errors are of this minimum alone" in fitted.status
+
+
+def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
+    stack = {"p": Free(0.5, 0.0, HIGH, Normal(0.3, 0.25)), "q": Free(0.6, 0.0, HIGH)}
+    found = fit(stack, DATA, transport=pair, starts=8)  # the other is 11 lower in the log-posterior
+    assert len(found.minima) >= 2
+    assert Mixture.of(found) is None
+
+
+def test_walkers_that_stay_where_they_are_have_not_converged() -> None:
+    """Two modes, a walker in each or changing at every step: autocorrelation within walkers tells them apart not."""
+    generator = np.random.default_rng(0)
+    chains = {}
+    for stays in (True, False):
+        chain = MemoryChain(8, 1)
+        which = np.arange(8) % 2 if stays else generator.integers(0, 2, (1000, 8))
+        chain.chain = (which + 0.01 * generator.standard_normal((1000, 8)))[..., None]
+        chain.log_prob, chain.accepted, chain.iteration = np.zeros((1000, 8)), np.full(8, 1000), 1000
+        chains[stays] = chain
+    for chain in chains.values():
+        assert autocorrelation_times(chain, 1000) < 2.0
+    assert r_hat(chains[True].chain) > 1.5
+    assert r_hat(chains[False].chain) < 1.01
+    assert not long_enough(chains[True])
+    assert long_enough(chains[False])
+
+
+def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
+    generator = np.random.default_rng(1)
+    at = np.array([[0.3, 1.5], [1.5, 0.3]])[np.arange(8) % 2]
+    values = at + 0.003 * generator.standard_normal((200, 8, 2))
+    modes = tuple(fits.Mode(0.5, 0.18, dict(zip(fitted.problem.names, one, strict=True))) for one in at[:2])
+    posterior = Posterior(fitted, values, np.zeros((200, 8)), np.ones(2), 0.5, False, modes=modes)
+    lines = verdicts.sampled(posterior)
+    assert any("R-hat is above 1.01: walkers differ in how long they stay at each mode" in line for line in lines)
+    assert any("R-hat above 1.05" in line for line in lines)
+    with pytest.raises(ValueError, match=r"with R-hat below 1.05 \(it is [1-9]"):
+        posterior.summary()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampler", ["emcee", "nuts"])
+def test_two_metals_that_share_a_surface(sampler: Sampler) -> None:
+    """Whichever is called which: both have one mean, half of their sum, and a deviation of half their difference."""
+    if sampler == "nuts":
+        pytest.importorskip("blackjax")
+
+    def metal(alpha) -> lj.Stack:
+        return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
+
+    single, geometry = lj.SingleScattering(), fits.slices([20.0, 50.0], np.arange(-70.0, 71.0, 5.0))
+    data = fits.simulate(
+        lj.Mixture({"a": metal(0.12), "b": metal(0.4)}, [0.5, 0.5]), geometry, single, 0.03, 1e-4, seed=1
+    )
+    stack = lj.Mixture({name: metal(Free(start, 0.02, 1.0)) for name, start in (("a", 0.2), ("b", 0.3))}, [0.5, 0.5])
+    found = fits.fit(stack, data, transport=single, noise=fits.Noise(0.03, 1e-4, correlated=False), starts=8)
+    posterior = sample(found, sampler=sampler, seed=1)
+    assert posterior.converged
+    first, second = found.vector
+    error = 4.0 / math.sqrt(posterior.effective_samples.min())
+    for *_, mean, deviation in posterior.summary().values():
+        assert mean == pytest.approx(0.5 * (first + second), abs=error * 0.14)
+        assert deviation == pytest.approx(0.5 * abs(first - second), rel=error)
+    assert [mode.share for mode in posterior.modes] == [pytest.approx(0.5, abs=error)] * 2

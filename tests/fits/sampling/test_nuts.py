@@ -1,0 +1,132 @@
+"""The No-U-Turn sampler: the same posterior as emcee's, from a few chains that follow the gradient."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fits.cli.parser import main
+from fits.optimise.result import Fit
+from fits.reports.results import load_posterior, save_fit
+from fits.sampling.posterior import Posterior
+from fits.sampling.sample import load, sample
+from tests.helpers.files import largest_file
+
+pytest.importorskip("blackjax")
+
+NUTS = {"sampler": "nuts", "seed": 1}
+SHORT = {**NUTS, "max_steps": 120}
+
+
+@pytest.fixture(scope="module")
+def short(result: Fit) -> Posterior:
+    return sample(result, **SHORT)
+
+
+def test_its_result_is_that_of_any_sampler(short: Posterior) -> None:
+    assert short.chain.shape == (120, 4, 2)
+    assert short.divergences == 0
+    assert short.status == "NUTS, 0 divergent steps of 480"
+    assert 0.5 < short.acceptance <= 1.0
+
+
+def test_divergent_steps_are_counted_and_told(result: Fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the walkers diverge at every step, as the chain's records have it."""
+    from fits.sampling.nuts import Nuts
+
+    step = Nuts._step
+
+    def diverging(self, positions, *rest):
+        ends, heights, divergent, acceptance = step(self, positions, *rest)
+        return ends, heights, divergent | (np.arange(len(ends)) < 2), acceptance
+
+    monkeypatch.setattr(Nuts, "_step", diverging)
+    sample(result, **SHORT, path=tmp_path / "chain.h5")
+    posterior = load(result, tmp_path / "chain.h5")
+    assert posterior.divergences == 240
+    assert "240 divergent steps of 480, near which it may have missed" in posterior.status
+
+
+class Stop(Exception):
+    pass
+
+
+@pytest.mark.parametrize("stage", ["warm-up", "sample"])
+def test_it_goes_on_from_its_file_to_the_same_end(result: Fit, short: Posterior, tmp_path: Path, stage: str) -> None:
+    path = tmp_path / "chain.h5"
+
+    def stop(at: str, *_: object) -> None:
+        if at == stage:
+            raise Stop
+
+    with pytest.raises(Stop):
+        sample(result, **SHORT, path=path, progress=stop)
+    np.testing.assert_array_equal(sample(result, **SHORT, path=path).chain, short.chain)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["chain.h5"]
+    assert load(result, path).status == short.status
+
+
+def test_a_torn_journal_costs_one_step(result: Fit, short: Posterior, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    with largest_file(100_000), pytest.raises(OSError, match="too large"):
+        sample(result, **SHORT, path=path)
+    kept = load(result, path, allow_short=True)
+    assert 10 < len(kept.chain) < 100
+    np.testing.assert_array_equal(kept.chain, short.chain[: len(kept.chain)])
+    np.testing.assert_array_equal(sample(result, **SHORT, path=path).chain, short.chain)
+
+
+def test_a_chain_of_another_sampler_is_refused(result: Fit, tmp_path: Path) -> None:
+    path = tmp_path / "chain.h5"
+    sample(result, **SHORT, path=path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=r"another problem or setting \(sampler differs\)"):
+        sample(result, walkers=4 + 2, seed=1, path=path)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sampler": "gibbs"}, "sampler is 'gibbs'; it must be one of emcee, nuts"),
+        ({"sampler": "nuts", "walkers": 1}, "walkers is 1; it must be at least 2"),
+        ({"sampler": "nuts", "surrogate": True}, 'goes with sampler="emcee"'),
+    ],
+)
+def test_refused(result: Fit, options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        sample(result, **options)
+
+
+def test_without_its_extra_it_says_how_to_get_it(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    with pytest.raises(ValueError, match=r'^sampler="nuts" needs blackjax: pip install "layerjax\[nuts\]"$'):
+        sample(result, sampler="nuts")
+
+
+def test_the_command_says_so_before_it_fits(
+    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--sample", "--sampler", "nuts"]
+    assert main(words) == 2
+    assert 'pip install "layerjax[nuts]"' in capsys.readouterr().err
+    assert not (work / "result").exists()
+
+
+def test_the_command_samples_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_fit(coat_fit, "result")
+    assert main(["sample", "result", "--sampler", "nuts", "--max-steps", "100", "--allow-short"]) == 1
+    shown = capsys.readouterr()
+    assert "The sampler: NUTS, 0 divergent steps of 400" in shown.out
+    assert "layerjax: warm-up 150/150" in shown.err
+    assert main(["sample", "result", "--max-steps", "200", "--allow-short"]) == 1  # the chain's own sampler
+    posterior = load_posterior("result")
+    assert posterior is not None
+    assert posterior.chain.shape[:2] == (200, 4)
+    assert main(["sample", "result", "--sampler", "emcee"]) == 2
+    assert "--sampler is emcee, the chain in result/chain.h5 has nuts" in capsys.readouterr().err
