@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
-    from fits.maps.smoothing import Smoothness as Smoothness
+    from fits.maps.options import MapOptions as MapOptions
+    from fits.maps.options import SpatialPrior as SpatialPrior
     from fits.optimise.fit import fit as fit
     from fits.optimise.identifiability import Combination as Combination
     from fits.optimise.result import Fit as Fit
@@ -83,7 +84,8 @@ _HOMES = {
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
-    "Smoothness": "maps.smoothing",
+    "MapOptions": "maps.options",
+    "SpatialPrior": "maps.options",
     "Foresight": "prediction.model_scores",
     "read": "data.formats",
     "write_csv": "data.formats.csv",

@@ -28,7 +28,7 @@ INNER = (1.0, 99.0)  # percentiles between which colours and axes run
 LOW_END = 0.25  # of their span
 WIDTH = 4.8  # inches
 RATIO = "χ² / degree of freedom"
-ABSENT, OPEN = "#d4d4d4", "#ffffff"
+ABSENT, NO_NUMBER = "#d4d4d4", "#ffffff"
 
 
 class Scale(NamedTuple):
@@ -55,11 +55,11 @@ class State(NamedTuple):
 STATES = (
     State("not there yet", "#ffffff", lacking=sum(FLAGS.values())),
     State("masked", ABSENT, FLAGS["masked"]),
-    State("too few readings", GREY, FLAGS["too_few_readings"]),
+    State("too few measurements", GREY, FLAGS["too_few_measurements"]),
     State("failed", "#000000", FLAGS["failed"]),
     State("not converged", "#D55E00", FLAGS["fitted"], FLAGS["converged"]),
     State("poor", "#E69F00", FLAGS["poor"]),
-    State("not resolved", "#CC79A7", FLAGS["unresolved"]),
+    State("unidentified", "#CC79A7", FLAGS["unidentified"]),
     State("at a bound", "#56B4E9", FLAGS["at_bound"]),
     State("fine, started again", "#009E73", FLAGS["restarted"]),
     State("fine", "#cfe8dc"),
@@ -154,7 +154,7 @@ def _picture(
             _line(axes, values, fitted, shown, scale, label)
             return figure
         missing = fitted & ~np.isfinite(values)
-        ground = mpl.colors.ListedColormap([ABSENT, OPEN])
+        ground = mpl.colors.ListedColormap([ABSENT, NO_NUMBER])
         placed = _placed(values.shape, shown.steps)
         axes.imshow(missing, cmap=ground, vmin=0, vmax=1, interpolation="nearest", **placed)
         image = axes.imshow(values, cmap=colours, norm=scale.norm, **placed)
@@ -166,7 +166,7 @@ def _picture(
         if scale.logarithmic:
             _plain_ticks(bar.ax.yaxis, scale)
         absent = [] if fitted.all() else [(ABSENT, "not fitted")]
-        _legend(figure, [*absent, *([(OPEN, "none: at a bound, or open")] if missing.any() else [])])
+        _legend(figure, [*absent, *([(NO_NUMBER, "none: at a bound, or unidentified")] if missing.any() else [])])
     return figure
 
 
@@ -234,7 +234,7 @@ def states_of(flags: np.ndarray) -> np.ndarray:
 
 
 def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
-    """What became of every texel, the gravest of what is said of it; with counts over the whole map."""
+    """The gravest flag of every texel, with counts over the whole map."""
     states = states_of(flags)
     counts = np.bincount(states.ravel(), minlength=len(STATES))
     drawn = shown.of(states)
@@ -246,7 +246,7 @@ def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
         axes = figure.subplots()
         placed = _placed(image.shape, shown.steps if drawn.ndim == 2 else (1, *shown.steps))
         axes.imshow(image, cmap=colours, vmin=-0.5, vmax=len(STATES) - 0.5, interpolation="nearest", **placed)
-        axes.set_title("what became of the texels")
+        axes.set_title("flags of the texels")
         _index_axes(axes)
         if drawn.ndim == 1:
             axes.set(xlabel="texel", ylabel="", yticks=[])

@@ -32,7 +32,7 @@ def test_an_image_is_the_map_with_row_0_on_top() -> None:
     np.testing.assert_array_equal(np.where(np.isfinite(shown), shown, np.nan), expected)
     assert figure.axes[0].get_ylim() == (2.5, -0.5)
     assert figure.axes[1].get_ylabel() == "mm"
-    assert words(figure) == ["not fitted", "none: at a bound, or open"]
+    assert words(figure) == ["not fitted", "none: at a bound, or unidentified"]
     ground = figure.axes[0].images[0].get_array()
     assert ground is not None
     assert ground[2, 2] == 1
@@ -111,11 +111,11 @@ def test_a_texel_is_shown_as_the_gravest_of_its_flags() -> None:
     cases = {
         "not there yet": 0,
         "masked": FLAGS["masked"],
-        "too few readings": FLAGS["too_few_readings"],
+        "too few measurements": FLAGS["too_few_measurements"],
         "failed": FLAGS["failed"] | FLAGS["restarted"],
         "not converged": FLAGS["fitted"] | FLAGS["poor"],
         "poor": GOOD | FLAGS["poor"] | FLAGS["at_bound"],
-        "not resolved": GOOD | FLAGS["unresolved"] | FLAGS["at_bound"],
+        "unidentified": GOOD | FLAGS["unidentified"] | FLAGS["at_bound"],
         "at a bound": GOOD | FLAGS["at_bound"] | FLAGS["restarted"],
         "fine, started again": GOOD | FLAGS["restarted"],
         "fine": GOOD,
