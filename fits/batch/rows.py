@@ -85,7 +85,7 @@ class Row:
 
 def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure: str, seconds: float) -> Row:
     """The row of a fit."""
-    fit, alone = fitted.fit, fitted.fit.alone
+    fit, alone = fitted.fit, fitted.fit.without_discrepancy
     seen = None if fitted.foretold is None else fitted.foretold.prediction.scores
     return Row(
         file=file,
@@ -100,7 +100,7 @@ def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure
         reduced_chi_square=fit.reduced_chi_square,
         alone=math.nan if alone is None else alone.chi_square / max(alone.degrees_of_freedom, 1),
         aic=2.0 * len(fit.vector) - 2.0 * fit.log_likelihood,
-        score=math.nan if seen is None else seen.log_score,
+        score=math.nan if seen is None else seen.elpd,
         scored=0 if seen is None else seen.count,
         seconds=round(seconds, 2),
         parameters=tuple(

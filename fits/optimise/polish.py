@@ -51,7 +51,7 @@ def optimum(
     if solver == "least_squares" and lowest.converged and promise < ROUGHLY and problem.objective == "likelihood":
         lowest = _followed(problem, lowest, promise)
     found = uncertainty(problem, lowest.vector, lowest.cost)
-    if solver == "least_squares" and check and found.without_influence:
+    if solver == "least_squares" and check and found.insensitive:
         lowest, lower = _off_the_plateau(problem, lowest, found, promise)
         found = uncertainty(problem, lowest.vector, lowest.cost) if lower else found
     if solver == "least_squares" and ((check and found.at_bound.any()) or not lowest.converged):
@@ -75,7 +75,7 @@ def _off_the_plateau(problem: Posed, end: End, found: Uncertainty, promise: floa
 
     No step leads off a plateau: every start may end on one though another minimum is far lower.
     """
-    stuck = np.isin(problem.names, found.without_influence) | found.at_bound
+    stuck = np.isin(problem.names, found.insensitive) | found.at_bound
     point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, end.vector))
     other = least_squares_end(problem, point, promise=promise)
     lower = other.cost < end.cost - (ROUGHLY if problem.objective == "likelihood" else WORTH_OF_COST * end.cost)

@@ -24,7 +24,7 @@ from fits.data.totals import Totals
 from fits.names import Objective
 from fits.problem.base import Assembled, Posed
 from fits.problem.compilation import Static, run
-from fits.problem.discrepancy.parameters import Correlated, numbers_of
+from fits.problem.discrepancy.parameters import Discrepancy, numbers_of
 from fits.problem.discrepancy.process import Process, make_process
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
@@ -61,7 +61,8 @@ class Problem(Posed):
 
     Raises:
         ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
-            cannot carry the stack, or a named objective stands beside free noise levels, priors or `Free.smooth`.
+            cannot carry the stack, or a named objective stands beside free noise levels, priors or
+            `Free.random_walk_sd`.
     """
 
     stack: Any
@@ -144,14 +145,14 @@ class Problem(Posed):
 
 UNITS = {
     "noise.floor": "1/sr",
-    "instrument.offset": "deg",
-    "noise.correlated.half": "deg",
-    "noise.correlated.difference": "deg",
+    "instrument.tilt": "deg",
+    "noise.discrepancy.length_half": "deg",
+    "noise.discrepancy.length_difference": "deg",
     **{"thickness": "optical depth", "thickness_mm": "mm", "mu_s": "1/mm", "mu_a": "1/mm"},
 }
 """Of parameters by their names, or by what these end with; all others are plain ratios."""
 
-PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.correlated")
+PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
 """How names begin of what stands in each place of `Parts`."""
 
 
@@ -165,7 +166,7 @@ def _assemble(problem: Problem) -> Assembled:
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
     levels = noise_levels(with_floor(problem.noise, problem.instrument), used)
-    process = make_process(used.wi, used.wo, used.values.shape[1]) if problem.noise.correlated else None
+    process = make_process(used.wi, used.wo, used.values.shape[1]) if problem.noise.discrepancy else None
     if process is not None:
         process = replace(process, gram=levels.gram(process, used.values))
     template, names, free = split(_numbers(problem, levels, process), _parameter_name)
@@ -206,8 +207,8 @@ def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple
     scale = 1.0 if problem.scale is None else problem.scale
     correlation = None
     if process is not None:
-        assert isinstance(problem.noise.correlated, Correlated)
-        correlation = numbers_of(problem.noise.correlated, process, problem.data.values.shape[1])
+        assert isinstance(problem.noise.discrepancy, Discrepancy)
+        correlation = numbers_of(problem.noise.discrepancy, process, problem.data.values.shape[1])
     instrument = None if problem.instrument is None else setting_of(problem.instrument, polar_angles(problem.data))
     rest = (scale, instrument, levels.relative, levels.floor, correlation)
     return (stack, *jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free))
@@ -244,7 +245,7 @@ def _require_noise(levels: Levels) -> None:
 
 def _refuse_angular_only(problem: Problem) -> None:
     """What is said of readings along directions, and means nothing of totals."""
-    for name, given in (("instrument", problem.instrument), ("noise.correlated", problem.noise.correlated)):
+    for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
         if given:
             raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
 
@@ -252,16 +253,16 @@ def _refuse_angular_only(problem: Problem) -> None:
 def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, ...]) -> None:
     objective = problem.objective
     fitted = [name for name in ("relative", "floor") if is_free(getattr(levels, name))]
-    if problem.noise.correlated:
-        raise ValueError(f"noise.correlated stands beside objective {objective!r}, which has no noise model")
+    if problem.noise.discrepancy:
+        raise ValueError(f"noise.discrepancy stands beside objective {objective!r}, which has no noise model")
     if fitted:
         raise ValueError(f"noise.{fitted[0]} is free, but objective {objective!r} has no noise model")
     weighted = [entry.prior for entry in free if isinstance(entry.prior, Normal | LogNormal)]
     if weighted:
         raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; leave it out")
-    smooth = [entry.smooth for entry in free if entry.smooth is not None]
+    smooth = [entry.random_walk_sd for entry in free if entry.random_walk_sd is not None]
     if smooth:
-        raise ValueError(f"Free.smooth is {shown(smooth[0])}, but has no weight beside objective {objective!r}")
+        raise ValueError(f"Free.random_walk_sd is {shown(smooth[0])}, but has no weight beside objective {objective!r}")
 
 
 def _model(

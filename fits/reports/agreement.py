@@ -57,7 +57,7 @@ def agreement(fit: "Fit") -> list[str]:
     if not (values > 0.0).any():
         return []
     half, most = map(apart, factors(fit, 0.5, 0.95))
-    which = "stack alone" if fit.problem.noise.correlated else "model"
+    which = "stack alone" if fit.problem.noise.discrepancy else "model"
     return [f"Half of the {values.size:,} readings are within {half} of the {which}, 95 % of them within {most}."]
 
 
@@ -90,30 +90,35 @@ def discrepancy(fit: "Fit") -> list[str]:
     )
     share = 1.0 - left / whole if whole > 0.0 else 0.0
     size = 100.0 * float(at.amplitude)
-    grazing = f" at normal incidence and {size * 2.0 ** float(at.growth):.2g} % at 60°" if at.growth > 0.0 else ""
+    grazing = (
+        f" at normal incidence and {size * 2.0 ** float(at.grazing_exponent):.2g} % at 60°"
+        if at.grazing_exponent > 0.0
+        else ""
+    )
     return [
         f"The model-discrepancy term (a Gaussian process) has a standard deviation of {size:.2g} % of the BRDF{grazing}"
-        f" and correlation lengths of {float(at.half):.2g}° (half angle) and {float(at.difference):.2g}° (difference "
-        f"angle). It absorbs {100.0 * share:.3g} % of the residual sum of squares. Parameter uncertainties and "
-        "prediction intervals include this term.",
+        f" and length scales of {float(at.length_half):.2g}° (half angle) and {float(at.length_difference):.2g}° "
+        f"(difference angle). It absorbs {100.0 * share:.3g} % of the residual sum of squares. Parameter uncertainties "
+        "and prediction intervals include this term.",
         *_added_automatically(fit),
     ]
 
 
 def _added_automatically(fit: "Fit") -> list[str]:
-    if fit.alone is None:
+    found = fit.without_discrepancy
+    if found is None:
         return []
     return [
         "It was added automatically because, with independent noise, neighbouring residuals correlate by "
-        f"{fit.alone.alike:+.2f} ({fit.alone.pairs} pairs; chi-square per degree of freedom "
-        f"{without_discrepancy(fit):.3g}). Set `correlated = false` to disable it."
+        f"{found.residual_autocorrelation:+.2f} ({found.pairs} pairs; chi-square per degree of freedom "
+        f"{without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
     ]
 
 
 def without_discrepancy(fit: "Fit") -> float:
     """Chi-square per degree of freedom with independent noise: as fitted so, else with these parameters."""
-    if fit.alone is not None:
-        square, freedom = fit.alone.chi_square, fit.alone.degrees_of_freedom
+    if fit.without_discrepancy is not None:
+        square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
     else:
         square = float(np.sum(np.square(fit.problem.call("offsets_at", fit.vector, fit.predicted))))
         freedom = fit.degrees_of_freedom
@@ -163,7 +168,7 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
             *_structure(structure),
         ]
     ratio, freedom = fit.reduced_chi_square, fit.degrees_of_freedom
-    correlated = bool(fit.problem.noise.correlated)
+    correlated = bool(fit.problem.noise.discrepancy)
     term = " with the discrepancy term" if correlated else ""
     sentences = [
         *misdescribed(fit),

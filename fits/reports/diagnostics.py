@@ -73,7 +73,7 @@ def standardised(fit: "Fit") -> np.ndarray:
 
 def residual_label(fit: "Fit") -> str:
     """What `standardised` residuals are, for an axis of a picture."""
-    return "whitened residual" if fit.problem.noise.correlated else misfit_label(fit)
+    return "whitened residual" if fit.problem.noise.discrepancy else misfit_label(fit)
 
 
 def bsdf(fit: "Fit") -> np.ndarray:
@@ -97,7 +97,7 @@ def misfit_label(fit: "Fit") -> str:
     """What a `misfit` is, for an axis of a picture."""
     if not fit.is_posterior:
         return f"residual of {fit.problem.objective} / its scatter"
-    which = "with discrepancy" if fit.problem.noise.correlated else "model"
+    which = "with discrepancy" if fit.problem.noise.discrepancy else "model"
     return rf"(data $-$ {which}) / $\sigma$"
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fits._files import locked, named, read_json, write_json
 from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import LeftOut
+from fits.prediction.cross_validation import CrossValidation
 from fits.prediction.evidence import Evidence
 from fits.reports.results import load_fit, save_fit
 from fits.reports.stored import stored_array, stored_number
@@ -95,7 +95,7 @@ class Kept:
         """Write the fit of a structure."""
         save_fit(fit, self._place(structure, closer))
 
-    def look(self, structure: Structure) -> tuple[LeftOut, Evidence] | None:
+    def look(self, structure: Structure) -> tuple[CrossValidation, Evidence] | None:
         """What a closer look found, if it is there. ValueError for a file that is damaged."""
         path = self._look(structure)
         if not path.is_file():
@@ -103,7 +103,7 @@ class Kept:
         content = read_json(path)
         try:
             groups = content["groups"]
-            left = LeftOut(
+            left = CrossValidation(
                 groups=tuple(groups),
                 rows=tuple(np.array(rows, np.int64) for rows in groups.values()),
                 log_density=stored_array(content["log_density"], *content["shape"]),
@@ -113,14 +113,14 @@ class Kept:
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: damaged: {error!r}") from None
 
-    def keep_look(self, structure: Structure, left: LeftOut, evidence: Evidence) -> None:
+    def keep_look(self, structure: Structure, left: CrossValidation, evidence: Evidence) -> None:
         """Write what a closer look found."""
         content = {
             "groups": dict(zip(left.groups, left.rows, strict=True)),
             "shape": left.log_density.shape,
             "log_density": left.log_density,
             "converged": left.converged,
-            "evidence": {"log": evidence.log, "error": evidence.error, "shape": evidence.shape},
+            "evidence": {"log": evidence.log_evidence, "error": evidence.error, "shape": evidence.pareto_k},
         }
         write_json(self._look(structure), content, force=True)
         self._groups(structure).unlink(missing_ok=True)

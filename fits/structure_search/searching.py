@@ -3,7 +3,7 @@ they foretell.
 
 Every structure of a level is fitted with noise alone, at a coarse resolution: that is cheap, and tells by the Bayesian
 information criterion which of them are worth a closer look. These few are fitted as `fits.fit` does, with errors that
-readings share where residuals say so, and ranked by what they foretell of incidences that are left out (`leave_out`).
+readings share where residuals say so, and ranked by what they foretell of held-out incidences (`cross_validate`).
 The next level has a layer more, or less, than the best of all. It ends where a level neither foretells more than
 chance would nor has a clearly lower criterion: with errors that readings share, a stack that lacks two layers may
 foretell as well as one that lacks one.
@@ -22,12 +22,12 @@ from typing import TypeVar
 import numpy as np
 
 from fits.data.measurements import Measurements
-from fits.optimise.discrepancy import alone, are_shared, left_open
+from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.fit import fit_again, fit_problem
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import LeftOut
+from fits.prediction.cross_validation import CrossValidation
 from fits.prediction.evidence import Evidence
-from fits.prediction.model_scores import Foresight, look_closely, together
+from fits.prediction.model_scores import ModelScore, out_of_sample, rank_models
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -59,13 +59,13 @@ Result = TypeVar("Result")
 @dataclass(frozen=True, eq=False)
 class Found:
     """A structure that was fitted. name: from top to bottom. bic: with noise alone, less that of the best. fit: closer,
-    if it was looked at, else with noise alone. foresight: None if it was not looked at closely."""
+    if it was looked at, else with noise alone. model_score: None if it was not looked at closely."""
 
     structure: Structure
     parameters: int
     bic: float
     fit: Fit
-    foresight: Foresight | None
+    model_score: ModelScore | None
 
     @property
     def name(self) -> str:
@@ -97,7 +97,7 @@ class Search:
     @property
     def probabilities(self) -> dict[str, float]:
         """By name, of the structures that were looked at closely: among these, all as probable beforehand."""
-        return {one.name: one.foresight.probability for one in self.found if one.foresight is not None}
+        return {one.name: one.model_score.model_probability for one in self.found if one.model_score is not None}
 
 
 def named(structure: Structure) -> str:
@@ -135,7 +135,7 @@ def search(
             finished. With the same `directory` another call goes on.
 
     Raises:
-        ValueError: layers or budget out of range; another search's directory; or as `fit` and `leave_out`.
+        ValueError: layers or budget out of range; another search's directory; or as `fit` and `cross_validate`.
     """
     require_kind("data", data, Measurements)
     require_kind("library", library, Library, None)
@@ -209,10 +209,10 @@ class _Fitting:
     def _fitted(self, structure: Structure, plain: Fit | None) -> Fit:
         stack = self.library.stack(structure)
         problem = Problem(stack, self.data, self.transport, self.noise, self.scale, instrument=self.instrument)
-        if plain is not None and left_open(problem) and are_shared(alone(plain)):
+        if plain is not None and undecided(problem) and needs_discrepancy(without_discrepancy(plain)):
             return fit_again(problem, plain, starts=self.starts, seed=self.seed)
-        if plain is None or left_open(problem):
-            problem = replace(problem, noise=replace(self.noise, correlated=False))
+        if plain is None or undecided(problem):
+            problem = replace(problem, noise=replace(self.noise, discrepancy=False))
         return fit_problem(problem, starts=self.starts, seed=self.seed, refine=plain is not None)
 
 
@@ -274,7 +274,7 @@ class _Looked:
         self.kept = kept
         self.plain: dict[Structure, Fit] = {}
         self.fits: dict[Structure, Fit] = {}
-        self.left: dict[Structure, LeftOut] = {}
+        self.left: dict[Structure, CrossValidation] = {}
         self.evidences: dict[Structure, Evidence] = {}
 
     def bic(self, structure: Structure) -> float:
@@ -289,30 +289,30 @@ class _Looked:
         found = self.fits[structure] = run(structure, self.plain[structure])
         stored = self.kept.look(structure) if self.kept is not None else None
         if stored is None:
-            stored = look_closely(found, done=None if self.kept is None else self.kept.groups(structure, found))
+            stored = out_of_sample(found, done=None if self.kept is None else self.kept.groups(structure, found))
             if self.kept is not None:
                 self.kept.keep_look(structure, *stored)
         self.left[structure], self.evidences[structure] = stored
 
     def ranked(self) -> list[Structure]:
-        return sorted(self.left, key=lambda one: -self.left[one].score)
+        return sorted(self.left, key=lambda one: -self.left[one].elpd)
 
     def best(self) -> Structure | None:
         return self.ranked()[0] if self.left else None
 
     def ahead(self, before: Structure) -> bool:
         """Whether the best is clearly better than what was it before."""
-        return self.ranked()[0] != before and self.foresights()[named(before)].surely_behind > 0.0
+        return self.ranked()[0] != before and self.model_scores()[named(before)].clear_diff > 0.0
 
-    def foresights(self) -> dict[str, Foresight]:
+    def model_scores(self) -> dict[str, ModelScore]:
         ranked = self.ranked()
-        return together(
+        return rank_models(
             {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
         )
 
     def result(self) -> Search:
         ranked = self.ranked()
-        foresights = self.foresights()
+        model_scores = self.model_scores()
         lowest = self.lowest()
         rest = sorted((one for one in self.plain if one not in self.left), key=self.bic)
         found = tuple(
@@ -321,11 +321,11 @@ class _Looked:
                 parameters=len(self.fits.get(one, self.plain[one]).vector),
                 bic=self.bic(one) - lowest,
                 fit=self.fits.get(one, self.plain[one]),
-                foresight=foresights.get(named(one)),
+                model_score=model_scores.get(named(one)),
             )
             for one in (*ranked, *rest)
         )
-        alike = tuple(name for name, seen in foresights.items() if name != found[0].name and seen.surely_behind <= 0.0)
+        alike = tuple(name for name, seen in model_scores.items() if name != found[0].name and seen.clear_diff <= 0.0)
         return Search(found, alike)
 
 

@@ -40,7 +40,7 @@ def search_table(search: "Search", most: int | None = SHOWN) -> tables.Table:
 def search_sentences(search: "Search") -> list[str]:
     """What the data say of the structures: one verdict, by the predictive score, and what is to be known of it."""
     best = search.best
-    assert best.foresight is not None
+    assert best.model_score is not None
     words = [
         *misdescribed(best.fit),
         f"Of {len(search.found)} models, {best.name} has the best cross-validated predictive score. {_others(search)}",
@@ -51,7 +51,7 @@ def search_sentences(search: "Search") -> list[str]:
             f"Even the best model needs a correlated discrepancy term of {100.0 * float(term.amplitude):.2g} %; "
             f"chi2/dof without it is {without_discrepancy(best.fit):.3g}."
         )
-    unsure = [one.name for one in search.found if one.foresight and not one.foresight.evidence.reliable]
+    unsure = [one.name for one in search.found if one.model_score and not one.model_score.evidence.reliable]
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
     if search.stopped:
@@ -61,12 +61,12 @@ def search_sentences(search: "Search") -> list[str]:
 
 def _others(search: "Search") -> str:
     """Which others the score does not tell from the best; and that nothing else in the table does."""
-    gaps = {one.name: one.foresight for one in search.found if one.foresight is not None}
+    gaps = {one.name: one.model_score for one in search.found if one.model_score is not None}
     if not search.alike:
         if len(gaps) == 1:
             return "No other was looked at closely."
         return "It is ahead of every other that was looked at closely by more than chance."
-    near = listed([f"{name} ({gaps[name].behind:.2g} ± {gaps[name].behind_error:.2g})" for name in search.alike])
+    near = listed([f"{name} ({gaps[name].elpd_diff:.2g} ± {gaps[name].dse:.2g})" for name in search.alike])
     return (
         f"It is statistically indistinguishable from {near}: these score differences are within two standard errors. "
         "BIC, weight and probability do not overrule this: BIC takes residuals to be independent, the weight has no "
@@ -76,14 +76,14 @@ def _others(search: "Search") -> str:
 
 def search_picture(search: "Search") -> Figure:
     """What structures foretell, and how well they fit, against how many parameters they have."""
-    close = [one for one in search.found if one.foresight is not None]
+    close = [one for one in search.found if one.model_score is not None]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 3.8), layout="constrained")
         left, middle, right = figure.subplots(1, 3, width_ratios=[3.0, 3.0, 2.0])
         for number, one in enumerate(close):
-            assert one.foresight is not None
+            assert one.model_score is not None
             colour = CYCLE[number % len(CYCLE)] if number < NAMED else GREY
-            error, behind = one.foresight.behind_error, one.foresight.behind
+            error, behind = one.model_score.dse, one.model_score.elpd_diff
             left.errorbar(_own(one), max(behind, 0.0), yerr=error, fmt="o", color=colour, markersize=5, label=one.name)
         left.set_yscale("symlog", linthresh=10.0)
         left.invert_yaxis()
@@ -99,7 +99,7 @@ def search_picture(search: "Search") -> Figure:
             axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(integer=True))
         named = close[:NAMED]
         places = np.arange(len(named))
-        shares = [one.foresight.probability if one.foresight else 0.0 for one in named]
+        shares = [one.model_score.model_probability if one.model_score else 0.0 for one in named]
         right.barh(places, shares, color=[CYCLE[number % len(CYCLE)] for number in places])
         right.set(xlabel="probability", title="Posterior", xlim=(0.0, 1.0))
         right.set_yticks(places, ["" for _ in named])
@@ -129,20 +129,20 @@ _CAPTION = (
 
 
 def _row(one: "Found") -> tuple[str, ...]:
-    seen = one.foresight
+    seen = one.model_score
     cells = ("", "", "", "")
     if seen is not None:
         cells = (
-            f"{seen.score:.1f}",
-            f"{seen.behind:.1f} ± {seen.behind_error:.1f}",
+            f"{seen.elpd:.1f}",
+            f"{seen.elpd_diff:.1f} ± {seen.dse:.1f}",
             f"{seen.weight:.2f}",
-            f"{seen.probability:.2g}",
+            f"{seen.model_probability:.2g}",
         )
-    alone = one.fit.alone
+    alone = one.fit.without_discrepancy
     ratio = alone.chi_square / max(alone.degrees_of_freedom, 1) if alone else one.fit.reduced_chi_square
     return (one.name, str(_own(one)), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
 
 
 def _own(one: "Found") -> int:
     """Parameters, without those of errors that readings share."""
-    return len(one.fit.alone.values) if one.fit.alone else one.parameters
+    return len(one.fit.without_discrepancy.values) if one.fit.without_discrepancy else one.parameters

@@ -14,7 +14,7 @@ FREE = {
     "difference": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
     "growth": fits.Free(0.5, 0.0, 1.0),
 }
-"""Of `fits.Correlated`."""
+"""Of `fits.Discrepancy`."""
 
 LABELS = {"amplitude": "amplitude", "half": "reach, half vector", "difference": "reach, difference", "growth": "growth"}
 

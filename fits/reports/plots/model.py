@@ -100,7 +100,7 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
 
 def _residual_label(fit: "Fit") -> str:
     words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
-    return f"{words}\nwith discrepancy" if fit.problem.noise.correlated else words
+    return f"{words}\nwith discrepancy" if fit.problem.noise.discrepancy else words
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
@@ -121,7 +121,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
             image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
             hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
             signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-reach, reach), "PuOr")
-            model = "with discrepancy" if fit.problem.noise.correlated else "model"
+            model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
             for axes, what in zip(row, ("data", model, "residual"), strict=True):
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
@@ -204,6 +204,6 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     curves = []
     for angle, end in zip(angles, ends, strict=True):
         own = slice(end - len(angle), end)
-        alone = values[0, own] if fit.problem.noise.correlated else None
+        alone = values[0, own] if fit.problem.noise.discrepancy else None
         curves.append(_Curve(angle, best[own], alone, None if band is None else band[:, own]))
     return curves

@@ -185,7 +185,7 @@ def test_readings_that_are_held_out_decide(folder: Path, monkeypatch: pytest.Mon
     assert coat.score > bare.score
     fit = fits.load_fit("out/coated.csv/coat")
     seen = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
-    assert coat.score == pytest.approx(seen.log_score, abs=1e-3)
+    assert coat.score == pytest.approx(seen.elpd, abs=1e-3)
     assert "log score" in Path("out/report.html").read_text()
 
 

@@ -286,10 +286,10 @@ def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path
 def test_a_chain_that_begins_again_is_not_allowed_what_the_last_one_was(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     options = {"walkers": 16, "path": tmp_path / "result" / "chain.h5"}
-    save_posterior(sample(coat_fit, max_steps=200, allow_short=True, **options), tmp_path / "result")
-    assert load_posterior(tmp_path / "result").allow_short
+    save_posterior(sample(coat_fit, max_steps=200, allow_unconverged=True, **options), tmp_path / "result")
+    assert load_posterior(tmp_path / "result").allow_unconverged
     sample(coat_fit, max_steps=100, resume=False, **options)
-    assert not load_posterior(tmp_path / "result").allow_short
+    assert not load_posterior(tmp_path / "result").allow_unconverged
 
 
 def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from fits.maps.tabulated import chebyshev, coarser, with_table
 from fits.maps.tabulating import ACCEPTED, tabulate
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
-NOISE = fits.Noise(relative=0.02, floor=1e-4, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 
 
 def coat(alpha, albedo):

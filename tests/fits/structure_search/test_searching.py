@@ -28,7 +28,7 @@ LIBRARY = Library(
     },
 )
 TRUTH = lj.Stack([lj.Interface(1.4, 0.25)], lj.Lambertian(0.3))
-NOISE = Noise(relative=0.03, floor=1e-6, correlated=False)
+NOISE = Noise(relative=0.03, floor=1e-6, discrepancy=False)
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +51,11 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
     assert found.best.name == "interface / diffuse"
     assert found.alike == ()
     assert found.ranking == tuple(one.name for one in found.found)
-    assert found.probabilities["interface / diffuse"] == found.best.foresight.probability
+    assert found.probabilities["interface / diffuse"] == found.best.model_score.model_probability
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert {one.name for one in found.found} == {"diffuse", "metal", "interface / diffuse", "interface / metal"}
     assert found.best.bic == 0.0
-    assert found.best.foresight.probability > 0.999
+    assert found.best.model_score.model_probability > 0.999
     values, errors = found.best.fit.values, found.best.fit.standard_errors
     for name, truth in (("layers[0].ior", 1.4), ("layers[0].alpha", 0.25), ("base.albedo", 0.3)):
         assert abs(values[name] - truth) < 4.0 * errors[name]
@@ -65,7 +65,7 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search) -> None:
 def test_a_lack_of_the_others_is_shared(data: fits.Measurements, found: fits.Search) -> None:
     by_rule = Noise(relative=0.03, floor=1e-6)
     again = search(data, LIBRARY, layers=1, transport=lj.Statistical(), noise=by_rule, starts=2)
-    noise = {one.name: one.fit.problem.noise.correlated for one in again.found}
+    noise = {one.name: one.fit.problem.noise.discrepancy for one in again.found}
     assert not noise["interface / diffuse"]
     assert all(noise[name] for name in ("diffuse", "metal", "interface / metal"))
     assert again.best.name == found.best.name
@@ -88,7 +88,7 @@ def test_a_search_goes_on_where_it_was(data: fits.Measurements, directory: Path,
     assert [one.name for one in again.found] == [one.name for one in found.found]
     for one, other in zip(again.found, found.found, strict=True):
         np.testing.assert_allclose(one.fit.vector, other.fit.vector)
-    assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
+    assert again.best.model_score.elpd == pytest.approx(found.best.model_score.elpd, rel=1e-6)
 
 
 def test_a_closer_look_goes_on_at_the_incidence_where_it_was(
@@ -116,7 +116,7 @@ def test_a_closer_look_goes_on_at_the_incidence_where_it_was(
     again = search(data, LIBRARY, **settings)
     assert len(left) == 2
     assert not groups.exists()
-    assert again.best.foresight.score == pytest.approx(found.best.foresight.score, rel=1e-6)
+    assert again.best.model_score.elpd == pytest.approx(found.best.model_score.elpd, rel=1e-6)
     assert look.read_text() == whole
 
 
@@ -126,7 +126,7 @@ def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Mea
     short = search(data, many, budget=0.0, **settings)
     assert short.stopped
     assert 0 < len(short.found) < len(many.bases)
-    assert short.best.foresight is not None
+    assert short.best.model_score is not None
     assert "The time budget ended the search" in " ".join(telling.search_sentences(short))
     longer = search(data, many, budget=60.0, **settings)
     assert not longer.stopped
@@ -146,14 +146,14 @@ def test_there_is_one_verdict(found: fits.Search) -> None:
 
 
 def test_every_structure_is_seen_by_the_instrument(data: fits.Measurements, tmp_path: Path) -> None:
-    seen = fits.Instrument(detector=2.0, gain_per_incidence=0.02)
+    seen = fits.Instrument(detector_aperture=2.0, gain_sd=0.02)
     given = {"layers": 0, "transport": lj.Statistical(), "noise": NOISE, "starts": 1, "directory": tmp_path / "seen"}
     found = search(data, LIBRARY, instrument=seen, **given)
     assert len(found.found) == 2
     for one in found.found:
         assert replace(one.fit.problem.instrument, rings=None) == seen
         assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3
-    for other in (None, fits.Instrument(detector=1.0, gain_per_incidence=0.02)):
+    for other in (None, fits.Instrument(detector_aperture=1.0, gain_sd=0.02)):
         with pytest.raises(ValueError, match="holds a search of other data, or with another library or settings"):
             search(data, LIBRARY, instrument=other, **given)
 
