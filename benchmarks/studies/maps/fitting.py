@@ -221,7 +221,7 @@ def warm(done: Sequence[tuple[int, Timed]]) -> list[tuple[int, Timed]]:
 
 def rate(tasks: Sequence[Timed]) -> float:
     """Fits a second of `PROCESSES` processes that are always at work."""
-    return PROCESSES * sum(task.fits for task in tasks) / sum(task.start_outcomes - task.began for task in tasks)
+    return PROCESSES * sum(task.fits for task in tasks) / sum(task.ended - task.began for task in tasks)
 
 
 def _differences(

@@ -187,7 +187,10 @@ def test_what_is_new_in_one_measurement_is_not_shared():
     noise = Noise(relative=Free(0.1, 0.01, 1.0))
     both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
     changed = both.with_problems({"first": with_discrepancy(both.parts["first"])})
-    added = {f"first.noise.discrepancy.{name}" for name in ("amplitude", "half", "difference", "growth")}
+    added = {
+        f"first.noise.discrepancy.{name}"
+        for name in ("amplitude", "length_half", "length_difference", "grazing_exponent")
+    }
     assert set(changed.names) == set(both.names) | added
     assert changed.names[:2] == (SLOPE, "noise.relative")
 

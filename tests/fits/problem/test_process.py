@@ -316,7 +316,10 @@ def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
 
 
 def test_what_is_given_is_no_parameter() -> None:
-    every = tuple(f"noise.discrepancy.{name}" for name in ("amplitude", "half", "difference", "growth", "channels"))
+    every = tuple(
+        f"noise.discrepancy.{name}"
+        for name in ("amplitude", "length_half", "length_difference", "grazing_exponent", "channel_correlation")
+    )
     assert problem("one scan").names == ("['a']", *every[:4])
     assert problem("two planes", 3).names[1:] == every
     fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0), growth=0.0)
