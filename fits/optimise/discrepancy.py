@@ -14,8 +14,7 @@ from fits.data.neighbours import alike, neighbours
 from fits.data.totals import Totals
 from fits.optimise.multi_start import start_points, unit_of
 from fits.optimise.result import Fit, WithoutDiscrepancy
-from fits.problem.base import Posed
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 
 LEAST, CLEAR = 0.2, 3.0
 
@@ -62,7 +61,7 @@ def with_discrepancy(problem: Problem) -> Problem:
     return replace(problem, noise=replace(problem.noise, discrepancy=True))
 
 
-def start_points_with_discrepancy(problem: Posed, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
+def start_points_with_discrepancy(problem: FittingProblem, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
     """Where to start from, (K, P) in the unit box of a problem with shared errors, after a fit without: its minima, and
     some of as many starts as it had.
     """

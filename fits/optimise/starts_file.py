@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import layerjax
 from fits._files import locked, named, write_whole
 from fits.optimise.descent import here
-from fits.problem.base import Posed
+from fits.problem.problem import FittingProblem
 from fits.problem.values import portable_repr
 
 Solver = Literal["least_squares", "bounded"]
@@ -40,7 +40,7 @@ class End(NamedTuple):
 class StartsFile:
     """A context manager: `ends` holds what was done before, by the number of the start, `add` keeps one more."""
 
-    def __init__(self, path: str | Path, problem: Posed, points: Floats, solver: Solver):
+    def __init__(self, path: str | Path, problem: FittingProblem, points: Floats, solver: Solver):
         self.path = Path(path)
         self.ends: dict[int, End] = {}
         self._fit = _identity(problem, points, solver)
@@ -97,7 +97,7 @@ def _checked(line: bytes) -> dict[str, Any] | None:
     return json.loads(text)
 
 
-def _identity(problem: Posed, points: Floats, solver: Solver) -> str:
+def _identity(problem: FittingProblem, points: Floats, solver: Solver) -> str:
     """A fingerprint of everything that the ends of the starts depend on."""
     arrays, static = problem.split_model
     told = portable_repr((layerjax.__version__, solver, problem.names, static.tree))

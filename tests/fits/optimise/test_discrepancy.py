@@ -12,13 +12,12 @@ from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.optimise.starts_file import Floats
-from fits.problem.base import Posed
 from fits.problem.discrepancy.inducing_points import places
 from fits.problem.discrepancy.kernel import log_sizes
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.reports import tables, verdicts
 from fits.reports.agreement import discrepancy
 from fits.reports.results import load_fit, save_fit
@@ -140,7 +139,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     run: list[str] = []
     end = starts_module.rough_end
 
-    def counted(problem: Posed, point: Floats) -> starts_module.End:
+    def counted(problem: FittingProblem, point: Floats) -> starts_module.End:
         run.append(type(problem).__name__)
         return end(problem, point)
 
