@@ -1,7 +1,7 @@
-"""Whether a fit counts errors of the model that neighbouring readings share, where that is left to the residuals.
+"""Whether a fit needs a model discrepancy, where that is left to the residuals.
 
-The rule: the stack is fitted with noise that readings do not share; where residuals of neighbours along the scans are
-correlated by more than `LEAST`, and by more than `CLEAR` standard errors, it is fitted again with errors that they do.
+The rule: the stack is fitted with independent noise; where residuals of neighbours along the scans are correlated by
+more than `LEAST`, and by more than `CLEAR` standard errors, it is fitted again with errors that they do.
 """
 
 import math
@@ -50,14 +50,14 @@ def needs_discrepancy(found: WithoutDiscrepancy) -> bool:
 
 
 def datasets_with_discrepancy(fit: Fit) -> dict[str, WithoutDiscrepancy]:
-    """The measurements of which errors are to be counted that readings share, by the rule, as fitted without."""
+    """The data sets that need a model discrepancy by the rule above, as fitted without."""
     problems = fit.problem.problems.items()
     found = {name: without_discrepancy(fit.part(name)) for name, problem in problems if undecided(problem)}
     return {name: one for name, one in found.items() if needs_discrepancy(one)}
 
 
 def with_discrepancy(problem: Problem) -> Problem:
-    """The problem with errors that readings share."""
+    """The problem with model discrepancy."""
     return replace(problem, noise=replace(problem.noise, discrepancy=True))
 
 

@@ -150,7 +150,7 @@ def fit_again(
     checkpoint: str | Path | None = None,
     refine: bool = True,
 ) -> Fit:
-    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
+    """The fit of a problem with model discrepancy, after one without; arguments as of `fit_problem`."""
     without = datasets_with_discrepancy(found) or {
         name: without_discrepancy(found.part(name)) for name in problem.problems
     }

@@ -31,9 +31,9 @@ Floats = NDArray[np.float64]
 class Uncertainty:
     """Errors at an optimum with P parameters, in physical units.
 
-    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (one without influence
-    lies where it happens to). Errors, covariance and
-    condition number are conditional on these values; their own errors are NaN and their rows of the covariance 0.
+    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (an insensitive one lies
+    where it happens to). Errors, covariance and condition number are conditional on these values; their own errors are
+    NaN and their rows of the covariance 0.
     standard_errors: (P,), infinite where nothing holds a parameter.
     unidentified: the combinations that the data do not resolve, of all parameters, also those at a bound.
     insensitive: names of those that the data say nothing about at all.
