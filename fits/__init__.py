@@ -21,28 +21,28 @@ if TYPE_CHECKING:
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
-    from fits.exports.export import Exported as Exported
+    from fits.exports.export import ExportReport as ExportReport
     from fits.exports.export import export as export
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
     from fits.maps.smoothing import Smoothness as Smoothness
     from fits.optimise.fit import fit as fit
-    from fits.optimise.identifiability import Combination as Combination
+    from fits.optimise.identifiability import Direction as Direction
     from fits.optimise.result import Fit as Fit
     from fits.prediction.average import Average as Average
     from fits.prediction.average import average as average
     from fits.prediction.compare import Comparison as Comparison
     from fits.prediction.compare import compare as compare
-    from fits.prediction.cross_validation import leave_out as leave_out
+    from fits.prediction.cross_validation import cross_validate as cross_validate
     from fits.prediction.evidence import Evidence as Evidence
     from fits.prediction.evidence import evidence as evidence
-    from fits.prediction.model_scores import Foresight as Foresight
+    from fits.prediction.model_scores import ModelScore as ModelScore
     from fits.prediction.predict import predict as predict
     from fits.prediction.prediction import Prediction as Prediction
     from fits.prediction.prediction import Scores as Scores
     from fits.prediction.prediction import scores as scores
-    from fits.problem.discrepancy.parameters import Correlated as Correlated
+    from fits.problem.discrepancy.parameters import Discrepancy as Discrepancy
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
     from fits.problem.noise import Noise as Noise
@@ -78,22 +78,22 @@ _HOMES = {
     "compare": "prediction.compare",
     "Evidence": "prediction.evidence",
     "evidence": "prediction.evidence",
-    "Exported": "exports.export",
+    "ExportReport": "exports.export",
     "export": "exports.export",
     "Fit": "optimise.result",
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
     "Smoothness": "maps.smoothing",
-    "Foresight": "prediction.model_scores",
+    "ModelScore": "prediction.model_scores",
     "read": "data.formats",
     "write_csv": "data.formats.csv",
     "read_slab": "data.formats.rxt",
     "Slab": "data.formats.rxt",
     "Geometry": "data.geometry",
     "slices": "data.geometry",
-    "Combination": "optimise.identifiability",
-    "Correlated": "problem.discrepancy.parameters",
+    "Direction": "optimise.identifiability",
+    "Discrepancy": "problem.discrepancy.parameters",
     "Instrument": "problem.instrument",
     "Joint": "problem.joint",
     "Noise": "problem.noise",
@@ -122,7 +122,7 @@ _HOMES = {
     "Library": "structure_search.library",
     "default_library": "structure_search.library",
     "read_library": "structure_search.library",
-    "leave_out": "prediction.cross_validation",
+    "cross_validate": "prediction.cross_validation",
     "fit_files": "batch.fit_files",
     "FittedFiles": "batch.fit_files",
     "Problem": "problem.problem",

@@ -380,7 +380,7 @@ def _fitted(job: Job, task: Task) -> Row:
     else:
         given = job.stacks[task.stack]
         fit, foretold = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
-    without = fit.alone
+    without = fit.without_discrepancy
     row = task.failed(fit.status) | {
         "result": "converged" if fit.converged else "not converged",
         "structure": structure,
@@ -390,7 +390,7 @@ def _fitted(job: Job, task: Task) -> Row:
         "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
     }
     if foretold is not None and (scores := foretold.prediction.scores) is not None:
-        row |= {"criterion": "-2 log score", "loss": -2.0 * scores.log_score * scores.count}
+        row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
     row |= {"at_bound": " ".join(fit.at_bound), "readings": int(fit.problem.data.mask.sum())}

@@ -126,7 +126,7 @@ def _sample(directory: Path, arguments: Namespace) -> int:
             max_steps=arguments.max_steps or MAX_STEPS,
             path=directory / results.CHAIN,
             resume=not arguments.force,
-            allow_short=bool(arguments.allow_short),
+            allow_unconverged=bool(arguments.allow_unconverged),
             progress=progress,
         )
         progress("pictures and report", 0, 1)

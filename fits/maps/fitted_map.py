@@ -120,7 +120,7 @@ class FittedMap:
 
         Args:
             meaning: "fitted", "converged", "at_bound", "poor" (chi-square above what noise and the pilot explain),
-                "restarted", "masked", "too_few_readings", "failed" (no finite value) or "unresolved".
+                "restarted", "masked", "too_few_readings", "failed" (no finite value) or "unidentified".
         """
         if meaning not in FLAGS:
             raise ValueError(f"meaning: {meaning!r} given, must be one of {', '.join(FLAGS)}")

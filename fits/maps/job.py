@@ -167,7 +167,7 @@ def _fill(results: dict[str, NDArray[Any]], job: Job, fitted: NDArray[np.int64],
         "at_bound": finite & found.at_bound.any(axis=1),
         "poor": finite & ends.poor,
         "restarted": ends.restarted,
-        "unresolved": finite & found.unresolved,
+        "unidentified": finite & found.unidentified,
     }.items():
         results["flags"][fitted[holds]] |= FLAGS[meaning]
 

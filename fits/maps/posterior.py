@@ -65,7 +65,9 @@ def _sampled(
     prepared: Prepared, readings: Readings, place: tuple[int, ...], vector: Floats, seed: int
 ) -> tuple[Floats, Floats, Floats, np.bool_]:
     part = part_of(readings, tuple(slice(at, at + 1) for at in place))
-    posterior = sample(refit(problem_at(prepared, part), vector), seed=seed, max_steps=MOST_STEPS, allow_short=True)
+    posterior = sample(
+        refit(problem_at(prepared, part), vector), seed=seed, max_steps=MOST_STEPS, allow_unconverged=True
+    )
     draws = posterior.samples
     quantiles = np.quantile(draws, QUANTILES, axis=0).T
     return draws.mean(axis=0), draws.std(axis=0), quantiles, np.bool_(posterior.converged)

@@ -129,8 +129,8 @@ def _spread(count: int, first: int) -> NDArray[np.int64]:
 def prototype(sample: Texels, readings: Readings, stack: Any, noise: Noise | None, **rest: Any) -> Problem:
     """A problem with the readings of a typical texel, in whose place those of each texel come."""
     noise = Noise() if noise is None else noise
-    if noise.correlated:
-        raise ValueError("noise.correlated is given; fits of maps have independent errors only")
+    if noise.discrepancy:
+        raise ValueError("noise.discrepancy is given; fits of maps have independent errors only")
     bright = np.nanmean(np.where(sample.used, sample.values, np.nan), axis=(1, 2))
     typical = int(np.argsort(bright)[len(bright) // 2])
     with np.errstate(all="ignore"):
@@ -147,7 +147,7 @@ def prototype(sample: Texels, readings: Readings, stack: Any, noise: Noise | Non
     wi, wo = (sample.wi[typical], sample.wo[typical]) if readings.geometry is None else _common(readings)
     channels = channel_names(readings.channels)
     data = Measurements(wi, wo, values, sigma, np.ones(len(values), bool), channels)
-    return Problem(stack, data, noise=replace(noise, relative=relative, floor=floor, correlated=False), **rest)
+    return Problem(stack, data, noise=replace(noise, relative=relative, floor=floor, discrepancy=False), **rest)
 
 
 def _common(readings: Readings) -> tuple[Floats, Floats]:
@@ -276,7 +276,7 @@ def load(root: "zarr.Group", readings: Readings, stack: Any, noise: Noise | None
     values = array["values"]
     channels, used = channel_names(values.shape[1]), np.ones(len(values), bool)
     data = Measurements(array["wi"], array["wo"], values, array.get("sigma"), used, channels)
-    problem = Problem(stack, data, noise=replace(given, **levels, correlated=False), **rest)
+    problem = Problem(stack, data, noise=replace(given, **levels, discrepancy=False), **rest)
     shared = None if about["shared"] is None else Shared(*about["shared"])
     if shared is not None:
         # None: of one at a bound, in stores of former versions

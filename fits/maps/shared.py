@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.parameters import is_free, split
 from fits.problem.problem import Problem
 from fits.problem.spectra import is_law
@@ -19,10 +19,10 @@ def shared_names(problem: Problem) -> tuple[str, ...]:
     """Names of a problem whose `Free` is `shared`, in its order; one a channel where there is a number a channel."""
     noise, instrument = problem.noise, problem.instrument
     parts = {"": problem.stack, "scale": problem.scale, "noise.relative": noise.relative, "noise.floor": noise.floor}
-    if isinstance(noise.correlated, Correlated):
-        parts |= {f"noise.correlated.{one.name}": getattr(noise.correlated, one.name) for one in fields(Correlated)}
+    if isinstance(noise.discrepancy, Discrepancy):
+        parts |= {f"noise.discrepancy.{one.name}": getattr(noise.discrepancy, one.name) for one in fields(Discrepancy)}
     if instrument is not None:
-        parts["instrument.offset"] = instrument.offset
+        parts["instrument.tilt"] = instrument.tilt
         if instrument.floor is not None:  # it stands in for that of the noise
             parts["noise.floor"] = instrument.floor
     marked = {name for where, part in parts.items() for name in _marked(part, where)}
@@ -42,7 +42,7 @@ def hold(stack: Any, values: Mapping[str, float]) -> Any:
     leaves, structure = jax.tree.flatten(stack, is_leaf=is_free)
     template, names, _ = split(stack, plain_name)
     for leaf, offset, shape in template.slots:
-        if leaves[leaf].shared:
+        if leaves[leaf].same_for_all_texels:
             own = names[offset : offset + leaves[leaf].arrays()[0].size]
             leaves[leaf] = jnp.asarray(np.reshape([_number(name, values) for name in own], shape))
     return _lawful(jax.tree.unflatten(structure, leaves))
@@ -60,7 +60,7 @@ def _marked(part: Any, where: str) -> list[str]:
     """Names of what is shared in a part of a problem, which stands at this place."""
     template, names, free = split(part, lambda path: plain_name(where + path))
     ends = [*(offset for _, offset, _ in template.slots), len(names)]
-    return [name for k, entry in enumerate(free) if entry.shared for name in names[ends[k] : ends[k + 1]]]
+    return [name for k, entry in enumerate(free) if entry.same_for_all_texels for name in names[ends[k] : ends[k + 1]]]
 
 
 def _lawful(stack: Any) -> Any:

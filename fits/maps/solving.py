@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, linear
 from fits.maps.texels import Texels, chi_square, model_of
 from fits.optimise.descent import PROMISE
-from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
+from fits.optimise.identifiability import LARGEST_ERROR, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
 from fits.optimise.uncertainty import LEAST_PULL, ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -27,7 +27,7 @@ class Found(NamedTuple):
     """What is found of M texels with P parameters.
 
     vector, errors: physical, (M, P); an error is NaN where a bound holds the parameter, infinite where nothing does.
-    cost, chi_square: (M,); an infinite cost where there is no finite value. converged, unresolved: (M,) bool.
+    cost, chi_square: (M,); an infinite cost where there is no finite value. converged, unidentified: (M,) bool.
     at_bound: (M, P) bool. predicted: (M, N, C), in 1/sr.
     """
 
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     cost: Any
     chi_square: Any
     converged: Any
-    unresolved: Any
+    unidentified: Any
     at_bound: Any
     predicted: Any
 
@@ -191,14 +191,14 @@ def _found(model: Model, end: End, texel: Texels) -> Found:
     rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(end.unit)
     # R of the QR decomposition has its singular values without squaring its condition number
     root = jnp.linalg.qr(rows, mode="r")
-    errors, held, unresolved = _errors(own, end, root, scatter)
+    errors, held, unidentified = _errors(own, end, root, scatter)
     return Found(
         vector=vector,
         errors=errors,
         cost=jnp.where(finite, end.cost, jnp.inf),
         chi_square=squares,
         converged=(end.converged > 0.5) & finite,
-        unresolved=unresolved,
+        unidentified=unidentified,
         at_bound=held,
         predicted=jnp.where(finite, predicted, jnp.nan),
     )
@@ -214,14 +214,14 @@ def _errors(model: Model, end: End, root: Array, scatter: Array) -> tuple[Array,
     held = ((unit <= ON_BOUND) & (end.gradient > pull)) | ((unit >= 1.0 - ON_BOUND) & (end.gradient < -pull))
     held &= ~idle & known
     data = jnp.linalg.svd(jnp.concatenate([root, jnp.zeros((count, count))]), compute_uv=False)
-    unresolved = (data[-1] < 1.0 / UNRESOLVED_BEYOND) | ~known
+    unidentified = (data[-1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
     rows = jnp.where(held, 0.0, jnp.concatenate([root, box.prior_slopes()]))
     _, sizes, directions = jnp.linalg.svd(rows, full_matrices=False)
     least = jnp.maximum(jnp.finfo(sizes.dtype).eps * count * sizes[0], 1.0 / LARGEST_ERROR)
     spread = jnp.linalg.norm(directions / jnp.maximum(sizes, least)[:, None], axis=0)
     errors = jnp.where(spread > UNKNOWN_BEYOND, jnp.inf, spread * box.slope(box.from_unit(unit)))
     errors = jnp.where(known, errors, jnp.inf)
-    return jnp.where(held, jnp.nan, errors), held, unresolved
+    return jnp.where(held, jnp.nan, errors), held, unidentified
 
 
 def nearest(

@@ -34,7 +34,7 @@ FLAGS = {
     "masked": 32,
     "too_few_readings": 64,
     "failed": 128,
-    "unresolved": 256,
+    "unidentified": 256,
 }
 """Meaning and bit of what `flags` says of a texel; 0: it is not there yet."""
 

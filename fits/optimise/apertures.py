@@ -71,7 +71,7 @@ def needed(problem: Problem, vector: Floats, predicted: Floats, is_open: bool, p
     """
     assert problem.instrument is not None
     rings, values = rings_of(problem), predicted
-    most = most_rings(problem.instrument.source, problem.instrument.detector)
+    most = most_rings(problem.instrument.source_aperture, problem.instrument.detector_aperture)
     sigma, peak = spread(problem, vector, predicted), np.max(np.abs(predicted))
     asked = min(_of_lobes(problem, vector), most)
     if is_open and asked > rings:

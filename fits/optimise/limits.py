@@ -33,7 +33,7 @@ def instrument_limits(fit: "Fit") -> dict[str, float]:
     the aperture of the `Instrument`, and hold two steps of the scan that is finest about the mirror direction.
     """
     instrument = fit.problem.instrument
-    aperture = 0.0 if instrument is None else math.hypot(instrument.source, instrument.detector)
+    aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
     resolved = max(aperture, READINGS * finest_step(fit.problem.data.used()))
     if not (resolved > 0.0 and isinstance(fit.problem.stack, lj.Stack | lj.Mixture)):
         return {}

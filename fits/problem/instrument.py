@@ -35,11 +35,12 @@ GAINS_END = 6.0
 class Instrument:
     """An instrument by which readings were taken. Angles in degrees.
 
-    source, detector: full angles of the cones, in [0, 30]; a reading is the mean over them, which costs four times as
-    much where a lobe may be narrow, more where one is narrower than the cones, and nothing elsewhere.
-    offset: how far the sample's normal leans towards the mirror side of the plane of incidence, in [-10, 10]; a number,
+    source_aperture, detector_aperture: full angles of the cones, in [0, 30]; a measurement is the mean over them, which
+    costs four times as much where a lobe may be narrow, more where one is narrower than the cones, and nothing
+    elsewhere.
+    tilt: how far the sample's normal leans towards the mirror side of the plane of incidence, in [-10, 10]; a number,
     `Free`, or None for 0.
-    gain_per_incidence: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
+    gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
     rings: of rays that stand for a cone where a lobe is narrowest, in [1, 8]; n of them keep the error below a
@@ -48,38 +49,38 @@ class Instrument:
     the lobe asks for that it finds.
     """
 
-    source: float = 0.0
-    detector: float = 0.0
-    offset: float | Free | None = None
-    gain_per_incidence: float | None = None
+    source_aperture: float = 0.0
+    detector_aperture: float = 0.0
+    tilt: float | Free | None = None
+    gain_sd: float | None = None
     floor: float | Free | None = None
     rings: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("source", "detector"):
+        for name in ("source_aperture", "detector_aperture"):
             _require(name, getattr(self, name), 0.0, WIDEST)
-        if isinstance(self.offset, Free):
-            if self.offset.shape != ():
-                raise ValueError("Instrument.offset has channels; it must be a single number")
+        if isinstance(self.tilt, Free):
+            if self.tilt.shape != ():
+                raise ValueError("Instrument.tilt has channels; it must be a single number")
             for end in ("low", "high"):
-                _require(f"offset.{end}", getattr(self.offset, end), -LEANS_MOST, LEANS_MOST)
-        elif self.offset is not None:
-            _require("offset", self.offset, -LEANS_MOST, LEANS_MOST)
-        if self.gain_per_incidence is not None:
-            _require("gain_per_incidence", self.gain_per_incidence, *GAIN_SPREADS)
+                _require(f"tilt.{end}", getattr(self.tilt, end), -LEANS_MOST, LEANS_MOST)
+        elif self.tilt is not None:
+            _require("tilt", self.tilt, -LEANS_MOST, LEANS_MOST)
+        if self.gain_sd is not None:
+            _require("gain_sd", self.gain_sd, *GAIN_SPREADS)
         if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
             raise ValueError(f"Instrument.rings is {shown(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
 
     @property
     def has_cones(self) -> bool:
         """Whether there is anything to take the mean over."""
-        return self.source > 0.0 or self.detector > 0.0
+        return self.source_aperture > 0.0 or self.detector_aperture > 0.0
 
 
 class Setting(NamedTuple):
-    """The numbers of an instrument that may be free: offset in degrees, gains (K,); None where there are none."""
+    """The numbers of an instrument that may be free: tilt in degrees, gains (K,); None where there are none."""
 
-    offset: Any
+    tilt: Any
     gains: Any
 
 
@@ -103,7 +104,7 @@ class Optics(eqx.Module):
         """Readings (N, C), where values(wi, wo, known) is the BSDF (K, C)."""
         wi, wo = self.wi, self.wo
         if self.forward is not None:
-            wi, wo = (_leaning(w, self.forward, setting.offset) for w in (wi, wo))
+            wi, wo = (_leaning(w, self.forward, setting.tilt) for w in (wi, wo))
         found = values(wi, wo, self.known)
         if self.row is not None:
             assert self.share is not None
@@ -117,11 +118,11 @@ class Optics(eqx.Module):
 def setting_of(instrument: Instrument, incidences: Floats) -> Setting:
     """Its free numbers and those that are known, for readings with these K polar angles of the light."""
     gains = None
-    if instrument.gain_per_incidence is not None:
-        spread = instrument.gain_per_incidence
+    if instrument.gain_sd is not None:
+        spread = instrument.gain_sd
         ends = math.exp(-GAINS_END * spread), math.exp(GAINS_END * spread)
         gains = Free((1.0,) * len(incidences), *ends, LogNormal(1.0, spread))
-    return Setting(instrument.offset if isinstance(instrument.offset, Free) else None, gains)
+    return Setting(instrument.tilt if isinstance(instrument.tilt, Free) else None, gains)
 
 
 def optics_of(
@@ -138,16 +139,16 @@ def optics_of(
     incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
     other numbers of rays, see `ray_counts`.
     """
-    gain = None if instrument.gain_per_incidence is None else _which(wi, incidences)
-    free, lean = isinstance(instrument.offset, Free), 0.0
-    forward = _forward(wi) if instrument.offset else None
-    if isinstance(instrument.offset, Free):
-        lean = float(np.max(np.abs(instrument.offset.arrays()[1:])))
+    gain = None if instrument.gain_sd is None else _which(wi, incidences)
+    free, lean = isinstance(instrument.tilt, Free), 0.0
+    forward = _forward(wi) if instrument.tilt else None
+    if isinstance(instrument.tilt, Free):
+        lean = float(np.max(np.abs(instrument.tilt.arrays()[1:])))
     elif forward is not None:
-        wi, wo = (np.asarray(_leaning(w, forward, instrument.offset), float) for w in (wi, wo))
+        wi, wo = (np.asarray(_leaning(w, forward, instrument.tilt), float) for w in (wi, wo))
         forward = None
     row = share = None
-    pairs, widths = (wi, wo), (instrument.source, instrument.detector)
+    pairs, widths = (wi, wo), (instrument.source_aperture, instrument.detector_aperture)
     if (
         instrument.has_cones
         and (spread := spread_over_lobes(*widths, stack, wi, wo, lean, instrument.rings)).matters.any()
@@ -167,8 +168,8 @@ def optics_of(
 
 def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
     """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
-    lean = 0.0 if setting.offset is None else abs(float(setting.offset))
-    spread = spread_over_lobes(instrument.source, instrument.detector, stack, wi, wo, lean)
+    lean = 0.0 if setting.tilt is None else abs(float(setting.tilt))
+    spread = spread_over_lobes(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, lean)
     if not spread.matters.any():
         return 1
     return int(np.max(ray_counts(spread.source[spread.matters], spread.detector[spread.matters])[:, :2]))
@@ -176,9 +177,9 @@ def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, 
 
 def gain_unknown(instrument: Instrument | None, wi: Floats, incidences: Floats) -> Floats:
     """Relative standard deviation, (M, 1), of the gain of light along wi (M, 3), beside incidences that have one."""
-    if instrument is None or instrument.gain_per_incidence is None:
+    if instrument is None or instrument.gain_sd is None:
         return np.zeros((len(wi), 1))
-    return np.where(_which(wi, incidences) == len(incidences), instrument.gain_per_incidence, 0.0)[:, None]
+    return np.where(_which(wi, incidences) == len(incidences), instrument.gain_sd, 0.0)[:, None]
 
 
 def _which(wi: Floats, incidences: Floats) -> NDArray[np.int64]:
@@ -200,8 +201,8 @@ def _cones(
         discs = rays(tuple(kind.tolist()))
         parts, cosines = [], []
         for w, width, disc in (
-            (wi[rows], instrument.source, discs.source),
-            (wo[rows], instrument.detector, discs.detector),
+            (wi[rows], instrument.source_aperture, discs.source),
+            (wo[rows], instrument.detector_aperture, discs.detector),
         ):
             rays_of_cone = _over_disc(w, math.radians(0.5 * width), disc)
             # light that would come or go below the horizon is not there

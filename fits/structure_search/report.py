@@ -51,18 +51,18 @@ def search_table(search: Search, most: int | None = SHOWN) -> tables.Table:
 
 
 def _row(one: Candidate) -> tuple[str, ...]:
-    seen, alone = one.foresight, one.fit.alone
+    seen, without = one.model_score, one.fit.without_discrepancy
     cells = ("", "", "", "")
     if seen is not None:
-        behind = f"{seen.behind:.1f} ± {seen.behind_error:.1f}"
-        cells = (f"{seen.score:.1f}", behind, f"{seen.weight:.2f}", f"{seen.probability:.2g}")
-    ratio = alone.chi_square / max(alone.degrees_of_freedom, 1) if alone else one.fit.reduced_chi_square
+        behind = f"{seen.elpd_diff:.1f} ± {seen.dse:.1f}"
+        cells = (f"{seen.elpd:.1f}", behind, f"{seen.weight:.2f}", f"{seen.model_probability:.2g}")
+    ratio = without.chi_square / max(without.degrees_of_freedom, 1) if without else one.fit.reduced_chi_square
     return (one.name, str(_of_stack(one)), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
 
 
 def _of_stack(one: Candidate) -> int:
     """Parameters, without those of the model discrepancy."""
-    return len(one.fit.alone.values) if one.fit.alone else one.parameters
+    return len(one.fit.without_discrepancy.values) if one.fit.without_discrepancy else one.parameters
 
 
 def search_sentences(search: Search) -> list[str]:
@@ -79,7 +79,7 @@ def search_sentences(search: Search) -> list[str]:
             f"Even the best model needs a correlated discrepancy term of {100.0 * float(term.amplitude):.2g} %; "
             f"chi2/dof without it is {without_discrepancy(best.fit):.3g}."
         )
-    unsure = [one.name for one in search.candidates if one.foresight and not one.foresight.evidence.reliable]
+    unsure = [one.name for one in search.candidates if one.model_score and not one.model_score.evidence.reliable]
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
     if search.stopped:
@@ -89,14 +89,12 @@ def search_sentences(search: Search) -> list[str]:
 
 def _others(search: Search) -> str:
     """Which others are indistinguishable from the best by the score; and that nothing else in the table decides."""
-    scores = {one.name: one.foresight for one in search.candidates if one.foresight is not None}
+    scores = {one.name: one.model_score for one in search.candidates if one.model_score is not None}
     if not search.indistinguishable:
         if len(scores) == 1:
             return "No other was cross-validated."
         return "It is ahead of every other cross-validated model by more than the error of the difference."
-    near = [
-        f"{name} ({scores[name].behind:.2g} ± {scores[name].behind_error:.2g})" for name in search.indistinguishable
-    ]
+    near = [f"{name} ({scores[name].elpd_diff:.2g} ± {scores[name].dse:.2g})" for name in search.indistinguishable]
     return (
         f"It is statistically indistinguishable from {listed(near)}: these score differences are within two standard "
         "errors. BIC, weight and probability do not overrule this: BIC takes residuals to be independent, the weight "
@@ -106,7 +104,7 @@ def _others(search: Search) -> str:
 
 def search_picture(search: Search) -> Figure:
     """Predictive score and BIC against the number of parameters, and probabilities."""
-    close = [(one, one.foresight) for one in search.candidates if one.foresight is not None]
+    close = [(one, one.model_score) for one in search.candidates if one.model_score is not None]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 3.8), layout="constrained")
         left, middle, right = figure.subplots(1, 3, width_ratios=[3.0, 3.0, 2.0])
@@ -116,10 +114,10 @@ def search_picture(search: Search) -> Figure:
         for number, (one, seen) in enumerate(close):
             colour = CYCLE[number % len(CYCLE)] if number < NAMED else GREY
             of_score = {"fmt": "o", "color": colour, "markersize": 5, "label": one.name}
-            left.errorbar(_of_stack(one), max(seen.behind, 0.0), yerr=seen.behind_error, **of_score)
+            left.errorbar(_of_stack(one), max(seen.elpd_diff, 0.0), yerr=seen.dse, **of_score)
             middle.plot(_of_stack(one), one.bic, "o", color=colour)
         for number, (_, seen) in enumerate(close[:NAMED]):
-            right.barh(number, seen.probability, color=CYCLE[number % len(CYCLE)])
+            right.barh(number, seen.model_probability, color=CYCLE[number % len(CYCLE)])
         left.set(ylabel="score behind the best", title="Held-out data")
         middle.set(ylabel="BIC above the lowest", title="Fit with independent noise")
         for axes in (left, middle):

@@ -9,7 +9,7 @@ predict as well as one that lacks one.
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
-from fits.optimise.discrepancy import alone, are_shared, left_open
+from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.fit import fit_again, fit_problem
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import LeftOut
+from fits.prediction.cross_validation import CrossValidation
 from fits.prediction.evidence import Evidence
-from fits.prediction.model_scores import Foresight, look_closely, together
+from fits.prediction.model_scores import ModelScore, out_of_sample, rank_models
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -90,14 +90,14 @@ class Candidate:
         parameters: how many are free in its fit.
         bic: of the fit with independent noise, less the lowest of all.
         fit: at full resolution if it was cross-validated, else the one with independent noise.
-        foresight: predictive score and evidence; None if it was not cross-validated.
+        model_score: predictive score and evidence; None if it was not cross-validated.
     """
 
     structure: Structure
     parameters: int
     bic: float
     fit: Fit
-    foresight: Foresight | None
+    model_score: ModelScore | None
 
     @property
     def name(self) -> str:
@@ -134,7 +134,7 @@ class Search:
     @property
     def probabilities(self) -> dict[str, float]:
         """By name, among the cross-validated stacks, all as probable beforehand."""
-        return {one.name: one.foresight.probability for one in self.candidates if one.foresight is not None}
+        return {one.name: one.model_score.model_probability for one in self.candidates if one.model_score is not None}
 
 
 def named(structure: Structure) -> str:
@@ -168,7 +168,7 @@ def search(
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
-        ValueError: the directory is in use, or holds another search or something else; or as `fit` and `leave_out`.
+        ValueError: the directory is in use, or holds another search or something else; as `fit`, `cross_validate`.
     """
     require_kind("data", data, Measurements)
     require_kind("library", library, Library, None)
@@ -198,7 +198,7 @@ def search(
 
 
 class _HeldOut(dict[str, tuple[NDArray[np.float64], bool]]):
-    """Log-densities of the incidences that were held out of a fit so far, kept in a store: see `leave_out`."""
+    """Log-densities of the incidences that were held out of a fit so far, kept in a store: see `cross_validate`."""
 
     def __init__(self, store: Store, key: str, fit: Fit):
         self._store, self._key, self._whose = store, key, fingerprint(fit=fit.vector)
@@ -222,34 +222,26 @@ class _Run:
     store: Store | None
     progress: Progress
     coarse: dict[Structure, Fit] = field(default_factory=dict)
-    full: dict[Structure, Fit] = field(default_factory=dict)
-    left: dict[Structure, LeftOut] = field(default_factory=dict)
-    evidences: dict[Structure, Evidence] = field(default_factory=dict)
+    full: dict[Structure, tuple[Fit, CrossValidation, Evidence]] = field(default_factory=dict)
 
     def searched(self) -> Search:
         """Level by level, as long as a level predicts better than those before, or lowers the BIC clearly."""
         options, stopped = self.options, False
         until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
         level: list[Structure] = [(base,) for base in self.library.bases]
-        while level:
-            before = self.ranked()[0] if self.left else None
-            lowest = self.lowest_bic()
-            stopped = before is not None and time.monotonic() > until
-            if stopped:
+        while level and not stopped:
+            before, lowest = self.ranked()[:1], self.lowest_bic()
+            if before and time.monotonic() > until:
+                stopped = True
                 break
-            for structure, fit in self._in_parallel(f"{len(level[0]) - 1} layers", self._coarse_fit, level, until):
-                self.coarse[structure] = fit
+            self.coarse |= self._in_parallel(f"{len(level[0]) - 1} layers", self._coarse_fit, level, until)
             fitted = [one for one in level if one in self.coarse]
             chosen = sorted(fitted, key=self.bic)[: options.cross_validated]
-            for structure, found in self._in_parallel("cross-validation", self._cross_validated, chosen, until):
-                self.full[structure], self.left[structure], self.evidences[structure] = found
-            stopped = len(fitted) < len(level) or any(one not in self.left for one in chosen)
-            if stopped:
+            self.full |= self._in_parallel("cross-validation", self._cross_validated, chosen, until)
+            stopped = len(fitted) < len(level) or any(one not in self.full for one in chosen)
+            ahead = not before or self.model_scores()[named(before[0])].clear_diff > 0.0
+            if not ahead and not self.lowest_bic() < lowest - options.bic_gain:
                 break
-            if before is not None:
-                ahead = self.ranked()[0] != before and self.foresights()[named(before)].surely_behind > 0.0
-                if not ahead and not self.lowest_bic() < lowest - options.bic_gain:
-                    break
             level = self._next_level()
         self.progress("cross-validation", 1, 1, "")
         return replace(self.result(), stopped=stopped)
@@ -259,33 +251,33 @@ class _Run:
 
         def fitted() -> Fit:
             problem = self._problem(structure)
-            problem = replace(problem, noise=replace(problem.noise, correlated=False))
+            problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
             return fit_problem(problem, starts=self.options.starts, seed=self.seed, refine=False)
 
         return self._kept(structure, "", fitted)
 
-    def _cross_validated(self, structure: Structure) -> tuple[Fit, LeftOut, Evidence]:
+    def _cross_validated(self, structure: Structure) -> tuple[Fit, CrossValidation, Evidence]:
         """As `fits.fit` fits it, with each incidence held out, and its evidence."""
 
         def fitted() -> Fit:
             problem, coarse = self._problem(structure), self.coarse[structure]
-            if left_open(problem) and are_shared(alone(coarse)):
+            if undecided(problem) and needs_discrepancy(without_discrepancy(coarse)):
                 return fit_again(problem, coarse, starts=self.options.starts, seed=self.seed)
-            if left_open(problem):
-                problem = replace(problem, noise=replace(problem.noise, correlated=False))
+            if undecided(problem):
+                problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
             return fit_problem(problem, starts=self.options.starts, seed=self.seed)
 
         fit = self._kept(structure, "+full", fitted)
         if self.store is None:
-            return fit, *look_closely(fit)
+            return fit, *out_of_sample(fit)
         name = named(structure)
         stored = self.store.get(name)
         if stored is None:
-            left, evidence = look_closely(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
+            left, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
             self.store.put(name, {"left": vars(left), "evidence": vars(evidence)})
         else:
             kept = stored["left"]
-            left = LeftOut(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
+            left = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
             evidence = Evidence(**stored["evidence"])
         return fit, left, evidence
 
@@ -304,22 +296,23 @@ class _Run:
 
     def _in_parallel(
         self, stage: str, call: Callable[[Structure], Result], structures: list[Structure], until: float
-    ) -> Iterator[tuple[Structure, Result]]:
-        """Structures with what the call gives of them, the first few whatever the time, the others until then.
+    ) -> dict[Structure, Result]:
+        """By structure what the call gives, of the first few whatever the time, of the others until then.
 
         Several run at a time, since compiling one keeps a single core busy; none runs while programs are thrown away.
         """
-        several = min(cores(), TOGETHER)
+        several, results = min(cores(), TOGETHER), dict[Structure, Result]()
         self.progress(stage, 0, len(structures), named(structures[0]))
         with ThreadPoolExecutor(several) as pool:
             for first in range(0, len(structures), several):
                 if first and time.monotonic() > until:
-                    return
+                    break
                 make_room()
                 some = structures[first : first + several]
-                for number, (structure, found) in enumerate(zip(some, pool.map(call, some), strict=True), first + 1):
-                    yield structure, found
-                    self.progress(stage, number, len(structures), named(structure))
+                for structure, found in zip(some, pool.map(call, some), strict=True):
+                    results[structure] = found
+                    self.progress(stage, len(results), len(structures), named(structure))
+        return results
 
     def _next_level(self) -> list[Structure]:
         """Structures not fitted before, with a layer more or less than the best by score and by BIC."""
@@ -345,24 +338,24 @@ class _Run:
 
     def ranked(self) -> list[Structure]:
         """What was cross-validated, best first."""
-        return sorted(self.left, key=lambda one: -self.left[one].score)
+        return sorted(self.full, key=lambda one: -self.full[one][1].elpd)
 
-    def foresights(self) -> dict[str, Foresight]:
+    def model_scores(self) -> dict[str, ModelScore]:
         """Scores side by side, best first."""
-        ranked = self.ranked()
-        return together(
-            {named(one): self.left[one] for one in ranked}, {named(one): self.evidences[one] for one in ranked}
+        close = {named(one): self.full[one] for one in self.ranked()}
+        return rank_models(
+            {name: left for name, (_, left, _) in close.items()}, {name: found for name, (*_, found) in close.items()}
         )
 
     def result(self) -> Search:
         """All that was fitted, ranked."""
-        foresights, lowest = self.foresights(), self.lowest_bic()
-        rest = sorted((one for one in self.coarse if one not in self.left), key=self.bic)
+        model_scores, lowest = self.model_scores(), self.lowest_bic()
+        rest = sorted((one for one in self.coarse if one not in self.full), key=self.bic)
         candidates = []
         for one in (*self.ranked(), *rest):
-            fit = self.full.get(one, self.coarse[one])
+            fit = self.full[one][0] if one in self.full else self.coarse[one]
             bic = self.bic(one) - lowest
-            candidates.append(Candidate(one, len(fit.vector), bic, fit, foresights.get(named(one))))
+            candidates.append(Candidate(one, len(fit.vector), bic, fit, model_scores.get(named(one))))
         best = candidates[0].name
-        near = tuple(name for name, seen in foresights.items() if name != best and seen.surely_behind <= 0.0)
+        near = tuple(name for name, seen in model_scores.items() if name != best and seen.clear_diff <= 0.0)
         return Search(tuple(candidates), near, self.options)

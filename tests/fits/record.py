@@ -43,8 +43,8 @@ def of_fit(fit: Any) -> dict[str, Any]:
         "values": fit.values,
         "standard_errors": fit.standard_errors,
         "at_bound": sorted(fit.at_bound),
-        "unidentified": [sorted(direction.weights) for direction in fit.unresolved],
-        "insensitive": sorted(fit.without_influence),
+        "unidentified": [sorted(direction.weights) for direction in fit.unidentified],
+        "insensitive": sorted(fit.insensitive),
         "reduced_chi_square": fit.reduced_chi_square,
     }
 
@@ -63,9 +63,9 @@ def of_comparison(comparison: Any) -> dict[str, Any]:
     """Ranking and elpd differences."""
     return {
         "ranking": [row.name for row in comparison.rows],
-        "elpd_diff": {row.name: row.foresight.behind for row in comparison.rows},
-        "dse": {row.name: row.foresight.behind_error for row in comparison.rows},
-        "weight": {row.name: row.foresight.weight for row in comparison.rows},
+        "elpd_diff": {row.name: row.model_score.elpd_diff for row in comparison.rows},
+        "dse": {row.name: row.model_score.dse for row in comparison.rows},
+        "weight": {row.name: row.model_score.weight for row in comparison.rows},
     }
 
 

@@ -22,7 +22,7 @@ FUNCTIONS = {
     "simulate": {"stack": PLAIN, "geometry": VIEW, "transport": "auto", "noise": 0.1, "floor": 0.1},
     "predict": {"of": FIT, "at": VIEW},
     "sample": {"fit": FIT},
-    "leave_out": {"fit": FIT},
+    "cross_validate": {"fit": FIT},
     "evidence": {"fit": FIT},
     "compare": {"candidates": {"one": FIT, "other": FIT}},
     "average": {"candidates": {"one": FIT}},

@@ -248,7 +248,7 @@ def pull_width(found: FittedMap, one: Given) -> float:
 
     Of texels whose readings say something of every parameter, within its bounds.
     """
-    good = found.has("converged") & ~found.has("at_bound") & ~found.has("unresolved")
+    good = found.has("converged") & ~found.has("at_bound") & ~found.has("unidentified")
     widths = []
     for name, truth in one.truth.items():
         pulls = ((found.values[name] - truth) / found.errors[name])[good]

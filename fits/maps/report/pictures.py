@@ -59,7 +59,7 @@ STATES = (
     State("failed", "#000000", FLAGS["failed"]),
     State("not converged", "#D55E00", FLAGS["fitted"], FLAGS["converged"]),
     State("poor", "#E69F00", FLAGS["poor"]),
-    State("not resolved", "#CC79A7", FLAGS["unresolved"]),
+    State("not resolved", "#CC79A7", FLAGS["unidentified"]),
     State("at a bound", "#56B4E9", FLAGS["at_bound"]),
     State("fine, started again", "#009E73", FLAGS["restarted"]),
     State("fine", "#cfe8dc"),

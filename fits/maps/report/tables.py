@@ -23,7 +23,7 @@ WORDS = {
     "masked": "masked",
     "too_few_readings": "too few readings",
     "failed": "failed: no finite value",
-    "unresolved": "a parameter is not resolved",
+    "unidentified": "a parameter is not resolved",
 }
 """What is said of each flag."""
 

@@ -38,12 +38,12 @@ def in_short(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
     else:
         words.append("No texel is at a bound.")
     words.append(_poor(found, map, too_far=not explains and found.reduced_chi_square[1] > 1.0))
-    if found.counts["unresolved"]:
-        unresolved = share(found.counts["unresolved"], found.fitted)
-        words.append(f"In {unresolved} of the fitted texels the readings do not resolve every parameter.")
+    if found.counts["unidentified"]:
+        unidentified = share(found.counts["unidentified"], found.fitted)
+        words.append(f"In {unidentified} of the fitted texels the readings do not resolve every parameter.")
     shared, accurate = _shared(map), _numerical(found)
     words += [*shared, *accurate[0]]
-    few = all(found.counts[flag] <= SOME * found.fitted for flag in ("at_bound", "poor", "unresolved"))
+    few = all(found.counts[flag] <= SOME * found.fitted for flag in ("at_bound", "poor", "unidentified"))
     return words, fine and good and explains and few and not shared and accurate[1]
 
 

@@ -99,8 +99,8 @@ class Process(eqx.Module):
     def elsewhere(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
         """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
         roots, root = self._factors(relative, at)
-        sizes, own = (jnp.exp(at.growth * log_sizes(where)) for where in (self.where, at_places))
-        across = sizes[:, None] * own * alike(self.where, at_places, at.half, at.difference)
+        sizes, own = (jnp.exp(at.grazing_exponent * log_sizes(where)) for where in (self.where, at_places))
+        across = sizes[:, None] * own * alike(self.where, at_places, at.length_half, at.length_difference)
         across = solve_triangular(roots.nodes, across, lower=True)
         rows = at.amplitude * jnp.einsum("cx,rm->mcxr", roots.channels, across)
         rows = rows.reshape(*rows.shape[:2], -1)

@@ -25,13 +25,13 @@ JITTER = 1e-8
 
 
 class Correlation(NamedTuple):
-    """The numbers of a process, as `fits.problem.discrepancy.parameters.Correlated` says of them."""
+    """The numbers of a process, as `fits.problem.discrepancy.parameters.Discrepancy` says of them."""
 
     amplitude: Any
-    half: Any
-    difference: Any
-    growth: Any
-    channels: Any
+    length_half: Any
+    length_difference: Any
+    grazing_exponent: Any
+    channel_correlation: Any
 
 
 class Roots(NamedTuple):

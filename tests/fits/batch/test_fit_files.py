@@ -168,7 +168,7 @@ def test_held_out_data_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert coat["loss"] < bare["loss"]
     fit = fits.load_fit("out/coated.csv/coat")
     seen = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
-    assert coat["loss"] == pytest.approx(-2.0 * seen.log_score * seen.count, abs=2e-3 * seen.count)
+    assert coat["loss"] == pytest.approx(-2.0 * seen.elpd * seen.count, abs=2e-3 * seen.count)
 
 
 def test_the_best_of_a_search_is_a_result_like_others(

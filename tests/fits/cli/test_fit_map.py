@@ -121,7 +121,7 @@ def test_the_stack_file_says_the_rest(place: Path, monkeypatch: pytest.MonkeyPat
     called = _in_place(monkeypatch, lambda: made)
     text = (place / "coat.toml").read_text()
     more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\nshared = true\n"
-    (place / "coat.toml").write_text(text + more + "[instrument]\ndetector = 2.0\n")
+    (place / "coat.toml").write_text(text + more + "[instrument]\ndetector_aperture = 2.0\n")
     assert main([*WORDS, "--noise", "0.03"]) == 0
     assert called.given is not None
     assert called.given["noise"] == Noise(relative=0.03, tails="student")

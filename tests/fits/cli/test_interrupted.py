@@ -1,6 +1,7 @@
 """Disks that fill up, processes that are killed or that meet, and damaged files: what was kept stays, and is seen."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -245,6 +246,32 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
         assert (work / "result" / name).read_bytes() == (work / "whole" / name).read_bytes()
 
 
+def test_a_killed_batch_goes_on_with_the_fits_that_are_done(
+    work: Path, capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    (work / "scans").mkdir()
+    for name in ("a.csv", "b.csv", "c.csv"):
+        shutil.copy("data.csv", work / "scans" / name)
+    words = ["fit-many", "scans", "--stacks", "coat.toml", "--starts", "2", "--no-reports", "--processes", "1", "--out"]
+    store = work / "out" / "batch.store"
+
+    def one_is_done() -> bool:
+        return store.is_file() and Store.read(store).get("a.csv/coat") is not None
+
+    with stopped([*words, "out"], tmp_path_factory.getbasetemp() / "cache", one_is_done) as process:
+        before = contents(work)
+        assert f"in use by another process ({process.pid})" in refusal([*words, "out"], capsys)
+        assert contents(work) == before
+    first = before[str(work / "out" / "a.csv" / "coat" / "fit.json")]
+    for out in ("out", "whole"):
+        assert main([*words, out]) == 0
+    assert (work / "out" / "a.csv" / "coat" / "fit.json").read_bytes() == first  # not fitted again
+    for name in ("a.csv", "b.csv", "c.csv"):
+        one, other = (load_fit(work / out / name / "coat") for out in ("out", "whole"))
+        np.testing.assert_array_equal(one.vector, other.vector)
+    assert not list((work / "out").rglob(".*"))
+
+
 def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     path = tmp_path / "result" / "chain.h5"
@@ -257,10 +284,10 @@ def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path
 def test_a_chain_that_begins_again_is_not_allowed_what_the_last_one_was(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     options = {"walkers": 16, "path": tmp_path / "result" / "chain.h5"}
-    save_posterior(sample(coat_fit, max_steps=200, allow_short=True, **options), tmp_path / "result")
-    assert load_posterior(tmp_path / "result").allow_short
+    save_posterior(sample(coat_fit, max_steps=200, allow_unconverged=True, **options), tmp_path / "result")
+    assert load_posterior(tmp_path / "result").allow_unconverged
     sample(coat_fit, max_steps=100, resume=False, **options)
-    assert not load_posterior(tmp_path / "result").allow_short
+    assert not load_posterior(tmp_path / "result").allow_unconverged
 
 
 def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:

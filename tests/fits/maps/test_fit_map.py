@@ -112,7 +112,7 @@ def test_every_texel_ends_where_scipy_does(whole, geometry, values):
 def test_errors_and_chi_square_are_those_of_a_fit(whole, geometry, values):
     place = (3, 5)
     problem = problem_of(values[place], geometry, np.isfinite(values[place]))
-    found = fits.fit(FREE, problem.data, transport=TRANSPORT, noise=replace(NOISE, correlated=False), starts=2)
+    found = fits.fit(FREE, problem.data, transport=TRANSPORT, noise=replace(NOISE, discrepancy=False), starts=2)
     for name in NAMES:
         assert whole.errors[name][place] == pytest.approx(found.standard_errors[name], rel=1e-3)
     assert whole.reduced_chi_square[place] == pytest.approx(found.reduced_chi_square, rel=1e-6)
@@ -294,7 +294,7 @@ def test_what_cannot_be_is_refused(tmp_path, geometry, values):
         ({"chunk": 1e4}, "chunk is 10000.0; it must be a whole number of at least 1"),
         ({"starts": "8"}, "starts is '8'; it must be a whole number of at least 1"),
         ({"noise": 0.02}, "noise is 0.02; it must be a fits.Noise, or None"),
-        ({"noise": fits.Noise(relative=0.02, correlated=True)}, "noise.correlated"),
+        ({"noise": fits.Noise(relative=0.02, discrepancy=True)}, "noise.discrepancy"),
     ):
         with pytest.raises(ValueError, match=words):
             fitted(out, geometry, values, **options)
@@ -313,11 +313,11 @@ def test_chunks_are_as_square_as_the_map_allows(shape, texels, expected):
 
 
 def test_an_instrument_stands_between_map_and_readings(tmp_path, geometry, values):
-    instrument = fits.Instrument(detector=2.0, floor=1e-4, gain_per_incidence=0.01)
+    instrument = fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)
     noise = fits.Noise(relative=0.02)
     found = fitted(tmp_path / "seen.zarr", geometry, values[3:4], noise=noise, instrument=instrument)
     data = problem_of(values[3, 2], geometry, np.ones((16, 1), bool)).data
-    alone = replace(noise, correlated=False)
+    alone = replace(noise, discrepancy=False)
     one = fits.fit(FREE, data, transport=TRANSPORT, noise=alone, instrument=instrument, starts=2)
     assert found.names == one.problem.names
     for name in found.names:
@@ -326,6 +326,6 @@ def test_an_instrument_stands_between_map_and_readings(tmp_path, geometry, value
     kept = zarr.open_group(tmp_path / "seen.zarr", mode="r")["pilot"].attrs["rings"]
     assert kept == one.problem.instrument.rings == 1
     assert found.numerical_error is not None
-    shared = fits.Instrument(offset=fits.Free(0.0, -1.0, 1.0, shared=True))
+    shared = fits.Instrument(tilt=fits.Free(0.0, -1.0, 1.0, same_for_all_texels=True))
     with pytest.raises(ValueError, match=r"instrument\.offset is shared"):
         fitted(tmp_path / "none.zarr", geometry, values, instrument=shared)

@@ -15,7 +15,7 @@ from fits.maps.job import Part
 from fits.maps.posterior import problem_at, sample_texels
 from fits.maps.store import FLAGS
 
-NOISE = fits.Noise(relative=0.02, floor=1e-4, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 STACK = lj.Stack(
     [lj.Medium(fits.Free(0.5, 0.05, 3.0), 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(fits.Free(0.4, 0.0, 1.0))
 )

@@ -15,7 +15,7 @@ from fits.maps.sharing import _Arrow, _step, fit_shared
 from fits.maps.texels import texels
 
 TRANSPORT = lj.SingleScattering()
-NOISE = fits.Noise(relative=0.02, floor=1e-4, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 TRUTH = np.array([[0.3, 0.2], [0.5, 0.3], [0.8, 0.4], [1.2, 0.5]])
 G = 0.4
 NAMES = ("layers[0].thickness", "base.albedo")
@@ -27,7 +27,9 @@ def coat(thickness, albedo, g):
 
 def free(low=-0.2, high=0.8, prior=None):
     return coat(
-        fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), fits.Free(0.2, low, high, prior=prior, shared=True)
+        fits.Free(0.5, 0.05, 3.0),
+        fits.Free(0.4, 0.0, 1.0),
+        fits.Free(0.2, low, high, prior=prior, same_for_all_texels=True),
     )
 
 
@@ -75,7 +77,7 @@ def test_the_joint_fit_of_a_sample_is_that_of_joint(geometry, values, prior, bou
 
 
 def test_errors_of_what_a_sample_does_not_know_are_infinite(geometry, values):
-    stack = coat(*(fits.Free(0.5, 0.1, 0.9, shared=k > 0) for k in range(3)))
+    stack = coat(*(fits.Free(0.5, 0.1, 0.9, same_for_all_texels=k > 0) for k in range(3)))
     problem, gradient = problem_of(stack, values[0], geometry), np.array([1.0, 0.0])
     for information in (np.zeros((2, 2)), np.diag([1e8, 0.0]), np.diag([1e8, -1e-9])):
         step, error, _ = _step(problem, np.array([1, 2]), _Arrow(0.0, gradient, information), np.array([0.5, 0.5]))
@@ -99,7 +101,7 @@ def test_a_map_holds_what_its_sample_shares(tmp_path, geometry, values):
 
 def test_a_shared_level_of_noise_is_found(tmp_path, geometry, values):
     stack = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), G)
-    noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, shared=True))
+    noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, same_for_all_texels=True))
     found = fits.fit_map(
         stack, geometry, values, tmp_path / "noise.zarr", noise=noise, transport=TRANSPORT, starts=2, chunk=4
     )
@@ -113,7 +115,7 @@ def test_a_shared_level_of_noise_is_found(tmp_path, geometry, values):
 
 
 def test_a_map_of_shared_numbers_alone_is_refused(tmp_path, geometry, values):
-    stack = coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, shared=True))
+    stack = coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, same_for_all_texels=True))
     with pytest.raises(ValueError, match="all free parameters are shared"):
         fits.fit_map(stack, geometry, values, tmp_path / "none.zarr", noise=NOISE, transport=TRANSPORT)
     assert not (tmp_path / "none.zarr").exists()

@@ -28,7 +28,7 @@ LIBRARY = Library(
     },
 )
 TRUTH = lj.Stack([lj.Interface(1.4, 0.25)], lj.Lambertian(0.3))
-GIVEN = {"transport": lj.Statistical(), "noise": Noise(relative=0.03, floor=1e-6, correlated=False)}
+GIVEN = {"transport": lj.Statistical(), "noise": Noise(relative=0.03, floor=1e-6, discrepancy=False)}
 OPTIONS = SearchOptions(layers=1, starts=2)
 SHORT = SearchOptions(layers=0, starts=1)
 
@@ -55,7 +55,7 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search, directory: Path)
     assert found.options == OPTIONS
     assert found.ranking == tuple(one.name for one in found.candidates)
     assert set(found.ranking) == {"diffuse", "metal", "interface / diffuse", "interface / metal"}
-    assert found.probabilities["interface / diffuse"] == found.best.foresight.probability > 0.999
+    assert found.probabilities["interface / diffuse"] == found.best.model_score.model_probability > 0.999
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
     assert found.best.bic == 0.0
     values, errors = found.best.fit.values, found.best.fit.standard_errors
@@ -68,7 +68,7 @@ def test_the_stack_behind_the_data_is_found(found: fits.Search, directory: Path)
 def test_others_get_a_discrepancy_term(data: fits.Measurements, found: fits.Search) -> None:
     by_rule = GIVEN | {"noise": Noise(relative=0.03, floor=1e-6)}
     again = search(data, LIBRARY, options=OPTIONS, **by_rule)
-    noise = {one.name: one.fit.problem.noise.correlated for one in again.candidates}
+    noise = {one.name: one.fit.problem.noise.discrepancy for one in again.candidates}
     assert not noise["interface / diffuse"]
     assert all(noise[name] for name in ("diffuse", "metal", "interface / metal"))
     assert again.best.name == found.best.name
@@ -100,7 +100,7 @@ def test_a_killed_search_goes_on_with_the_incidence_where_it_was(
     assert again.ranking == found.ranking
     for one, other in zip(again.candidates, found.candidates, strict=True):
         np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
-        assert one.foresight == other.foresight
+        assert one.model_score == other.model_score
     assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
 
 
@@ -110,7 +110,7 @@ def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Mea
     short = search(data, many, options=replace(SHORT, budget=0.0), **given)
     assert short.stopped
     assert 0 < len(short.candidates) < len(many.bases)
-    assert short.best.foresight is not None
+    assert short.best.model_score is not None
     assert "The time budget ended the search" in " ".join(report.search_sentences(short))
     longer = search(data, many, options=replace(SHORT, budget=60.0), **given)
     assert not longer.stopped
@@ -120,7 +120,7 @@ def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Mea
 def test_every_structure_is_seen_by_the_instrument_and_another_search_is_refused(
     data: fits.Measurements, tmp_path: Path
 ) -> None:
-    seen = fits.Instrument(detector=2.0, gain_per_incidence=0.02)
+    seen = fits.Instrument(detector_aperture=2.0, gain_sd=0.02)
     given = GIVEN | {"options": SHORT, "directory": tmp_path / "seen"}
     found = search(data, LIBRARY, instrument=seen, **given)
     assert len(found.candidates) == 2

@@ -115,7 +115,7 @@ def test_a_texel_is_shown_as_the_gravest_of_its_flags() -> None:
         "failed": FLAGS["failed"] | FLAGS["restarted"],
         "not converged": FLAGS["fitted"] | FLAGS["poor"],
         "poor": GOOD | FLAGS["poor"] | FLAGS["at_bound"],
-        "not resolved": GOOD | FLAGS["unresolved"] | FLAGS["at_bound"],
+        "not resolved": GOOD | FLAGS["unidentified"] | FLAGS["at_bound"],
         "at a bound": GOOD | FLAGS["at_bound"] | FLAGS["restarted"],
         "fine, started again": GOOD | FLAGS["restarted"],
         "fine": GOOD,

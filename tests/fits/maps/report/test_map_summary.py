@@ -51,7 +51,7 @@ def test_counts_and_quartiles_are_those_of_the_arrays(map: FittedMap, painted: F
         "masked": 29,
         "too_few_readings": 20,
         "failed": 10,
-        "unresolved": 0,
+        "unidentified": 0,
     }
     assert found.converged == (541 - 4) / 541
     assert found.at_bound == {NAMES[0]: 0, NAMES[1]: 25, NAMES[2]: 0}
@@ -127,7 +127,7 @@ def test_chi_square_far_from_one_is_told(factor: float, sentence: str, tmp_path:
 def test_a_map_is_fine_if_few_texels_leave_a_parameter_open(texels: int, expected: bool, tmp_path: Path) -> None:
     """Of 600; that they do is told in either case."""
     found = numbers(SHAPE)
-    found["flags"].reshape(-1)[:texels] |= FLAGS["unresolved"]
+    found["flags"].reshape(-1)[:texels] |= FLAGS["unidentified"]
     words, fine = told(tmp_path, found)
     assert "of the fitted texels the readings do not resolve every parameter" in words
     assert fine == expected
@@ -202,7 +202,7 @@ def test_the_worst_texels_come_first_with_their_values(map: FittedMap, painted: 
 def test_flags_of_the_worst_texels_are_told(tmp_path: Path) -> None:
     found = numbers((2, 2))
     found["reduced_chi_square"][...] = [[4.0, 3.0], [2.0, np.nan]]
-    found["flags"][0, 0] = FLAGS["fitted"] | FLAGS["poor"] | FLAGS["unresolved"]
+    found["flags"][0, 0] = FLAGS["fitted"] | FLAGS["poor"] | FLAGS["unidentified"]
     bounded(found, np.array([[False, True], [False, False]]), 2)
     table = tables.worst_table(stored(tmp_path / "a.zarr", found, (2, 2)))
     assert [row[0] for row in table.rows] == ["[0, 0]", "[0, 1]", "[1, 0]"]
