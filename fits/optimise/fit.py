@@ -22,7 +22,7 @@ from fits.optimise.discrepancy import (
     without_discrepancy,
 )
 from fits.optimise.identifiability import OPEN_BEYOND
-from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, unit_of
+from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, starts_store, unit_of
 from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
 from fits.optimise.refinement import Accuracy, refined
 from fits.optimise.resolution import resolutions
@@ -245,10 +245,8 @@ def _ends(
     """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
     if checkpoint is None:
         return run_starts(problem, points, solver, progress)
-    from fits.optimise.starts_file import StartsFile
-
-    with StartsFile(checkpoint, problem, points, solver) as kept:
-        return run_starts(problem, points, solver, progress, kept)
+    with starts_store(checkpoint, problem, points, solver) as store:
+        return run_starts(problem, points, solver, progress, store)
 
 
 def _minima(

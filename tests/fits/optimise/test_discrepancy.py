@@ -10,8 +10,8 @@ from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
+from fits.optimise.multi_start import Floats
 from fits.optimise.result import Fit
-from fits.optimise.starts_file import Floats
 from fits.problem.discrepancy.inducing_points import places
 from fits.problem.discrepancy.kernel import log_scales
 from fits.problem.discrepancy.parameters import Discrepancy
