@@ -17,7 +17,7 @@ from rich.table import Table
 import fits
 import layerjax as lj
 
-NOISE = fits.Noise(relative=0.02, floor=1e-6, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-6, discrepancy=False)
 SCANS = fits.slices(incidence=(10.0, 30.0, 50.0, 70.0), outgoing=np.arange(-80.0, 81.0, 2.0))
 
 
@@ -28,10 +28,10 @@ def instrument():
         return lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(albedo))
 
     free = coat(fits.Free(1.6, 1.2, 2.2), fits.Free(0.12, 0.02, 0.5), fits.Free(0.4, 0.0, 1.0))
-    seen = fits.Instrument(detector=4.0, offset=0.3)
+    seen = fits.Instrument(detector_aperture=4.0, tilt=0.3)
     exact = fits.Problem(free, readings(coat(1.5, 0.08, 0.3)), lj.Statistical(), NOISE, instrument=seen)
     data = readings(np.asarray(exact.predict([1.5, 0.08, 0.3])))
-    known = fits.Instrument(detector=4.0, offset=fits.Free(0.0, -2.0, 2.0))
+    known = fits.Instrument(detector_aperture=4.0, tilt=fits.Free(0.0, -2.0, 2.0))
     ways = {"exact directions": None, "its instrument": known}
     found = {way: fit(free, data, lj.Statistical(), instrument=given) for way, given in ways.items()}
     show("A detector of 4 degrees", {**dict(zip(exact.names, (1.5, 0.08, 0.3), strict=True)), LEAN: 0.3}, found)
@@ -97,7 +97,7 @@ def bins():
     show("Flakes from a MERL table", dict(zip(names, (0.8, 0.2, 0.5), strict=True)), found)
 
 
-LEAN = "instrument.offset"
+LEAN = "instrument.tilt"
 
 
 def readings(of, transport=None):

@@ -18,6 +18,7 @@ import numpy as np
 import fits
 import layerjax as lj
 from fits.reports import verdicts
+from fits.reports.diagnostics import residual_structure, standardised
 
 TRUTH = {
     "layers[0].ior": 1.5,
@@ -67,7 +68,7 @@ def main():
             truth, error = TRUTH[name], fit.standard_errors[name]
             off = f"{(value - truth) / error:+5.1f} errors off" if np.isfinite(error) else "at a bound"
             print(f"  {name:20} truth {truth:4.2f}  fit {value:6.4f} ± {error:6.4f}  {off}")
-        for sentence in verdicts.outcome(fit):
+        for sentence in verdicts.outcome(fit, residual_structure(data, standardised(fit))):
             print(f"  {sentence}")
         fits.report(fit, path=out / f"{number}.html")
 

@@ -9,9 +9,8 @@ from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.any_report import report as report
-    from fits.batch.files import FittedFiles as FittedFiles
-    from fits.batch.files import fit_files as fit_files
-    from fits.batch.searching import Searching as Searching
+    from fits.batch.fit_files import FittedFiles as FittedFiles
+    from fits.batch.fit_files import fit_files as fit_files
     from fits.data.formats import read as read
     from fits.data.formats.csv import write_csv as write_csv
     from fits.data.formats.rxt import Slab as Slab
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
-    from fits.exports.export import Exported as Exported
+    from fits.exports.export import ExportReport as ExportReport
     from fits.exports.export import export as export
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
@@ -30,21 +29,21 @@ if TYPE_CHECKING:
     from fits.maps.options import MapOptions as MapOptions
     from fits.maps.options import SpatialPrior as SpatialPrior
     from fits.optimise.fit import fit as fit
-    from fits.optimise.identifiability import Combination as Combination
+    from fits.optimise.identifiability import Direction as Direction
     from fits.optimise.result import Fit as Fit
     from fits.prediction.average import Average as Average
     from fits.prediction.average import average as average
     from fits.prediction.compare import Comparison as Comparison
     from fits.prediction.compare import compare as compare
-    from fits.prediction.cross_validation import leave_out as leave_out
+    from fits.prediction.cross_validation import cross_validate as cross_validate
     from fits.prediction.evidence import Evidence as Evidence
     from fits.prediction.evidence import evidence as evidence
-    from fits.prediction.model_scores import Foresight as Foresight
+    from fits.prediction.model_scores import ModelScore as ModelScore
     from fits.prediction.predict import predict as predict
     from fits.prediction.prediction import Prediction as Prediction
     from fits.prediction.prediction import Scores as Scores
     from fits.prediction.prediction import scores as scores
-    from fits.problem.discrepancy.parameters import Correlated as Correlated
+    from fits.problem.discrepancy.parameters import Discrepancy as Discrepancy
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
     from fits.problem.noise import Noise as Noise
@@ -68,8 +67,10 @@ if TYPE_CHECKING:
     from fits.structure_search.library import Library as Library
     from fits.structure_search.library import default_library as default_library
     from fits.structure_search.library import read_library as read_library
-    from fits.structure_search.searching import Search as Search
-    from fits.structure_search.searching import search as search
+    from fits.structure_search.search import Candidate as Candidate
+    from fits.structure_search.search import Search as Search
+    from fits.structure_search.search import SearchOptions as SearchOptions
+    from fits.structure_search.search import search as search
 
 _HOMES = {
     "Average": "prediction.average",
@@ -78,7 +79,7 @@ _HOMES = {
     "compare": "prediction.compare",
     "Evidence": "prediction.evidence",
     "evidence": "prediction.evidence",
-    "Exported": "exports.export",
+    "ExportReport": "exports.export",
     "export": "exports.export",
     "Fit": "optimise.result",
     "fit_map": "maps.fit_map",
@@ -86,15 +87,15 @@ _HOMES = {
     "open_map": "maps.fitted_map",
     "MapOptions": "maps.options",
     "SpatialPrior": "maps.options",
-    "Foresight": "prediction.model_scores",
+    "ModelScore": "prediction.model_scores",
     "read": "data.formats",
     "write_csv": "data.formats.csv",
     "read_slab": "data.formats.rxt",
     "Slab": "data.formats.rxt",
     "Geometry": "data.geometry",
     "slices": "data.geometry",
-    "Combination": "optimise.identifiability",
-    "Correlated": "problem.discrepancy.parameters",
+    "Direction": "optimise.identifiability",
+    "Discrepancy": "problem.discrepancy.parameters",
     "Instrument": "problem.instrument",
     "Joint": "problem.joint",
     "Noise": "problem.noise",
@@ -116,15 +117,16 @@ _HOMES = {
     "scores": "prediction.prediction",
     "predict": "prediction.predict",
     "sample": "sampling.sample",
-    "Search": "structure_search.searching",
-    "search": "structure_search.searching",
+    "Candidate": "structure_search.search",
+    "Search": "structure_search.search",
+    "SearchOptions": "structure_search.search",
+    "search": "structure_search.search",
     "Library": "structure_search.library",
     "default_library": "structure_search.library",
     "read_library": "structure_search.library",
-    "leave_out": "prediction.cross_validation",
-    "fit_files": "batch.files",
-    "FittedFiles": "batch.files",
-    "Searching": "batch.searching",
+    "cross_validate": "prediction.cross_validation",
+    "fit_files": "batch.fit_files",
+    "FittedFiles": "batch.fit_files",
     "Problem": "problem.problem",
     "render": "reports.render",
     "report": "any_report",

@@ -110,7 +110,7 @@ def study(
         if index % 10 == 0:
             report(f"repeat {index} of {size.repeats}")
         fit = fit_problem(problem_of(geometry, values), starts=STARTS, seed=index)
-        results.append((fit, fits.sample(fit, walkers=WALKERS, seed=index, allow_short=True)))
+        results.append((fit, fits.sample(fit, walkers=WALKERS, seed=index, allow_unconverged=True)))
     rows = _rows(results, many, size)
     limits = stats.binom.interval(0.95, size.repeats, LEVEL)
     counts = _counts(results, many)

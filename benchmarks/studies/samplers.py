@@ -135,7 +135,7 @@ def study(
 
 def _sampled(name: str, sampler: str, fit: fits.Fit, ess: float) -> Sampled:
     began = time.perf_counter()
-    posterior = fits.sample(fit, seed=1, ess=ess, max_steps=STEPS, allow_short=True, **SAMPLERS[sampler])
+    posterior = fits.sample(fit, seed=1, ess=ess, max_steps=STEPS, allow_unconverged=True, **SAMPLERS[sampler])
     kept = posterior.chain[posterior.burn_in :].reshape(-1, len(posterior.names))
     return Sampled(
         posterior=name,

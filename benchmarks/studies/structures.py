@@ -18,7 +18,7 @@ from fits.data.measurements import Measurements
 from fits.engines import Failure, run
 from fits.problem.compilation import cores
 from fits.structure_search.library import Library, Structure, default_library
-from fits.structure_search.searching import named
+from fits.structure_search.search import named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4
@@ -74,7 +74,7 @@ this judges the search, not how well a transport describes a material.
 
 {rows}
 *first*, *first three*: how often the true structure is ranked there. *told apart*: how often a wrong one is ahead of it
-by more than chance (see `Foresight.surely_behind`). *too complex*: how often such a one has more layers. *time*: of a
+by more than chance (see `ModelScore.clear_diff`). *too complex*: how often such a one has more layers. *time*: of a
 search on one core.
 
 The true structure is among the first three in {found} of {repeats} (asked for: {wanted} of {asked}); a more complex one
@@ -92,7 +92,7 @@ class Repeat:
     place: int | None
     best: str
     behind: float | None
-    surely_behind: float | None
+    clear_diff: float | None
     fitted: int
     seconds: float
 
@@ -104,7 +104,7 @@ class Repeat:
     @property
     def is_beaten(self) -> bool:
         """Whether another structure is preferred by more than chance."""
-        return self.surely_behind is None or self.surely_behind > 0.0
+        return self.clear_diff is None or self.clear_diff > 0.0
 
 
 def study(
@@ -165,17 +165,18 @@ def run_repeat(index: int) -> Repeat:
     began = time.perf_counter()
     structure, data = material(index)
     noise = fits.Noise(relative=NOISE, floor=1e-6)
-    found = fits.search(data, LIBRARY, layers=3, transport=TRANSPORT, noise=noise, starts=STARTS, seed=index)
-    places = [place for place, one in enumerate(found.found) if one.structure == structure and one.foresight]
-    seen = found.found[places[0]].foresight if places else None
+    options = fits.SearchOptions(layers=3, starts=STARTS)
+    found = fits.search(data, LIBRARY, transport=TRANSPORT, noise=noise, seed=index, options=options)
+    places = [place for place, one in enumerate(found.candidates) if one.structure == structure and one.model_score]
+    seen = found.candidates[places[0]].model_score if places else None
     return Repeat(
         repeat=index,
         truth=named(structure),
         place=places[0] if places else None,
         best=found.best.name,
-        behind=None if seen is None else seen.behind,
-        surely_behind=None if seen is None else seen.surely_behind,
-        fitted=len(found.found),
+        behind=None if seen is None else seen.elpd_diff,
+        clear_diff=None if seen is None else seen.clear_diff,
+        fitted=len(found.candidates),
         seconds=time.perf_counter() - began,
     )
 

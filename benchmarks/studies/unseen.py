@@ -37,7 +37,7 @@ TEXT = """\
 {environment}
 Every stack of [`examples/`](../../examples), with all orders of scattering, is fitted to three coatings at incidences
 of {fitted} degrees and foretells the readings at {asked}: once with noise that readings do not share, once with errors
-of the model that they do (`Noise(correlated=True)`). {starts} starts a fit.
+of the model that they do (`Noise(discrepancy=True)`). {starts} starts a fit.
 
 {rows}
 *in 95 %*: share of the unseen readings inside the band of 95 %, at {asked} degrees; *error*: median of |prediction /
@@ -60,7 +60,7 @@ class Row:
     held_all: float
     errors: list[float]
     error: float
-    log_score: float
+    elpd: float
     amplitude: float | None
     half: float | None
     difference: float | None
@@ -109,7 +109,7 @@ def run_row(stack: str, coating: str, shared: bool, starts: int = STARTS) -> Row
         given.stack,
         data.where(_at(data, FITTED)),
         transport=given.transport,
-        noise=replace(given.noise, correlated=shared),
+        noise=replace(given.noise, discrepancy=shared),
         scale=given.scale,
         starts=starts,
     )
@@ -127,13 +127,13 @@ def run_row(stack: str, coating: str, shared: bool, starts: int = STARTS) -> Row
         held_all=both.coverage[0.95],
         errors=[one.median_error for one in each],
         error=both.median_error,
-        log_score=both.log_score,
+        elpd=both.elpd,
         amplitude=None if at is None else float(at.amplitude),
-        half=None if at is None else float(at.half),
-        difference=None if at is None else float(at.difference),
+        half=None if at is None else float(at.length_half),
+        difference=None if at is None else float(at.length_difference),
         at_bound=list(fit.at_bound),
         seconds=time.perf_counter() - began,
-        growth=None if at is None else float(at.growth),
+        growth=None if at is None else float(at.grazing_exponent),
     )
 
 
@@ -182,7 +182,7 @@ def _cells(row: Row | None) -> tuple[str, ...]:
     if row is None:
         return ("-",) * 4
     held = " / ".join(f"{100.0 * share:.0f}" for share in row.held)
-    return f"{row.reduced_chi_square:.2g}", held, f"{100.0 * row.error:.1f} %", f"{row.log_score:.2f}"
+    return f"{row.reduced_chi_square:.2g}", held, f"{100.0 * row.error:.1f} %", f"{row.elpd:.2f}"
 
 
 def _verdict(rows: list[Row]) -> str:
@@ -191,8 +191,8 @@ def _verdict(rows: list[Row]) -> str:
     plain = {(row.stack, row.coating): row for row in rows if not row.shared}
     both = [key for key in shared if key in plain]
     better = sum(shared[key].error <= plain[key].error for key in both)
-    higher = sum(shared[key].log_score > plain[key].log_score for key in both)
-    gain = math.fsum(shared[key].log_score - plain[key].log_score for key in both) / max(len(both), 1)
+    higher = sum(shared[key].elpd > plain[key].elpd for key in both)
+    gain = math.fsum(shared[key].elpd - plain[key].elpd for key in both) / max(len(both), 1)
     words = [
         f"With shared errors predictions err by no more than those with noise alone in {better} of {len(both)}, the "
         f"score is higher in {higher}, by {gain:.2f} in the mean.",

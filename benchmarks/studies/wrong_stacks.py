@@ -68,7 +68,7 @@ class Repeat:
     within_95: float
     within_half: float
     error: float
-    log_score: float
+    elpd: float
     amplitude: float | None
     seconds: float
 
@@ -113,7 +113,7 @@ def material(index: int, simulator: Callable[..., jax.Array]) -> Measurements:
 def run_repeat(index: int, kind: str, data: Measurements, asked: Rows) -> Repeat:
     """A wrong stack, fitted to what was not asked for."""
     began = time.perf_counter()
-    noise = fits.Noise(relative=NOISE, floor=1e-6, correlated=KINDS[kind])
+    noise = fits.Noise(relative=NOISE, floor=1e-6, discrepancy=KINDS[kind])
     fit = fits.fit(WRONG, data.where(~asked), transport=lj.Statistical(), noise=noise, starts=STARTS, seed=index)
     unseen = data.where(asked)
     found = fits.scores(fits.predict(fit, unseen, seed=index), unseen)
@@ -125,7 +125,7 @@ def run_repeat(index: int, kind: str, data: Measurements, asked: Rows) -> Repeat
         within_95=found.coverage[0.95],
         within_half=found.coverage[0.5],
         error=found.median_error,
-        log_score=found.log_score,
+        elpd=found.elpd,
         amplitude=None if at is None else float(at.amplitude),
         seconds=time.perf_counter() - began,
     )
@@ -161,6 +161,6 @@ def _row(kind: str, found: list[Repeat]) -> tuple[str, ...]:
     error, chi_square = (
         float(np.median([getattr(one, name) for one in found])) for name in ("error", "reduced_chi_square")
     )
-    score = float(np.mean([one.log_score for one in found]))
+    score = float(np.mean([one.elpd for one in found]))
     held = "yes" if BAND[0] <= np.mean(shares[0]) <= BAND[1] else "**no**"
     return kind, *words, f"{100 * error:.1f} %", f"{score:.2f}", f"{chi_square:.2f}", held

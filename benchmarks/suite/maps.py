@@ -84,7 +84,7 @@ def painted(
     noisy = exact * (1.0 + noise * np.random.default_rng(seed).standard_normal(exact.shape))
     more: dict[str, Any] = {}
     if shared:
-        truth["base.albedo"], more["base"] = np.full(shape, SHARED), fits.Free(0.5, 0.0, 1.0, shared=True)
+        truth["base.albedo"], more["base"] = np.full(shape, SHARED), fits.Free(0.5, 0.0, 1.0, same_for_all_texels=True)
     stack = _BUILD[material](*(one.free for one in numbers), **more)
     return Painted(truth, geometry, noisy, stack, fits.Noise(relative=noise))
 

@@ -9,7 +9,7 @@ from fits.names import FORMATS, OBJECTIVES, QUANTITIES, STRATA
 MAX_STEPS = 20_000
 LAYERS = 3
 
-SAMPLING = ("sampler", "walkers", "ess", "surrogate", "max_steps", "allow_short")
+SAMPLING = ("sampler", "walkers", "ess", "surrogate", "max_steps", "allow_unconverged")
 """Options of `add_sampling`."""
 
 READING = ("format", "quantity", "bins", "all", "strata", "wavelengths", "corrected")
@@ -91,7 +91,7 @@ def add_sampling(parser: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--max-steps", type=count, metavar="N", help=f"hard limit (default: {MAX_STEPS})")
     group.add_argument(
-        "--allow-short",
+        "--allow-unconverged",
         action="store_const",
         const=True,
         help="report estimates from a chain under 50 autocorrelation times too",

@@ -61,8 +61,8 @@ def predict(arguments: Namespace) -> int:
     if arguments.out is not None:
         write_text(arguments.out, prediction_csv(found), force=arguments.force)
         print(
-            f"{arguments.out}: in 1/sr, bsdf_* with the model discrepancy, reading_* of a new measurement, "
-            "model_* of the stack alone"
+            f"{arguments.out}: in 1/sr, bsdf_* with the model discrepancy, predictive_* of a new measurement, "
+            "latent_* of the stack alone"
         )
         if not found.reliable:
             print(UNRELIABLE)

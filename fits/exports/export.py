@@ -41,7 +41,7 @@ ENDINGS: dict[str, str] = {
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportReport:
     """A file that was written. notes: what it holds, how well, and what it does not, one sentence each."""
 
     path: Path
@@ -59,7 +59,7 @@ def export(
     name: str | None = None,
     force: bool = False,
     progress: Progress | None = None,
-) -> Exported:
+) -> ExportReport:
     """Write a material for renderers or for optical design.
 
     Args:
@@ -90,7 +90,7 @@ def export(
     prepared = material_of(stack, chosen, name or path.stem, progress or silent)
     written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
     write_bytes(path, written.content, force)
-    return Exported(path, to, written.notes)
+    return ExportReport(path, to, written.notes)
 
 
 def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.Mixture, Any]:

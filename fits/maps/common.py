@@ -22,7 +22,7 @@ from fits.optimise.descent import PROMISE, descend
 from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.optimise.multi_start import start_points
 from fits.optimise.uncertainty import ON_BOUND
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.model import Model
 from fits.problem.parameters import is_free, split
 from fits.problem.problem import Problem
@@ -55,20 +55,22 @@ class Common(NamedTuple):
 
 
 def common_names(problem: Problem) -> tuple[str, ...]:
-    """Names of a problem whose `Free` is `shared`, in its order; one a channel where there is a number a channel."""
+    """Names of what is `same_for_all_texels`, in the order of the problem; one a channel where numbers are."""
     noise, instrument = problem.noise, problem.instrument
     parts = {"": problem.stack, "scale": problem.scale, "noise.relative": noise.relative, "noise.floor": noise.floor}
-    if isinstance(noise.correlated, Correlated):
-        parts |= {f"noise.correlated.{one.name}": getattr(noise.correlated, one.name) for one in fields(Correlated)}
+    if isinstance(noise.discrepancy, Discrepancy):
+        parts |= {f"noise.discrepancy.{one.name}": getattr(noise.discrepancy, one.name) for one in fields(Discrepancy)}
     if instrument is not None:
-        parts["instrument.offset"] = instrument.offset
+        parts["instrument.tilt"] = instrument.tilt
         if instrument.floor is not None:  # it stands in for that of the noise
             parts["noise.floor"] = instrument.floor
     marked = set()
     for where, part in parts.items():
         template, names, free = split(part, lambda path, where=where: plain_name(where + path))
         ends = [*(offset for _, offset, _ in template.slots), len(names)]
-        marked |= {name for k, one in enumerate(free) if one.shared for name in names[ends[k] : ends[k + 1]]}
+        marked |= {
+            name for k, one in enumerate(free) if one.same_for_all_texels for name in names[ends[k] : ends[k + 1]]
+        }
     return tuple(name for name in problem.names if name in marked)
 
 
@@ -106,7 +108,7 @@ def hold(stack: Any, values: Mapping[str, float]) -> Any:
     leaves, structure = jax.tree.flatten(stack, is_leaf=is_free)
     template, names, _ = split(stack, plain_name)
     for leaf, offset, shape in template.slots:
-        if leaves[leaf].shared:
+        if leaves[leaf].same_for_all_texels:
             own = names[offset : offset + leaves[leaf].arrays()[0].size]
             leaves[leaf] = jnp.asarray(np.reshape([number(name) for name in own], shape))
     return jax.tree.map(

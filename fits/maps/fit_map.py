@@ -25,10 +25,11 @@ from fits.maps.inputs import Block, MapData, map_data, words
 from fits.maps.options import USUAL, VERDICTS, MapOptions
 from fits.maps.pilot import Pilot, fit_pilot, load, require_smoothable, save
 from fits.maps.spatial import smooth_map
-from fits.maps.store import Store, blocks_of, create, fingerprint, require_folder, resume, throw_away
+from fits.maps.store import Store, blocks_of, create, described, require_folder, resume, throw_away
 from fits.problem.model import Transport
 from fits.problem.noise import Noise
 from fits.problem.problem import unit, with_floor
+from fits.store import fingerprint
 
 if TYPE_CHECKING:
     from fits.data.geometry import Geometry
@@ -55,8 +56,8 @@ def fit_map(
     What is in the store is not done again, and what comes to be in it does not depend on who did the work.
 
     Args:
-        stack: holds `Free` where each texel has a number of its own, or with `shared=True` all have one in common,
-            which is held from then on: errors of the others are conditional on it.
+        stack: holds `Free` where each texel has a number of its own, or with `same_for_all_texels=True` all have one in
+            common, which is held from then on: errors of the others are conditional on it.
         geometry, values, sigma, mask: see `fits.maps.inputs.map_data`: arrays or files, values (..., N, C) in 1/sr.
         out: directory of the store, made here, or begun by an earlier call with the same arguments.
         noise: as in `fits.fit`, but independent; a floor that it leaves out is one for the whole map.
@@ -95,7 +96,7 @@ def _fit(
     numbers = options.numbers()
     said = {"stack": stack, "noise": noise, "transport": transport, **options.model}
     said |= {name: one for name, one in numbers.items() if name not in VERDICTS}
-    identity = {name: fingerprint(one) for name, one in said.items()}
+    identity = fingerprint(**{name: described(one) for name, one in said.items()})
     identity |= {"measurements": data.fingerprint(), "precision": str(np.dtype(jnp.result_type(float)))}
     store = resume(path, identity, options.force)
 

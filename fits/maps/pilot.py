@@ -119,8 +119,8 @@ def prototype(
 ) -> Problem:
     """A problem with the measurements of a typical texel, in whose place those of each texel come."""
     noise = Noise() if noise is None else noise
-    if noise.correlated:
-        raise ValueError("noise.correlated is given; fits of maps have independent noise only")
+    if noise.discrepancy:
+        raise ValueError("noise.discrepancy is given; fits of maps have independent noise only")
     bright = np.nanmean(np.where(pilot.used, pilot.values, np.nan), axis=(1, 2))
     typical = int(np.argsort(bright)[len(bright) // 2])
     with np.errstate(all="ignore"):
@@ -137,7 +137,7 @@ def prototype(
     own = data.geometry is None
     wi, wo = (pilot.wi[typical], pilot.wo[typical]) if own else (data.geometry.wi, data.geometry.wo)  # type: ignore[union-attr]
     measured = Measurements(wi, wo, values, sigma, np.ones(len(values), bool), channel_names(data.channels))
-    noise = replace(noise, relative=relative, floor=floor, correlated=False)
+    noise = replace(noise, relative=relative, floor=floor, discrepancy=False)
     return Problem(stack, measured, transport=transport, noise=noise, **options.model)
 
 
@@ -165,7 +165,7 @@ def fit_pilot(data: MapData, stack: Any, noise: Noise | None, transport: Any, op
     require_smoothable(problem, options)
     if any(name.startswith("instrument.") for name in names):
         raise ValueError(
-            "instrument.offset is common to all texels; of an instrument nothing can be, hold it at a number"
+            "instrument.tilt is common to all texels; of an instrument nothing can be, hold it at a number"
         )
     if len(names) == len(problem.names):
         raise ValueError("stack: all free parameters are common; a map needs one that each texel has of its own")
@@ -327,7 +327,7 @@ def load(
     values, own = array["values"], data.geometry is None
     used = np.ones(len(values), bool)
     measured = Measurements(array["wi"], array["wo"], values, array.get("sigma"), used, channel_names(values.shape[1]))
-    problem = Problem(stack, measured, transport=transport, noise=replace(given, **levels, correlated=False), **rest)
+    problem = Problem(stack, measured, transport=transport, noise=replace(given, **levels, discrepancy=False), **rest)
     common = None
     if about["common"] is not None:
         numbers, errors, converged = about["common"]

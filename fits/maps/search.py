@@ -29,7 +29,7 @@ from fits.maps.descent import (
 )
 from fits.maps.options import MapOptions
 from fits.optimise.descent import PROMISE
-from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND, UNRESOLVED_BEYOND
+from fits.optimise.identifiability import LARGEST_ERROR, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
 from fits.optimise.uncertainty import LEAST_PULL, ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -251,7 +251,7 @@ def _errors(model: Model, end: Ending, root: Array, scatter: Array) -> tuple[Arr
     held = ((unit <= ON_BOUND) & (end.gradient > pull)) | ((unit >= 1.0 - ON_BOUND) & (end.gradient < -pull))
     held &= ~idle & known
     data = jnp.linalg.svd(jnp.concatenate([root, jnp.zeros((count, count))]), compute_uv=False)
-    unidentified = (data[-1] < 1.0 / UNRESOLVED_BEYOND) | ~known
+    unidentified = (data[-1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
     rows = jnp.where(held, 0.0, jnp.concatenate([root, box.prior_slopes()]))
     _, sizes, directions = jnp.linalg.svd(rows, full_matrices=False)
     least = jnp.maximum(jnp.finfo(sizes.dtype).eps * count * sizes[0], 1.0 / LARGEST_ERROR)

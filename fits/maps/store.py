@@ -9,7 +9,6 @@ nothing.
 
 import functools
 import glob
-import hashlib
 import itertools
 import json
 import os
@@ -31,7 +30,7 @@ from zarr.codecs import Crc32cCodec
 from fits._files import named, permissions, plain, require_there
 from fits.maps.inputs import UNREADABLE, Block
 from fits.problem.parameters import is_free
-from fits.problem.values import portable_repr
+from fits.store import portable_repr
 
 ROOT, KEY, KIND, FORMAT = "zarr.json", "layerjax", "fitted map", 3
 PARTIAL = ".partial"
@@ -342,42 +341,34 @@ def alike(one: str, other: str) -> bool:
     return same and len(parts[0]) == len(parts[1])
 
 
-def fingerprint(tree: Any, within: tuple[Any, ...] = ()) -> str:
-    """Of a tree: its structure and its numbers, and of functions their names, what they do and what they hold; not what
-    they find in global variables. within: functions that hold the tree, or may be in it themselves."""
+def described(tree: Any, within: tuple[Any, ...] = ()) -> list[Any]:
+    """A tree as `fits.store.fingerprint` tells it from others: its structure and its numbers, and of functions their
+    names, what they do and what they hold; not what they find in global variables.
+
+    within: functions that hold the tree, or may be in it themselves.
+    """
     leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
-    found = hashlib.sha256(repr(structure).encode())
-    for leaf in leaves:
-        if isinstance(leaf, np.ndarray | np.generic | jax.Array):
-            array = np.asarray(leaf)
-            found.update(repr((array.shape, str(array.dtype))).encode())
-            found.update(np.ascontiguousarray(array).tobytes())
-        else:
-            found.update((_of_function(leaf, within) if callable(leaf) else portable_repr(leaf)).encode())
-    return found.hexdigest()
+    return [repr(structure), *(_function(leaf, within) if callable(leaf) else leaf for leaf in leaves)]
 
 
-def _of_function(function: Any, within: tuple[Any, ...]) -> str:
-    """What tells a function, or whatever can be called, from others."""
+def _function(function: Any, within: tuple[Any, ...]) -> Any:
     if any(function is one for one in within):
         return "itself"
     within = (*within, function)
     if isinstance(function, functools.partial):
-        return fingerprint(["partial", function.func, function.args, function.keywords], within)
+        return ["partial", described([function.func, function.args, function.keywords], within)]
     name = f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', portable_repr(function))}"
     if hasattr(function, "__code__"):
         cells = [cell.cell_contents for cell in function.__closure__ or ()]
         held = [cells, function.__defaults__, function.__kwdefaults__, getattr(function, "__self__", None)]
-        return f"{name} {_of_code(function.__code__)} {fingerprint(held, within)}"
-    if hasattr(function, "__wrapped__"):  # as jax.jit has it
-        return f"{name} {_of_function(function.__wrapped__, within)}"
-    return name
+        return [name, _code(function.__code__), described(held, within)]
+    return [name, _function(function.__wrapped__, within)] if hasattr(function, "__wrapped__") else name  # of jax.jit
 
 
-def _of_code(code: CodeType) -> str:
+def _code(code: CodeType) -> list[Any]:
     """Its instructions, and the names and constants that they are about."""
     constants = [
-        _of_code(one) if isinstance(one, CodeType) else sorted(map(repr, one)) if isinstance(one, frozenset) else one
+        _code(one) if isinstance(one, CodeType) else sorted(map(repr, one)) if isinstance(one, frozenset) else repr(one)
         for one in code.co_consts
     ]
-    return repr((code.co_code, code.co_names, constants))
+    return [code.co_code, code.co_names, constants]

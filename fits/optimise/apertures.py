@@ -17,7 +17,7 @@ from fits.problem.problem import Problem
 from fits.progress import Progress
 
 ENOUGH_OF_PEAK = 1e-3
-"""Numerical error of readings, in units of the largest, that no fit needs to fall below."""
+"""Numerical error of measurements, in units of the largest, that no fit needs to fall below."""
 
 NO_BETTER = 0.3
 """Of an error: a ring more that leaves as much of it is not worth its rays; of a lobe it leaves a fifth or less."""
@@ -36,7 +36,7 @@ class Needed(NamedTuple):
 
 
 def has_rays(problem: Problem) -> bool:
-    """Whether readings are means over cones."""
+    """Whether measurements are means over cones."""
     return problem.model.optics is not None and problem.model.optics.row is not None
 
 
@@ -71,7 +71,7 @@ def needed(problem: Problem, vector: Floats, predicted: Floats, is_open: bool, p
     """
     assert problem.instrument is not None
     rings, values = rings_of(problem), predicted
-    most = most_rings(problem.instrument.source, problem.instrument.detector)
+    most = most_rings(problem.instrument.source_aperture, problem.instrument.detector_aperture)
     sigma, peak = spread(problem, vector, predicted), np.max(np.abs(predicted))
     asked = min(_of_lobes(problem, vector), most)
     if is_open and asked > rings:

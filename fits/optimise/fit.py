@@ -15,21 +15,25 @@ from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.optimise import apertures
 from fits.optimise.descent import PROMISE, ROUGHLY
-from fits.optimise.discrepancy import alone, counting, points, sharing
+from fits.optimise.discrepancy import (
+    datasets_with_discrepancy,
+    start_points_with_discrepancy,
+    with_discrepancy,
+    without_discrepancy,
+)
 from fits.optimise.identifiability import OPEN_BEYOND
-from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, unit_of
+from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, starts_store, unit_of
 from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
 from fits.optimise.refinement import Accuracy, refined
 from fits.optimise.resolution import resolutions
-from fits.optimise.result import ENDED, Alone, Fit, Minimum
+from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import Uncertainty
-from fits.problem.base import Posed
 from fits.problem.instrument import Instrument
 from fits.problem.joint import Joint
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, silent
 
 Floats = NDArray[np.float64]
@@ -85,7 +89,7 @@ def fit(
         for name, given in beside.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
-        problem: Posed = stack
+        problem: FittingProblem = stack
     elif data is None:
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
@@ -94,7 +98,7 @@ def fit(
 
 
 def fit_problem(
-    problem: Posed,
+    problem: FittingProblem,
     *,
     starts: int = 32,
     seed: int = 0,
@@ -121,7 +125,7 @@ def fit_problem(
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or silent
     found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
-    if not sharing(found):
+    if not datasets_with_discrepancy(found):
         return found
     return fit_again(
         problem,
@@ -136,7 +140,7 @@ def fit_problem(
 
 
 def fit_again(
-    problem: Posed,
+    problem: FittingProblem,
     found: Fit,
     *,
     starts: int = 32,
@@ -146,16 +150,18 @@ def fit_again(
     checkpoint: str | Path | None = None,
     refine: bool = True,
 ) -> Fit:
-    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
-    without = sharing(found) or {name: alone(found.part(name)) for name in problem.problems}
-    shared = problem.with_problems({name: counting(problem.problems[name]) for name in without})
+    """The fit of a problem with model discrepancy, after one without; arguments as of `fit_problem`."""
+    without = datasets_with_discrepancy(found) or {
+        name: without_discrepancy(found.part(name)) for name in problem.problems
+    }
+    shared = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in without})
     settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
     progress = progress or silent
 
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         progress(f"{stage} with shared errors", done, total, info)
 
-    places = points(shared, found, starts, seed)
+    places = start_points_with_discrepancy(shared, found, starts, seed)
     return _found(shared, places, solver, report, checkpoint, settings, without, refine)
 
 
@@ -172,13 +178,13 @@ def again(checkpoint: str | Path) -> Path:
 
 
 def _found(
-    problem: Posed,
+    problem: FittingProblem,
     places: Floats,
     solver: Solver,
     progress: Progress,
     checkpoint: str | Path | None,
     settings: dict[str, int | str],
-    without: Mapping[str, Alone] = MappingProxyType({}),
+    without: Mapping[str, WithoutDiscrepancy] = MappingProxyType({}),
     refine: bool = True,
 ) -> Fit:
     """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
@@ -196,12 +202,12 @@ def _found(
 
 
 def _fit_of(
-    at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Mapping[str, Alone]
+    at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Mapping[str, WithoutDiscrepancy]
 ) -> Fit:
     """The fit of an optimum, with what is to be said of it."""
     problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
-    minima, ended = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
+    minima, outcomes = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
     as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * at.excess)
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose measurements `Fit.part` tells
@@ -214,16 +220,16 @@ def _fit_of(
         status="",
         iterations=lowest.steps,
         condition_number=found.condition_number,
-        unresolved=found.unresolved,
-        without_influence=found.without_influence,
+        unidentified=found.unidentified,
+        insensitive=found.insensitive,
         minima=minima,
         alternatives=as_good,
         settings=settings,
-        ended=ended,
+        start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
         resolution=None if accuracy is None else accuracy.resolution,
-        alone=without.get(""),
-        alone_parts={name: one for name, one in without.items() if name},
+        without_discrepancy=without.get(""),
+        without_discrepancy_parts={name: one for name, one in without.items() if name},
     )
     notes = ["L-BFGS-B improved on Levenberg-Marquardt"] if at.improved else []
     notes += [] if accuracy is None else [accuracy.words]
@@ -234,19 +240,17 @@ def _fit_of(
 
 
 def _ends(
-    problem: Posed, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
+    problem: FittingProblem, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
 ) -> list[End]:
     """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
     if checkpoint is None:
         return run_starts(problem, points, solver, progress)
-    from fits.optimise.starts_file import StartsFile
-
-    with StartsFile(checkpoint, problem, points, solver) as kept:
-        return run_starts(problem, points, solver, progress, kept)
+    with starts_store(checkpoint, problem, points, solver) as store:
+        return run_starts(problem, points, solver, progress, store)
 
 
 def _minima(
-    problem: Posed, ends: list[End], best: int, found: Uncertainty, same_cost: float
+    problem: FittingProblem, ends: list[End], best: int, found: Uncertainty, same_cost: float
 ) -> tuple[tuple[Minimum, ...], dict[str, int]]:
     """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
     cost = np.array([end.cost for end in ends])
@@ -254,14 +258,14 @@ def _minima(
     width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
     spread = np.nan_to_num(found.standard_errors / width, nan=0.0, posinf=np.inf)
     same = SAME_BOX + SAME_ERRORS * np.minimum(spread, SAME_AT_MOST)
-    open_ = (spread > OPEN_BEYOND) | np.isin(problem.names, found.without_influence)
+    open_ = (spread > OPEN_BEYOND) | np.isin(problem.names, found.insensitive)
     alike = np.where(open_, np.inf, same)
     leaders: list[int] = []
     counts: list[int] = []
-    ended = dict.fromkeys(ENDED, 0)
+    outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
         if not np.isfinite(cost[index]) and index != best:
-            ended["failed"] += 1
+            outcomes["failed"] += 1
             continue
         near = [
             place
@@ -277,9 +281,9 @@ def _minima(
         if near or leads:
             place = near[0] if near else len(leaders) - 1
             counts[place] += 1
-            ended["other minima" if place else "this minimum"] += 1
+            outcomes["local minima" if place else "best minimum"] += 1
         else:
-            ended["out of steps" if ends[index].unfinished else "failed"] += 1
+            outcomes["maximum steps reached" if ends[index].unfinished else "failed"] += 1
     minima = tuple(
         Minimum(
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
@@ -289,27 +293,27 @@ def _minima(
         )
         for leader, count in zip(leaders, counts, strict=True)
     )
-    return minima, ended
+    return minima, outcomes
 
 
 def _status(fit: Fit) -> list[str]:
-    total, reached = sum(fit.ended.values()), fit.ended["this minimum"]
+    total, reached = sum(fit.start_outcomes.values()), fit.start_outcomes["best minimum"]
     words = [
         f"converged; {reached} of {total} starts reached this minimum"
         if fit.converged
         else f"not converged: the lowest of {total} starts did not; these are the best values seen"
     ]
     words += [
-        f"{fit.ended[key]} of {total} starts {word}"
-        for key, word in ENDED.items()
-        if key != "this minimum" and fit.ended[key]
+        f"{fit.start_outcomes[key]} of {total} starts {word}"
+        for key, word in OUTCOMES.items()
+        if key != "best minimum" and fit.start_outcomes[key]
     ]
     if fit.at_bound:
         words.append(f"at a bound: {', '.join(fit.at_bound)}; the errors of the others hold with them kept there")
-    if fit.without_influence:
-        words.append(f"without influence on the data: {', '.join(fit.without_influence)}")
-    if fit.unresolved:
-        words.append(f"the data leave {len(fit.unresolved)} direction(s) unresolved")
+    if fit.insensitive:
+        words.append(f"insensitive, with no effect on the data: {', '.join(fit.insensitive)}")
+    if fit.unidentified:
+        words.append(f"{len(fit.unidentified)} direction(s) in the space of parameters are not identified")
     if fit.alternatives:
         words.append(f"the errors are of this minimum alone, and {len(fit.alternatives)} more fit equally well")
     if fit.is_posterior and any(problem.noise_is_assumed for problem in fit.problem.problems.values()):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-UNRESOLVED_BEYOND = 0.1  # boxes: a direction with a larger standard error is not resolved
+UNIDENTIFIED_BEYOND = 0.1  # boxes: a direction with a larger standard error is not resolved
 OPEN_BEYOND = 1.0  # boxes: nor is this one held within its bounds
 UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
 LARGEST_ERROR = 1e9  # boxes: stands for all larger ones, so that squares of it can be formed
@@ -24,37 +24,38 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Combination:
-    """A direction in the space of parameters that the data do not resolve: only its members' other combinations are.
+class Direction:
+    """A direction in the space of parameters that the data do not identify: only its members' other combinations are.
 
     Attributes:
         error: standard error along the direction from the data alone, in boxes; infinite where they say nothing.
         weights: of its members by name, in units of their boxes, largest first; their squares add up to about 1.
-        alone: standard error that the data would give each member, were all other parameters known, in physical units.
+        conditional_errors: of each member, with all other parameters known, in physical units.
     """
 
     error: float
     weights: dict[str, float]
-    alone: dict[str, float]
+    conditional_errors: dict[str, float]
 
     def error_of(self, name: str) -> float:
         """Standard error that one parameter has along it, in boxes; 0 where it is no member."""
         return abs(self.weights[name]) * self.error if name in self.weights else 0.0
 
-    def called(self, names: Mapping[str, str]) -> "Combination":
+    def renamed(self, names: Mapping[str, str]) -> "Direction":
         """Of those of its members that have names elsewhere, under these."""
-        weights, alone = (
-            {names[name]: value for name, value in part.items() if name in names} for part in (self.weights, self.alone)
+        weights, errors = (
+            {names[name]: value for name, value in part.items() if name in names}
+            for part in (self.weights, self.conditional_errors)
         )
-        return replace(self, weights=weights, alone=alone)
+        return replace(self, weights=weights, conditional_errors=errors)
 
     @property
-    def open(self) -> bool:
+    def unconstrained(self) -> bool:
         """Whether one standard error along it crosses the whole box: only bounds and priors decide there."""
         return self.error > OPEN_BEYOND
 
 
-def unresolved_combinations(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Combination, ...]:
+def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Direction, ...]:
     """Directions known to no better than a tenth of the box, worst first.
 
     root: rows A of the data alone, (rows, P), in units of the boxes. width: of the boxes, (P,), in physical units.
@@ -69,7 +70,7 @@ def unresolved_combinations(root: Floats, names: tuple[str, ...], width: Floats)
     alone = np.divide(width, lengths, out=np.full(len(names), math.inf), where=lengths > 0)
     found = []
     for error, direction, owed in zip(errors[::-1], directions[::-1], share[::-1], strict=True):
-        if error <= UNRESOLVED_BEYOND:
+        if error <= UNIDENTIFIED_BEYOND:
             break
         direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
         members = [
@@ -78,10 +79,10 @@ def unresolved_combinations(root: Floats, names: tuple[str, ...], width: Floats)
             if abs(direction[index]) > (MEMBER if owed[index] > OWED else CERTAIN_MEMBER)
         ]
         found.append(
-            Combination(
+            Direction(
                 error=float(error) if error < UNKNOWN_BEYOND else math.inf,
                 weights={names[index]: float(direction[index]) for index in members},
-                alone={names[index]: float(alone[index]) for index in members},
+                conditional_errors={names[index]: float(alone[index]) for index in members},
             )
         )
     return tuple(found)
@@ -92,7 +93,7 @@ def floored(values: Floats) -> Floats:
     return np.maximum(values, np.maximum(np.finfo(float).eps * len(values) * values[0], 1.0 / LARGEST_ERROR))
 
 
-def without_influence(root: Floats, names: tuple[str, ...]) -> tuple[str, ...]:
+def insensitive(root: Floats, names: tuple[str, ...]) -> tuple[str, ...]:
     """Parameters that the data say nothing about, whatever is known of the others: their columns of A are all but 0."""
     lengths = np.linalg.norm(root, axis=0)
     return tuple(name for name, length in zip(names, lengths, strict=True) if length * UNKNOWN_BEYOND < 1.0)

@@ -9,18 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._lazy import shown_by
-from fits.optimise.identifiability import Combination
+from fits.optimise.identifiability import Direction
+from fits.problem.model import Density
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 
-ENDED = {
-    "this minimum": "reached this minimum",
-    "other minima": "ended at other minima",
-    "out of steps": "ran out of steps",
+OUTCOMES = {
+    "best minimum": "converged to the best minimum",
+    "local minima": "converged to other local minima",
+    "maximum steps reached": "reached the maximum of steps",
     "failed": "failed",
 }
-"""What is said of the starts that ended in each way (see `Fit.ended`)."""
+"""What is said of the starts that ended in each way (see `Fit.start_outcomes`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +35,10 @@ class Minimum:
 
 
 @dataclass(frozen=True)
-class Alone:
-    """The same stack fitted with noise that readings do not share: values and standard errors by name, how well.
+class WithoutDiscrepancy:
+    """The same stack fitted with independent noise: values and standard errors by name, how well.
 
-    alike: correlation of residuals of neighbours along the scans. pairs: of them.
+    residual_autocorrelation: of neighbours along the scans. pairs: of them.
     """
 
     values: dict[str, float]
@@ -45,7 +46,7 @@ class Alone:
     chi_square: float
     degrees_of_freedom: int
     log_likelihood: float
-    alike: float
+    residual_autocorrelation: float
     pairs: int
 
 
@@ -65,23 +66,23 @@ class Fit:
         status: how the fit ended, in words.
         iterations: steps of the solver to this minimum.
         condition_number: of the information about the parameters, each scaled to unit length.
-        unresolved: the combinations of parameters that the data alone do not separate, worst first.
+        unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
         minima: the minima that starts reached, best first.
         alternatives: those among `minima`, other than the best, that fit equally well (local minima of the same model).
             `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
             that hold a share of the posterior.
-        without_influence: names of the parameters that the data say nothing about.
+        insensitive: names of the parameters that the data say nothing about.
         settings: starts, seed and solver.
-        ended: how many starts ended where: "this minimum", "other minima", "out of steps", "failed".
+        start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
             from a coarser one, which is more than it; that of the rays for an instrument's cones is added. None where
             there is neither a resolution nor a cone.
         resolution: of the transport, and the rays for cones, in words; None where there is neither. `problem` holds it.
-        alone: the fit without errors that readings share, where it showed that they do and `problem` counts them by
-            that rule (see `Noise`); else None.
-        alone_parts: of a `Joint`, the same by the names of measurements.
-        part_of_joint: of one measurement of a `Joint`, its name there, kept where it is saved.
+        without_discrepancy: the fit without model discrepancy, where its residuals showed that one is needed (see
+            `Noise`); else None.
+        without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
+        dataset: of one measurement of a `Joint`, its name there, kept where it is saved.
         within: of the same, the fit of all of them, which is not.
     """
 
@@ -95,24 +96,24 @@ class Fit:
     status: str
     iterations: int
     condition_number: float
-    unresolved: tuple[Combination, ...]
+    unidentified: tuple[Direction, ...]
     minima: tuple[Minimum, ...]
     alternatives: tuple[Minimum, ...]
-    without_influence: tuple[str, ...] = ()
+    insensitive: tuple[str, ...] = ()
     settings: Mapping[str, int | str] = field(default_factory=dict)
-    ended: Mapping[str, int] = field(default_factory=dict)
+    start_outcomes: Mapping[str, int] = field(default_factory=dict)
     numerical_error: float | None = None
     resolution: str | None = None
-    alone: Alone | None = None
-    alone_parts: Mapping[str, Alone] = field(default_factory=dict)
-    part_of_joint: str | None = None
+    without_discrepancy: WithoutDiscrepancy | None = None
+    without_discrepancy_parts: Mapping[str, WithoutDiscrepancy] = field(default_factory=dict)
+    dataset: str | None = None
     within: "Fit | None" = None
 
     def __repr__(self) -> str:
         values = ", ".join(
             f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
         )
-        return f"<Fit to {self.problem.count} readings: {values}; {self.status}>"
+        return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
         return str(shown_by("fits.reports.notebook:fit_fragment", self))
@@ -142,12 +143,12 @@ class Fit:
             errors=self.errors[own],
             covariance=self.covariance[np.ix_(own, own)],
             at_bound=_called(self.at_bound, called),
-            without_influence=_called(self.without_influence, called),
-            unresolved=tuple(one.called(called) for one in self.unresolved if set(one.weights) & set(called)),
+            insensitive=_called(self.insensitive, called),
+            unidentified=tuple(one.renamed(called) for one in self.unidentified if set(one.weights) & set(called)),
             minima=tuple(map(minimum, self.minima)),
             alternatives=tuple(map(minimum, self.alternatives)),
-            alone=self.alone_parts.get(name),
-            part_of_joint=name,
+            without_discrepancy=self.without_discrepancy_parts.get(name),
+            dataset=name,
             within=self,
         )
         vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
@@ -169,9 +170,9 @@ class Fit:
         Raises:
             ValueError: it is one.
         """
-        if self.part_of_joint is not None:
+        if self.dataset is not None:
             raise ValueError(
-                f"{what}: {self.part_of_joint!r} is a part of a joint fit, and without the others it says something "
+                f"{what}: {self.dataset!r} is a part of a joint fit, and without the others it says something "
                 "else; fit it by itself, or take the whole fit"
             )
 
@@ -219,12 +220,12 @@ class Fit:
         With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
         assumed model they are independent standard normal; `chi_square` is the sum of their squares.
         """
-        return np.asarray(self.problem.call("independent_at", self.vector, self.predicted), float)
+        return np.asarray(self.problem.call(Density.whitened_residuals_at, self.vector, self.predicted), float)
 
     @cached_property
     def chi_square(self) -> float:
         """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
-        return float(self.problem.call("chi_square_at", self.vector, self.predicted))
+        return float(self.problem.call(Density.chi_square_at, self.vector, self.predicted))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -241,7 +242,7 @@ class Fit:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
         if not self.is_posterior:
             return float("nan")
-        return float(self.problem.call("log_likelihood_at", self.vector, self.predicted))
+        return float(self.problem.call(Density.log_likelihood_at, self.vector, self.predicted))
 
     @property
     def correlation(self) -> Floats:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from fits.optimise.descent import here
 from fits.optimise.identifiability import (
     UNKNOWN_BEYOND,
-    Combination,
+    Direction,
     floored,
+    insensitive,
     square,
-    unresolved_combinations,
-    without_influence,
+    unidentified_directions,
 )
-from fits.problem.base import Posed
+from fits.problem.problem import FittingProblem
 
 ON_BOUND = 1e-6  # of the box
 LEAST_PULL = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
@@ -31,12 +31,12 @@ Floats = NDArray[np.float64]
 class Uncertainty:
     """Errors at an optimum with P parameters, in physical units.
 
-    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (one without influence
-    lies where it happens to). Errors, covariance and
-    condition number are conditional on these values; their own errors are NaN and their rows of the covariance 0.
+    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (an insensitive one lies
+    where it happens to). Errors, covariance and condition number are conditional on these values; their own errors are
+    NaN and their rows of the covariance 0.
     standard_errors: (P,), infinite where nothing holds a parameter.
-    unresolved: the combinations that the data do not resolve, of all parameters, also those at a bound.
-    without_influence: names of those that the data say nothing about at all.
+    unidentified: the combinations that the data do not resolve, of all parameters, also those at a bound.
+    insensitive: names of those that the data say nothing about at all.
     predicted: the model at the optimum, (N, C), in 1/sr.
     """
 
@@ -44,12 +44,12 @@ class Uncertainty:
     standard_errors: Floats
     covariance: Floats
     condition_number: float
-    unresolved: tuple[Combination, ...]
-    without_influence: tuple[str, ...]
+    unidentified: tuple[Direction, ...]
+    insensitive: tuple[str, ...]
     predicted: Floats
 
 
-def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
+def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncertainty:
     """Errors at the optimum `vector` (P,) with this `cost`; a named objective's are scaled by its residual variance.
 
     Where the model is not finite nothing is known: all errors are infinite.
@@ -66,12 +66,12 @@ def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
     data_root, pull = data_root / np.sqrt(scatter), LEAST_PULL * scatter
-    idle = without_influence(data_root, problem.names)
+    idle = insensitive(data_root, problem.names)
     at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
     at_bound &= ~np.isin(problem.names, idle)
     free = np.flatnonzero(~at_bound)
     width = np.asarray(box.slope(jnp.asarray(vector)), float)
-    unresolved = unresolved_combinations(data_root, problem.names, width)
+    unidentified = unidentified_directions(data_root, problem.names, width)
     data_root, prior_root = data_root[:, free], _prior_root(problem)[:, free]
     errors, covariance = np.full(count, np.nan), np.zeros((count, count))
     if free.size:
@@ -79,10 +79,10 @@ def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
         spread = np.sqrt(np.diagonal(boxes))
         errors[free] = np.where(spread > UNKNOWN_BEYOND, np.inf, spread * width[free])
         covariance[np.ix_(free, free)] = boxes * np.outer(width[free], width[free])
-    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unresolved, idle, found.predicted)
+    return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unidentified, idle, found.predicted)
 
 
-def local_information(problem: Posed, unit: Floats) -> tuple[Floats, Floats, float]:
+def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
     """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2.
 
     And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
@@ -102,7 +102,7 @@ def condition_number(root: Floats) -> float:
     return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
 
 
-def _prior_root(problem: Posed) -> Floats:
+def _prior_root(problem: FittingProblem) -> Floats:
     """Rows (P + Q, P) of the prior's information, in boxes^-1."""
     return np.asarray(problem.model.box.prior_slopes(), float)
 

@@ -8,7 +8,7 @@ import numpy as np
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
-from fits.prediction.model_scores import foresights
+from fits.prediction.model_scores import model_scores
 from fits.prediction.predict import DRAWS, LEVELS, predict
 from fits.prediction.prediction import Prediction, banded
 from fits.progress import Progress
@@ -52,8 +52,8 @@ class Average:
         found = banded(
             first.wi, first.wo, first.channels, levels, values, means, scales, softness, unknown, freedom, seed
         )
-        shape = float(np.fmax.reduce([part.shape for part in parts]))
-        return replace(found, shape=shape, readings=first.readings)
+        pareto_k = float(np.fmax.reduce([part.pareto_k for part in parts]))
+        return replace(found, pareto_k=pareto_k, readings=first.readings)
 
 
 def average(
@@ -66,20 +66,20 @@ def average(
 
     Args:
         candidates: fits or posteriors, by name.
-        weights: by the same names, none below 0: those of stacking (`Foresight.weight`) foretell best, probabilities
-            of the stacks (`Foresight.probability`) average over them as Bayes does. None: those of stacking, for which
-            each is fitted again without each incidence (see `leave_out`).
-        progress: of these fits, see `leave_out`.
+        weights: by the same names, none below 0: those of stacking (`ModelScore.weight`) foretell best, probabilities
+            of the stacks (`ModelScore.model_probability`) average over them as Bayes does. None: those of stacking, for
+            which each is fitted again without each incidence (see `cross_validate`).
+        progress: of these fits, see `cross_validate`.
 
     Raises:
-        ValueError: no candidate; weights that are missing, negative or all 0; or as `leave_out`.
+        ValueError: no candidate; weights that are missing, negative or all 0; or as `cross_validate`.
     """
     require_fits(candidates)
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:
         plain = {name: one.fit if isinstance(one, Posterior) else one for name, one in candidates.items()}
-        weights = {name: seen.weight for name, seen in foresights(plain, progress).items()}
+        weights = {name: seen.weight for name, seen in model_scores(plain, progress).items()}
     total = float(sum(weights.get(name, np.nan) for name in candidates))
     if set(weights) != set(candidates) or min(weights.values()) < 0.0 or not total > 0.0:
         raise ValueError(

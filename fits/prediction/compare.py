@@ -10,7 +10,7 @@ import numpy as np
 
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
-from fits.prediction.model_scores import Foresight, foresights
+from fits.prediction.model_scores import ModelScore, model_scores
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
 
@@ -26,9 +26,9 @@ class Row:
     parameters: number of fitted ones. aic, bic: Akaike's and the Bayesian information criterion, NaN for a named
     objective.
     loo: expected log-density of a new datum summed over the data, by Pareto-smoothed leave-one-out, with its standard
-    error; loo_behind: how far that falls behind the best, with the error of the difference; unreliable: number of data
+    error; loo_diff: how far that falls behind the best, with the error of the difference; unreliable: number of data
     whose leave-one-out weight has a Pareto shape above 0.7. All five are NaN where posteriors were not given.
-    foresight: what it foretells of incidences that are left out, its weight and its evidence; None without `refit`.
+    model_score: what it foretells of incidences that are left out, its weight and its evidence; None without `refit`.
     """
 
     name: str
@@ -41,12 +41,12 @@ class Row:
     bic: float
     loo: float
     loo_error: float
-    loo_behind: float
-    loo_behind_error: float
+    loo_diff: float
+    loo_dse: float
     unreliable: float
     converged: bool
     at_bound: tuple[str, ...]
-    foresight: Foresight | None = None
+    model_score: ModelScore | None = None
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ def compare(
     loo = _leave_one_out(posteriors) if len(posteriors) == len(candidates) else {}
     rows = [_row(name, fit, loo.get(name, {})) for name, fit in fits.items()]
     if refit:
-        foreseen = foresights(fits, progress)
-        rows = [replace(row, foresight=foreseen[row.name]) for row in rows]
-        rows.sort(key=lambda row: -foreseen[row.name].score)
+        foreseen = model_scores(fits, progress)
+        rows = [replace(row, model_score=foreseen[row.name]) for row in rows]
+        rows.sort(key=lambda row: -foreseen[row.name].elpd)
     elif loo:
         rows.sort(key=lambda row: -row.loo)
     elif first.is_posterior:
@@ -130,8 +130,8 @@ def _row(name: str, fit: Fit, loo: dict[str, float]) -> Row:
         bic=count * math.log(fit.problem.count) - 2.0 * likelihood,
         loo=loo.get("loo", math.nan),
         loo_error=loo.get("error", math.nan),
-        loo_behind=loo.get("behind", math.nan),
-        loo_behind_error=loo.get("behind_error", math.nan),
+        loo_diff=loo.get("behind", math.nan),
+        loo_dse=loo.get("dse", math.nan),
         unreliable=loo.get("unreliable", math.nan),
         converged=fit.converged,
         at_bound=fit.at_bound,
@@ -147,14 +147,14 @@ def _preference(best: Row, other: Row, sorted_by: str) -> str:
     if sorted_by == "chi_square":
         return f"{best.name} comes closer than {other.name}; without a likelihood it cannot be said whether by chance."
     if sorted_by == "left_out":
-        assert other.foresight is not None
-        ahead, error = other.foresight.behind, other.foresight.behind_error
+        assert other.model_score is not None
+        ahead, error = other.model_score.elpd_diff, other.model_score.dse
         differ = f"it foretells incidences that are left out with a log-density higher by {ahead:.1f} ± {error:.1f}"
-        return _in_words(best.name, other.name, 2.0 * other.foresight.surely_behind, differ)
+        return _in_words(best.name, other.name, 2.0 * other.model_score.clear_diff, differ)
     excess = max(1.0, best.reduced_chi_square) if best.degrees_of_freedom > 0 else 1.0
     counted = f" (the scatter that {best.name} leaves counted as noise)" if excess > 1.0 else ""
     if sorted_by == "loo":
-        ahead, error = other.loo_behind / excess, other.loo_behind_error / excess
+        ahead, error = other.loo_diff / excess, other.loo_dse / excess
         lead = 2.0 * (ahead - 2.0 * error)
         differ = f"it expects new data with a log-density higher by {ahead:.1f} ± {error:.1f}{counted}"
     else:
@@ -187,7 +187,7 @@ def _leave_one_out(posteriors: Mapping[str, Posterior]) -> dict[str, dict[str, f
             "loo": float(estimate.elpd_loo),
             "error": float(estimate.se),
             "behind": float(difference.sum()),
-            "behind_error": float(math.sqrt(difference.size) * difference.std()),
+            "dse": float(math.sqrt(difference.size) * difference.std()),
             "unreliable": float(np.sum(np.asarray(estimate.pareto_k) > 0.7)),
         }
     return result
@@ -215,7 +215,7 @@ def _notes(fits: Mapping[str, Fit], rows: list[Row], posteriors: int) -> list[st
         notes.append(f"leave-one-out is unreliable for single data of {', '.join(doubtful)}")
     if 0 < posteriors < len(fits):
         notes.append("leave-one-out is left out: not every candidate is a posterior")
-    unsure = [row.name for row in rows if row.foresight is not None and not row.foresight.evidence.reliable]
+    unsure = [row.name for row in rows if row.model_score is not None and not row.model_score.evidence.reliable]
     if unsure:
         notes.append(f"the evidence is unreliable, its sampling misses a part of the posterior: {', '.join(unsure)}")
     if min(row.reduced_chi_square for row in rows) > 2.0:

@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class CrossValidation:
     """How readings were foretold that were left out.
 
     groups: what was left out together. rows: the rows of each among the used samples. log_density: of each reading by
@@ -50,7 +50,7 @@ class LeftOut:
     converged: bool
 
     @property
-    def score(self) -> float:
+    def elpd(self) -> float:
         """Sum of the log-densities: the higher, the better are new readings foretold."""
         return float(np.sum(self.log_density))
 
@@ -69,7 +69,7 @@ Done = MutableMapping[str, tuple[Floats, bool]]
 """By group: the log-density of its readings, (rows, C), and whether the fit without them converged."""
 
 
-def leave_out(
+def cross_validate(
     fit: Fit,
     *,
     draws: int = DRAWS,
@@ -77,7 +77,7 @@ def leave_out(
     progress: Progress | None = None,
     known: Weighted | None = None,
     done: Done | None = None,
-) -> LeftOut:
+) -> CrossValidation:
     """Fit anew without each incidence, from the best values on, and foretell its readings.
 
     With fewer than three incidences every scan is left out by fifths.
@@ -110,26 +110,26 @@ def leave_out(
         converged &= good
     if progress is not None:
         progress("left out", len(groups), len(groups), "")
-    return LeftOut(tuple(groups), tuple(groups.values()), density, converged)
+    return CrossValidation(tuple(groups), tuple(groups.values()), density, converged)
 
 
 def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
     """Rows of a fit's readings that are left out together, by name.
 
     Raises:
-        ValueError: as `leave_out`.
+        ValueError: as `cross_validate`.
     """
     require_kind("fit", fit, Fit)
     if not fit.is_posterior:
         raise ValueError(
-            f"leave_out: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
+            f"cross_validate: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
         )
-    fit.require_alone("leave_out")
+    fit.require_alone("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
-        raise ValueError("leave_out: it takes a fit of one measurement by itself, not a joint one")
+        raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
     groups = groups_of(fit.problem.data.used())
     if len(groups) < 2:
-        raise ValueError("leave_out: the readings are all of one incidence, and too few to leave some of them out")
+        raise ValueError("cross_validate: the readings are all of one incidence, and too few to leave some of them out")
     return groups
 
 

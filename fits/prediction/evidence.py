@@ -18,17 +18,17 @@ DRAWS = 1000
 
 @dataclass(frozen=True)
 class Evidence:
-    """log: natural logarithm of the evidence, with data in 1/sr. error: its standard error. shape: Pareto shape of the
-    largest weights: above 0.7 the approximation misses a part of the posterior, and the error tells too little."""
+    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: of the largest
+    importance weights: above 0.7 the approximation misses a part of the posterior, and the error tells too little."""
 
-    log: float
+    log_evidence: float
     error: float
-    shape: float
+    pareto_k: float
 
     @property
     def reliable(self) -> bool:
         """Whether the error may be believed."""
-        return self.shape < UNRELIABLE
+        return self.pareto_k < UNRELIABLE
 
 
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:

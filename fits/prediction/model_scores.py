@@ -1,5 +1,4 @@
-"""Which of several stacks foretells what it has not seen, with what weights they foretell it best together, and how
-probable each is."""
+"""Which of several stacks predicts held-out data best: elpd differences, stacking weights, model probabilities."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax, logsumexp, softmax
 
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import Done, LeftOut, leave_out, require_groups
+from fits.prediction.cross_validation import CrossValidation, Done, cross_validate, require_groups
 from fits.prediction.evidence import Evidence, evidence_of, posterior_draws
 from fits.progress import Progress, named, silent
 
@@ -28,66 +27,67 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Foresight:
-    """What one of several stacks is worth to who wants to know what was not measured.
+class ModelScore:
+    """How well one of several stacks predicts held-out data, and how probable it is.
 
-    score: sum of log-densities of readings, each foretold by a fit without its incidence. behind: how far that falls
-    behind the best, and its standard error by the incidences. least_behind: the same a reading, of the incidence where
-    that is least. weight: of its predictions in the mixture that foretells best (stacking, Yao, Vehtari, Simpson &
-    Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`. probability: of this stack among those that are
-    compared, all as probable beforehand.
+    elpd: sum of log-densities of measurements, each predicted by a fit without its incidence. elpd_diff: how far it is
+    below the best; dse: standard error of the difference, by the incidences. least_diff: the difference a measurement,
+    of the incidence where that is least. weight: of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13,
+    917). evidence: see `evidence`. model_probability: of this stack among those compared, equally probable a priori.
     """
 
-    score: float
-    behind: float
-    behind_error: float
-    least_behind: float
+    elpd: float
+    elpd_diff: float
+    dse: float
+    least_diff: float
     weight: float
     evidence: Evidence
-    probability: float
+    model_probability: float
 
     @property
-    def surely_behind(self) -> float:
-        """How far the score falls behind the best beyond chance; below 0 the data do not tell the two apart."""
-        return self.behind if self.least_behind > EVERYWHERE else self.behind - BY_CHANCE * self.behind_error
+    def clear_diff(self) -> float:
+        """The difference less what may be chance; below 0 the two are statistically indistinguishable."""
+        return self.elpd_diff if self.least_diff > EVERYWHERE else self.elpd_diff - BY_CHANCE * self.dse
 
 
-def foresights(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, Foresight]:
-    """Of fits of the same data, by name; each is fitted again without each incidence (see `leave_out`)."""
-    seen = {name: look_closely(fit, named(name, progress or silent)) for name, fit in candidates.items()}
-    return together(
+def model_scores(candidates: Mapping[str, Fit], progress: Progress | None = None) -> dict[str, ModelScore]:
+    """Of fits of the same data, by name; each is fitted again without each incidence (see `cross_validate`)."""
+    seen = {name: out_of_sample(fit, named(name, progress or silent)) for name, fit in candidates.items()}
+    return rank_models(
         {name: left for name, (left, _) in seen.items()}, {name: found for name, (_, found) in seen.items()}
     )
 
 
-def look_closely(fit: Fit, progress: Progress | None = None, done: Done | None = None) -> tuple[LeftOut, Evidence]:
+def out_of_sample(
+    fit: Fit, progress: Progress | None = None, done: Done | None = None
+) -> tuple[CrossValidation, Evidence]:
     """What a fit foretells of each incidence without it, and its evidence: by draws of its posterior both.
 
-    done: see `leave_out`.
+    done: see `cross_validate`.
     """
     require_groups(fit)
     known = posterior_draws(fit)
-    return leave_out(fit, progress=progress, known=known, done=done), evidence_of(known)
+    return cross_validate(fit, progress=progress, known=known, done=done), evidence_of(known)
 
 
-def together(left: Mapping[str, LeftOut], evidences: Mapping[str, Evidence]) -> dict[str, Foresight]:
+def rank_models(left: Mapping[str, CrossValidation], evidences: Mapping[str, Evidence]) -> dict[str, ModelScore]:
     """What was left out of fits of the same data, and their evidence, side by side."""
     names = list(left)
-    scores = np.array([left[name].score for name in names])
+    scores = np.array([left[name].elpd for name in names])
     best = left[names[int(np.argmax(scores))]]
     weights = stacking(np.stack([left[name].log_density.ravel() for name in names]))
-    probabilities = softmax(np.array([evidences[name].log for name in names]))
+    probabilities = softmax(np.array([evidences[name].log_evidence for name in names]))
     found = {}
     for index, name in enumerate(names):
         gaps = best.by_group - left[name].by_group
-        found[name] = Foresight(
-            score=float(scores[index]),
-            behind=float(gaps.sum()),
-            behind_error=float(np.sqrt(gaps.size) * gaps.std(ddof=1)),
-            least_behind=float(np.min(gaps / best.sizes)),
+        found[name] = ModelScore(
+            elpd=float(scores[index]),
+            elpd_diff=float(gaps.sum()),
+            dse=float(np.sqrt(gaps.size) * gaps.std(ddof=1)),
+            least_diff=float(np.min(gaps / best.sizes)),
             weight=float(weights[index]),
             evidence=evidences[name],
-            probability=float(probabilities[index]),
+            model_probability=float(probabilities[index]),
         )
     return found
 

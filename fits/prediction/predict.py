@@ -98,7 +98,7 @@ def foretold(
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
     generator = np.random.default_rng(seed)
     data = _measurements(fit, at)
-    vectors, shape = _vectors(of, draws, generator, like)
+    vectors, pareto_k = _vectors(of, draws, generator, like)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
     sigma = _own_sigma(fit, values, data.sigma)
@@ -106,7 +106,7 @@ def foretold(
     noise = fit.problem.noise
     freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
     found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, *parts, freedom, seed)
-    return replace(found, shape=shape, readings=at.used() if isinstance(at, Measurements) else None)
+    return replace(found, pareto_k=pareto_k, readings=at.used() if isinstance(at, Measurements) else None)
 
 
 def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
@@ -143,9 +143,9 @@ def _vectors(
     of: Fit | Posterior, draws: int, generator: np.random.Generator, like: "Mixture | None" = None
 ) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the shape of their weights."""
-    if isinstance(of, Fit) and of.within is not None and of.part_of_joint is not None:
+    if isinstance(of, Fit) and of.within is not None and of.dataset is not None:
         vectors, shape = _vectors(of.within, draws, generator)  # what others say of its parameters counts too
-        return vectors[:, list(of.within.problem.places(of.part_of_joint))], shape
+        return vectors[:, list(of.within.problem.places(of.dataset))], shape
     if isinstance(of, Posterior):
         return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))
@@ -160,7 +160,7 @@ def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats
         return values
     _, floor = (np.asarray(part, float) for part in fit.problem.call(_levels, fit.vector[None]))
     softness = _softness(fit, np.hypot(_own_sigma(fit, values[None], None), floor))
-    lack = np.asarray(fit.problem.call("lack_at", fit.vector, fit.predicted, places(wi, wo))[0])
+    lack = np.asarray(fit.problem.call(Model.discrepancy_at, fit.vector, fit.predicted, places(wi, wo))[0])
     return softness * np.sinh(np.asarray(logarithm(values, softness)) + lack)
 
 
@@ -206,4 +206,4 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
 
 
 def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
-    return jax.lax.map(lambda vector: model.lack_at(vector, model.predict(vector), where), vectors)
+    return jax.lax.map(lambda vector: model.discrepancy_at(vector, model.predict(vector), where), vectors)

@@ -46,8 +46,8 @@ class Prediction:
         channels: their names.
         levels: of the quantiles.
         bsdf: of the BSDF: the stack's value with the model discrepancy. This is the best estimate.
-        reading: of a new measurement: the BSDF with noise.
-        model: of the stack alone, without the discrepancy.
+        predictive: of a new measurement: the BSDF with noise.
+        latent: of the stack alone, without the discrepancy.
         means, scales: of a reading with each of D vectors of parameters, (D, M, C), in 1/sr; given these it is
             Gaussian, or has Student-t tails. Where readings share errors, of its `logarithm`.
         softness: of that, (M, C) or (D, M, C), in 1/sr; else None.
@@ -55,7 +55,7 @@ class Prediction:
             None where no discrepancy is modelled.
         values: of the stack itself, with each vector, (D, M, C), in 1/sr.
         degrees_of_freedom: of these tails; infinite if it is Gaussian.
-        shape: Pareto shape of the weights by which draws stand for the posterior of a fit (see `evidence`); NaN where
+        pareto_k: of the importance weights by which draws stand for the posterior of a fit (see `evidence`); NaN where
             they are those of a chain.
         readings: those that were to be predicted, None where directions alone were asked for.
     """
@@ -65,15 +65,15 @@ class Prediction:
     channels: tuple[str, ...]
     levels: tuple[float, ...]
     bsdf: Band
-    reading: Band
-    model: Band
+    predictive: Band
+    latent: Band
     means: Floats
     scales: Floats
     softness: Floats | None
     unknown: Floats | None
     degrees_of_freedom: float
     values: Floats
-    shape: float = math.nan
+    pareto_k: float = math.nan
     readings: Measurements | None = None
 
     @property
@@ -93,7 +93,7 @@ class Prediction:
             return np.quantile(self.values, level, axis=0)
         return self._mixture_quantile(level, np.maximum(self.unknown, NARROWEST), stats.norm())
 
-    def reading_quantile(self, level: float) -> Floats:
+    def predictive_quantile(self, level: float) -> Floats:
         """Of a new reading, (M, C), in 1/sr; level in (0, 1)."""
         require_level(level)
         return self._mixture_quantile(level, self.scales, self._tails)
@@ -119,7 +119,7 @@ class Prediction:
     @property
     def reliable(self) -> bool:
         """Whether the vectors stand for the whole posterior; else a chain is better asked."""
-        return not self.shape >= UNRELIABLE
+        return not self.pareto_k >= UNRELIABLE
 
     def log_density(self, values: Floats) -> Floats:
         """Log-density of readings (M, C), each by itself."""
@@ -164,9 +164,9 @@ def banded(
     generator, shape = np.random.default_rng(seed), (BESIDE, *means.shape)
     gaussian = math.isinf(degrees_of_freedom)
     drawn = generator.standard_normal(shape) if gaussian else generator.standard_t(degrees_of_freedom, shape)
-    model = _band(values, levels)
-    reading = _drawn_band(means + scales * drawn, softness, levels)
-    bsdf = model
+    latent = _band(values, levels)
+    predictive = _drawn_band(means + scales * drawn, softness, levels)
+    bsdf = latent
     if unknown is not None:
         bsdf = _drawn_band(means + unknown * generator.standard_normal(shape), softness, levels)
     return Prediction(
@@ -175,8 +175,8 @@ def banded(
         channels=channels,
         levels=levels,
         bsdf=bsdf,
-        reading=reading,
-        model=model,
+        predictive=predictive,
+        latent=latent,
         means=means,
         scales=scales,
         softness=softness,
@@ -192,7 +192,7 @@ class Scores:
 
     count: readings times channels. median_error, p95_error: median and 95th percentile of |prediction / reading - 1|,
     the prediction being the median; model_error: the median of that for the model's own value. coverage: share of the
-    readings in the central interval, by what that should hold: 0.5 and 0.95. log_score: mean log-density of a reading.
+    readings in the central interval, by what that should hold: 0.5 and 0.95. elpd: mean log-density of a reading.
     """
 
     count: int
@@ -200,7 +200,7 @@ class Scores:
     p95_error: float
     model_error: float
     coverage: Mapping[float, float]
-    log_score: float
+    elpd: float
 
 
 def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool_] | None = None) -> Scores:
@@ -220,14 +220,14 @@ def scores(prediction: Prediction, readings: Measurements, rows: NDArray[np.bool
     values, rank = used.values[keep], prediction.rank(used.values)[keep]
     median = prediction.median[keep]
     size = np.maximum(np.abs(values), np.finfo(float).tiny)
-    error, of_model = (np.abs(part - values) / size for part in (median, prediction.model.mean[keep]))
+    error, of_model = (np.abs(part - values) / size for part in (median, prediction.latent.mean[keep]))
     return Scores(
         count=values.size,
         median_error=float(np.median(error)),
         p95_error=float(np.quantile(error, 0.95)),
         model_error=float(np.median(of_model)),
         coverage={share: float(np.mean(np.abs(2.0 * rank - 1.0) < share)) for share in HELD},
-        log_score=float(np.mean(prediction.log_density(used.values)[keep])),
+        elpd=float(np.mean(prediction.log_density(used.values)[keep])),
     )
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.problem.discrepancy.logarithm import size, softness
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.discrepancy.process import Process
 from fits.problem.parameters import Free, is_free
 from fits.problem.values import shown
@@ -43,10 +43,10 @@ class Noise:
     use_sigma: take the measurement's own sigma where it has one.
     tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
     then sigma.
-    correlated: errors of the model that neighbouring readings share, beside those: `Correlated`, or True for one whose
-    numbers are all free; only with Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted
-    without; where residuals of neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is
-    fitted with them, and the fit tells of both (`Fit.alone`). A `Problem` by itself has none then.
+    discrepancy: model discrepancy beside that: `Discrepancy`, or True for one whose numbers are all free; only with
+    Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted without; where residuals of
+    neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is fitted again with it, and the
+    fit keeps both (`Fit.without_discrepancy`). A `Problem` by itself has none then.
     Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
@@ -57,7 +57,7 @@ class Noise:
     use_sigma: bool = True
     tails: Tails = "gaussian"
     degrees_of_freedom: float = 4.0
-    correlated: Correlated | bool | None = None
+    discrepancy: Discrepancy | bool | None = None
 
     def __post_init__(self) -> None:
         for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
@@ -72,12 +72,12 @@ class Noise:
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
-        if self.correlated is True:
-            object.__setattr__(self, "correlated", Correlated())
-        if not (self.correlated in (False, None) or isinstance(self.correlated, Correlated)):
-            raise ValueError(f"Noise.correlated is {shown(self.correlated)}; it must be true, false or Correlated")
-        if self.correlated and self.tails != "gaussian":
-            raise ValueError(f"Noise.tails is {self.tails!r}; with correlated noise it must be gaussian")
+        if self.discrepancy is True:
+            object.__setattr__(self, "discrepancy", Discrepancy())
+        if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
+            raise ValueError(f"Noise.discrepancy is {shown(self.discrepancy)}; it must be true, false or Discrepancy")
+        if self.discrepancy and self.tails != "gaussian":
+            raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
 
 
 def _check_range(field: str, value: Any, low: float, high: float) -> None:
@@ -174,11 +174,11 @@ class Levels(NamedTuple):
         return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
 
     def softness(self, values: Floats) -> Floats:
-        """Of the logarithms of readings (N, C), see `fits.problem.discrepancy.logarithm`."""
+        """Of the logarithms of measurements (N, C), see `fits.problem.discrepancy.logarithm`."""
         return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
 
     def gram(self, process: Process, values: Floats) -> Array | None:
-        """What readings (N, C) tell of a process that they share; None where it depends on parameters."""
+        """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
         variance, relative, floor = (jnp.asarray(level) for level in self)

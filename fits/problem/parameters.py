@@ -38,20 +38,20 @@ class Free:
     above 1e-15 of the distance from the mean to either bound, so that its density can be computed (`LogNormal`: the
     same of the logarithms). Each place is a parameter of its own, even where the same object stands twice.
 
-    `smooth` holds channels together: the standard deviation of the difference between neighbours (of the logarithms for
-    `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root of the distance
-    in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at the bounds.
+    `random_walk_sd` holds channels together: the standard deviation of the difference between neighbours (of the
+    logarithms for `LogNormal` and `LogUniform`), one or one for each of the C - 1 steps, say in proportion to the root
+    of the distance in wavelength. It is a Gaussian random walk beside the prior of each channel, not cut off at bounds.
 
-    `shared` says that all texels of a map have this number in common, see `fits.fit_map`; in a fit of one material it
-    says nothing.
+    `same_for_all_texels` says that all texels of a map have this number in common, see `fits.fit_map`; in a fit of one
+    material it says nothing.
     """
 
     start: float | tuple[float, ...]
     low: float | tuple[float, ...]
     high: float | tuple[float, ...]
     prior: Prior
-    smooth: float | tuple[float, ...] | None
-    shared: bool = False
+    random_walk_sd: float | tuple[float, ...] | None
+    same_for_all_texels: bool = False
 
     __layerjax_placeholder__: ClassVar[bool] = True
 
@@ -61,17 +61,18 @@ class Free:
         low: float | Sequence[float],
         high: float | Sequence[float],
         prior: Prior | None = None,
-        smooth: float | Sequence[float] | None = None,
-        shared: bool = False,
+        random_walk_sd: float | Sequence[float] | None = None,
+        same_for_all_texels: bool = False,
     ):
         prior = Uniform() if prior is None else prior
         if not isinstance(prior, Prior):
             raise ValueError(f"Free.prior is {shown(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None")
-        if not isinstance(shared, bool):
-            raise ValueError(f"Free.shared is {shown(shared)}; it must be True or False")
+        if not isinstance(same_for_all_texels, bool):
+            raise ValueError(f"Free.same_for_all_texels is {shown(same_for_all_texels)}; it must be True or False")
         object.__setattr__(self, "prior", prior)
-        object.__setattr__(self, "shared", shared)
-        for field, value in (("start", start), ("low", low), ("high", high), ("smooth", smooth)):
+        object.__setattr__(self, "same_for_all_texels", same_for_all_texels)
+        given = {"start": start, "low": low, "high": high, "random_walk_sd": random_walk_sd}
+        for field, value in given.items():
             object.__setattr__(self, field, value if value is None else _plain(f"Free.{field}", value))
         first, lower, upper = self.arrays()
         if np.any(lower >= upper):
@@ -83,8 +84,8 @@ class Free:
                 f"Free.start is {shown(self.start)}; it must lie in [{shown(self.low)}, {shown(self.high)}]"
             )
         require_computable(prior, lower, upper)
-        if self.smooth is not None:
-            require_steps(np.asarray(self.smooth), self.shape)
+        if self.random_walk_sd is not None:
+            require_steps(np.asarray(self.random_walk_sd), self.shape)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -94,8 +95,8 @@ class Free:
     def __repr__(self) -> str:
         words = [repr(value) for value in (self.start, self.low, self.high)]
         words += [] if self.prior == Uniform() else [repr(self.prior)]
-        words += [] if self.smooth is None else [f"smooth={self.smooth!r}"]
-        words += ["shared=True"] if self.shared else []
+        words += [] if self.random_walk_sd is None else [f"random_walk_sd={self.random_walk_sd!r}"]
+        words += ["same_for_all_texels=True"] if self.same_for_all_texels else []
         return f"Free({', '.join(words)})"
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,7 +114,7 @@ class Free:
 class Box(eqx.Module):
     """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces.
 
-    between: (Q, P), differences between neighbouring channels over their standard deviations, see `Free.smooth`.
+    between: (Q, P), differences between neighbouring channels in units of `Free.random_walk_sd`.
     """
 
     low: Array
@@ -137,9 +138,9 @@ class Box(eqx.Module):
         first = 0
         for entry in free:
             here = slice(first, first := first + math.prod(entry.shape))
-            if entry.smooth is not None:
+            if entry.random_walk_sd is not None:
                 rows = np.zeros((here.stop - here.start - 1, len(low)))
-                rows[:, here] = steps(entry.smooth, here.stop - here.start)
+                rows[:, here] = steps(entry.random_walk_sd, here.stop - here.start)
                 between.append(rows)
                 logs[here] = shared_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(

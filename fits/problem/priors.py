@@ -155,11 +155,11 @@ def shared_normaliser(prior: Prior, steps: NDArray[np.float64], own: NDArray[np.
 def require_steps(smooth: NDArray[np.float64], shape: tuple[int, ...]) -> None:
     """ValueError for standard deviations between neighbours that are none."""
     if not shape or shape[0] < 2:
-        raise ValueError("Free.smooth is given for a single number; start, low or high must have two channels or more")
+        raise ValueError("Free.random_walk_sd is given for a single number; start, low or high must have two channels")
     if smooth.shape not in ((), (shape[0] - 1,)):
-        raise ValueError(f"Free.smooth has {smooth.size} entries; it must have one, or {shape[0] - 1}, one a step")
+        raise ValueError(f"Free.random_walk_sd has {smooth.size} entries; it must have 1 or {shape[0] - 1}, one a step")
     if not np.all(smooth > 0.0):
-        raise ValueError(f"Free.smooth is {shown(smooth.tolist())}; it must be above 0")
+        raise ValueError(f"Free.random_walk_sd is {shown(smooth.tolist())}; it must be above 0")
 
 
 def _require_finite(field: str, value: Any, above: float = -math.inf) -> None:

@@ -9,7 +9,7 @@
     kind = "Medium"
     thickness = { start = 0.5, low = 0.0, high = 5.0, prior = { kind = "Normal", mean = 0.5, sd = 0.2 } }
     phase = { kind = "SGGX", shape = "surface", alpha = 0.3 }
-    f0 = { start = 0.04, low = 0.0, high = 0.2, shared = true }     # `smooth` and `shared`: see `Free`
+    f0 = { start = 0.04, low = 0.0, high = 0.2, same_for_all_texels = true }   # see `Free`
 
     [base]
     kind = "Lambertian"
@@ -19,10 +19,10 @@
     weight = 0.3                               # of the gallery, or a mixture; left out in one, which covers the rest
 
     [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom,
-                                               # correlated: true, or a table of its amplitude and lengths
+                                               # discrepancy: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
-    [instrument]                               # optional: source, detector, offset, gain_per_incidence, floor, rings
+    [instrument]                               # optional: source, detector, offset, gain_sd, floor, rings
 
 Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
 ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.

@@ -9,7 +9,7 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 import numpy as np
 
 import layerjax as lj
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, Prior, Uniform
@@ -41,8 +41,8 @@ _TRANSPORTS: _Kinds = {
 }
 _LAWS: _Kinds = {"PowerLaw": PowerLaw}
 _PRIORS: _Kinds = {kind.__name__: kind for kind in (Uniform, LogUniform, Normal, LogNormal)}
-SHARED = "correlated"
-_FREE_KEYS = ("start", "low", "high", "prior", "smooth", "shared")
+SHARED = "discrepancy"
+_FREE_KEYS = ("start", "low", "high", "prior", "random_walk_sd", "same_for_all_texels")
 
 
 MATERIAL = ("gallery", "layers", "base", "mixture")
@@ -205,10 +205,10 @@ def _free(where: str, table: Any, allowed: Range = ANY) -> Free:
             raise ValueError(f"{where} has no {key}, a free parameter must have start, low and high")
     bounds = {key: numbers(f"{where}.{key}", table[key], allowed) for key in ("start", "low", "high")}
     prior = cast(Prior, _build(f"{where}.prior", table["prior"], _PRIORS)) if "prior" in table else None
-    smooth = numbers(f"{where}.smooth", table["smooth"], ANY) if "smooth" in table else None
-    shared = truth(f"{where}.shared", table["shared"]) if "shared" in table else False
+    steps = numbers(f"{where}.random_walk_sd", table["random_walk_sd"], ANY) if "random_walk_sd" in table else None
+    same = truth(f"{where}.same_for_all_texels", table.get("same_for_all_texels", False))
     try:
-        return Free(**bounds, prior=prior, smooth=smooth, shared=shared)
+        return Free(**bounds, prior=prior, random_walk_sd=steps, same_for_all_texels=same)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).replace('Free.', '')}") from None
 
@@ -227,14 +227,14 @@ def noise_from_dict(table: Any) -> Noise:
         raise ValueError(str(error).replace("Noise.", "noise.")) from None
 
 
-def _correlated(value: Any) -> Correlated | bool:
+def _correlated(value: Any) -> Discrepancy | bool:
     where = f"noise.{SHARED}"
     if isinstance(value, bool):
         return value
-    names = tuple(entry.name for entry in fields(Correlated))
+    names = tuple(entry.name for entry in fields(Discrepancy))
     check_keys(where, require_table(where, value), names)
     given: dict[str, Any] = {key: _number_or_free(f"{where}.{key}", entry, ANY) for key, entry in value.items()}
-    return Correlated(**given)
+    return Discrepancy(**given)
 
 
 def instrument_from_dict(table: Any) -> Instrument:
@@ -294,13 +294,13 @@ def _module_to_dict(module: Any) -> dict[str, Any]:
 def to_plain(value: Any) -> Any:
     if isinstance(value, Free):
         table = {key: getattr(value, key) for key in _FREE_KEYS}
-        left_out = {"prior": Uniform(), "smooth": None, "shared": False}
+        left_out = {"prior": Uniform(), "random_walk_sd": None, "same_for_all_texels": False}
         return {key: to_plain(entry) for key, entry in table.items() if key not in left_out or entry != left_out[key]}
     if isinstance(value, str | bool | int):
         return value
     if isinstance(value, lj.PhaseFunction | Prior | PowerLaw):
         return _module_to_dict(value)
-    if isinstance(value, Correlated):
+    if isinstance(value, Discrepancy):
         table = {entry.name: getattr(value, entry.name) for entry in fields(value)}
         return {name: to_plain(entry) for name, entry in table.items() if entry is not None} or True
     array = np.asarray(value)

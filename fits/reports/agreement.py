@@ -7,6 +7,7 @@ import numpy as np
 
 from fits.data.checks import repeats
 from fits.data.totals import Totals
+from fits.problem.model import Density
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.problem.parameters import is_free
 from fits.reports.diagnostics import ResidualStructure
@@ -30,7 +31,7 @@ def describes(fit: "Fit") -> bool:
     """Whether the stack alone comes as near to the data as the stated noise lets expect, but for a moderate misfit."""
     if not fit.is_posterior:
         return True  # nothing is stated
-    offsets = np.abs(np.asarray(fit.problem.call("offsets_at", fit.vector, fit.predicted), float))
+    offsets = np.abs(np.asarray(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted), float))
     significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > MISFIT_SIGMAS
     return not (significant and float(np.median(offsets)) > UNDESCRIBED)
 
@@ -40,7 +41,7 @@ def misdescribed(fit: "Fit") -> list[str]:
     if describes(fit):
         return []
     values = fit.problem.data.used().values
-    sigma = np.asarray(fit.problem.call("sigma_at", fit.vector, values))  # of what was measured: a share of that
+    sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, values))  # of what was measured: a share of that
     lit = values > 0.0
     if not lit.any():
         return ["This stack does not describe the sample."]
@@ -57,7 +58,7 @@ def agreement(fit: "Fit") -> list[str]:
     if not (values > 0.0).any():
         return []
     half, most = map(apart, factors(fit, 0.5, 0.95))
-    which = "stack alone" if fit.problem.noise.correlated else "model"
+    which = "stack alone" if fit.problem.noise.discrepancy else "model"
     return [f"Half of the {values.size:,} readings are within {half} of the {which}, 95 % of them within {most}."]
 
 
@@ -85,37 +86,42 @@ def discrepancy(fit: "Fit") -> list[str]:
     if at is None:
         return []
     left, whole = (
-        float(np.sum(np.square(fit.problem.call(name, fit.vector, fit.predicted))))
-        for name in ("unshared_at", "offsets_at")
+        float(np.sum(np.square(fit.problem.call(offsets, fit.vector, fit.predicted))))
+        for offsets in (Density.offsets_after_discrepancy_at, Density.offsets_at)
     )
     share = 1.0 - left / whole if whole > 0.0 else 0.0
     size = 100.0 * float(at.amplitude)
-    grazing = f" at normal incidence and {size * 2.0 ** float(at.growth):.2g} % at 60°" if at.growth > 0.0 else ""
+    grazing = (
+        f" at normal incidence and {size * 2.0 ** float(at.grazing_exponent):.2g} % at 60°"
+        if at.grazing_exponent > 0.0
+        else ""
+    )
     return [
         f"The model-discrepancy term (a Gaussian process) has a standard deviation of {size:.2g} % of the BRDF{grazing}"
-        f" and correlation lengths of {float(at.half):.2g}° (half angle) and {float(at.difference):.2g}° (difference "
-        f"angle). It absorbs {100.0 * share:.3g} % of the residual sum of squares. Parameter uncertainties and "
-        "prediction intervals include this term.",
+        f" and length scales of {float(at.length_half):.2g}° (half angle) and {float(at.length_difference):.2g}° "
+        f"(difference angle). It absorbs {100.0 * share:.3g} % of the residual sum of squares. Parameter uncertainties "
+        "and prediction intervals include this term.",
         *_added_automatically(fit),
     ]
 
 
 def _added_automatically(fit: "Fit") -> list[str]:
-    if fit.alone is None:
+    found = fit.without_discrepancy
+    if found is None:
         return []
     return [
         "It was added automatically because, with independent noise, neighbouring residuals correlate by "
-        f"{fit.alone.alike:+.2f} ({fit.alone.pairs} pairs; chi-square per degree of freedom "
-        f"{without_discrepancy(fit):.3g}). Set `correlated = false` to disable it."
+        f"{found.residual_autocorrelation:+.2f} ({found.pairs} pairs; chi-square per degree of freedom "
+        f"{without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
     ]
 
 
 def without_discrepancy(fit: "Fit") -> float:
     """Chi-square per degree of freedom with independent noise: as fitted so, else with these parameters."""
-    if fit.alone is not None:
-        square, freedom = fit.alone.chi_square, fit.alone.degrees_of_freedom
+    if fit.without_discrepancy is not None:
+        square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
     else:
-        square = float(np.sum(np.square(fit.problem.call("offsets_at", fit.vector, fit.predicted))))
+        square = float(np.sum(np.square(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted))))
         freedom = fit.degrees_of_freedom
     return square / freedom if freedom > 0 else math.nan
 
@@ -163,7 +169,7 @@ def explains(fit: "Fit", structure: ResidualStructure) -> list[str]:
             *_structure(structure),
         ]
     ratio, freedom = fit.reduced_chi_square, fit.degrees_of_freedom
-    correlated = bool(fit.problem.noise.correlated)
+    correlated = bool(fit.problem.noise.discrepancy)
     term = " with the discrepancy term" if correlated else ""
     sentences = [
         *misdescribed(fit),

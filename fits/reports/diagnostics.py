@@ -12,6 +12,7 @@ import numpy as np
 
 from fits.data.neighbours import alike, neighbours
 from fits.data.scans import incidences
+from fits.problem.model import Density
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -73,7 +74,7 @@ def standardised(fit: "Fit") -> np.ndarray:
 
 def residual_label(fit: "Fit") -> str:
     """What `standardised` residuals are, for an axis of a picture."""
-    return "whitened residual" if fit.problem.noise.correlated else misfit_label(fit)
+    return "whitened residual" if fit.problem.noise.discrepancy else misfit_label(fit)
 
 
 def bsdf(fit: "Fit") -> np.ndarray:
@@ -89,7 +90,7 @@ def misfit(fit: "Fit") -> np.ndarray:
 
     With a model discrepancy these are smaller than the noise, since it follows the readings: `standardised` are not.
     """
-    left = np.asarray(fit.problem.call("unshared_at", fit.vector, fit.predicted), float)
+    left = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, left / _unit(fit))
 
 
@@ -97,7 +98,7 @@ def misfit_label(fit: "Fit") -> str:
     """What a `misfit` is, for an axis of a picture."""
     if not fit.is_posterior:
         return f"residual of {fit.problem.objective} / its scatter"
-    which = "with discrepancy" if fit.problem.noise.correlated else "model"
+    which = "with discrepancy" if fit.problem.noise.discrepancy else "model"
     return rf"(data $-$ {which}) / $\sigma$"
 
 

@@ -119,7 +119,7 @@ def page(
         section(
             "Values",
             tables.html_table(tables.parameter_table(fit)),
-            "" if fit.alone is None else tables.html_table(tables.alone_table(fit)),
+            "" if fit.without_discrepancy is None else tables.html_table(tables.alone_table(fit)),
         ),
         section(
             "Data and model",
@@ -141,7 +141,7 @@ def page(
         section(
             "What the data cannot tell",
             sentences(verdicts.determines(fit)),
-            tables.html_table(tables.unresolved_table(fit)) if fit.unresolved else "",
+            tables.html_table(tables.unresolved_table(fit)) if fit.unidentified else "",
             image(images, "correlation", "Correlation of the fitted parameters."),
         ),
         section("Minima", sentences(verdicts.minima(fit)), tables.html_table(tables.minima_table(fit))),
@@ -226,7 +226,7 @@ def _fitted(fit: "Fit") -> str:
 
 def _curves_caption(fit: "Fit") -> str:
     caption = "In the plane of incidence. Grey: one sigma as the noise model assumes it."
-    if fit.problem.noise.correlated:
+    if fit.problem.noise.discrepancy:
         caption += " Residuals are of the curve with the discrepancy, which follows the readings."
     return caption
 

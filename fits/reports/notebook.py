@@ -36,7 +36,7 @@ def _one(fit: "Fit") -> str:
     words, _ = verdicts.in_short(fit, residual_structure(fit.problem.data, standardised(fit)))
     ratio = f"Chi-square per degree of freedom: {fit.reduced_chi_square:.3g} ({fit.degrees_of_freedom})."
     found = [_paragraph([*words, ratio] if fit.is_posterior else words), tables.html_table(tables.parameter_table(fit))]
-    if fit.unresolved:
+    if fit.unidentified:
         found.append(tables.html_table(tables.unresolved_table(fit)))
     return "".join(found)
 

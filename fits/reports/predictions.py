@@ -24,10 +24,10 @@ UNRELIABLE = (
 def prediction_csv(prediction: "Prediction") -> str:
     """A row for each pair of directions and channel: angles in degrees, all else in 1/sr.
 
-    Columns `bsdf_...` are the best estimate, of the stack with the model discrepancy; `reading_...` are of a new
-    measurement; `model_...` of the stack without the discrepancy.
+    Columns `bsdf_...` are the best estimate, of the stack with the model discrepancy; `predictive_...` are of a new
+    measurement; `latent_...` of the stack without the discrepancy.
     """
-    parts = {"bsdf": prediction.bsdf, "reading": prediction.reading, "model": prediction.model}
+    parts = {"bsdf": prediction.bsdf, "predictive": prediction.predictive, "latent": prediction.latent}
     statistics = ("mean", "sd", *(f"q{100.0 * level:g}" for level in prediction.levels))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -72,4 +72,4 @@ def _only(count: int, rows: np.ndarray) -> np.ndarray:
 
 def _row(label: str, found: "Scores") -> tuple[str, ...]:
     shares = (found.median_error, found.p95_error, found.model_error, *found.coverage.values())
-    return (label, f"{found.count:,}", *(f"{100.0 * share:.1f} %" for share in shares), f"{found.log_score:.2f}")
+    return (label, f"{found.count:,}", *(f"{100.0 * share:.1f} %" for share in shares), f"{found.elpd:.2f}")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.sampling.posterior import Posterior
 
-SCHEMA = 2
+SCHEMA = 3
 REPORT, SUMMARY = "report.html", "summary.json"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.h5"
 _STORED = (
@@ -108,19 +108,19 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
         "layerjax_result": SCHEMA,
         "versions": versions(),
         "settings": fit.settings,
-        "starts_ended": fit.ended,
+        "start_outcomes": fit.start_outcomes,
         "transport": transport_to_dict(transport),
         "resolution": fit.resolution,
         "numerical_error": fit.numerical_error,
-        "alone": None if fit.alone is None else asdict(fit.alone),
-        "part_of_joint": fit.part_of_joint,
+        "without_discrepancy": None if fit.without_discrepancy is None else asdict(fit.without_discrepancy),
+        "dataset": fit.dataset,
         "source": asdict(problem.data.source),
         "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
         "parameters": _parameters(fit),
         "fit": {name: getattr(fit, name) for name in _STORED},
-        "without_influence": fit.without_influence,
-        "unresolved": [asdict(combination) for combination in fit.unresolved],
+        "insensitive": fit.insensitive,
+        "unidentified": [asdict(combination) for combination in fit.unidentified],
         "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
         "alternatives": [list(map(id, fit.minima)).index(id(one)) for one in fit.alternatives],
         "derived": {name: getattr(fit, name) for name in _DERIVED},
@@ -159,19 +159,25 @@ def load_fit(directory: str | Path) -> "Fit":
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
-    from fits.optimise.identifiability import Combination
+    from fits.optimise.identifiability import Direction
     from fits.optimise.result import Fit, Minimum
     from fits.problem.stack_file import read_problem
-    from fits.reports.stored import stored_alone, stored_array, stored_number, stored_problem, stored_spheres
+    from fits.reports.stored import (
+        stored_array,
+        stored_number,
+        stored_problem,
+        stored_spheres,
+        stored_without_discrepancy,
+    )
 
     directory = Path(directory)
     content = _content(directory)
     given, data = read_problem(directory / PROBLEM), read(directory / DATA)
     try:
         if isinstance(data, Totals):
-            data = replace(data, spheres=stored_spheres(content.get("spheres")))
+            data = replace(data, spheres=stored_spheres(content["spheres"]))
         problem = stored_problem(content, given, data)
-        stored, count, error = content["fit"], len(problem.names), content.get("numerical_error")
+        stored, count, error = content["fit"], len(problem.names), content["numerical_error"]
         minima = tuple(
             Minimum(
                 values, stored_number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack
@@ -190,24 +196,23 @@ def load_fit(directory: str | Path) -> "Fit":
             status=stored["status"],
             iterations=stored["iterations"],
             condition_number=stored_number(stored["condition_number"]),
-            unresolved=tuple(
-                Combination(
+            unidentified=tuple(
+                Direction(
                     stored_number(one["error"]),
                     one["weights"],
-                    {name: stored_number(e) for name, e in one["alone"].items()},
+                    {name: stored_number(e) for name, e in one["conditional_errors"].items()},
                 )
-                for one in content["unresolved"]
+                for one in content["unidentified"]
             ),
             minima=minima,
             alternatives=tuple(minima[index] for index in content["alternatives"]),
-            # not in results of layerjax 0.1.0
-            without_influence=tuple(content.get("without_influence", ())),
-            part_of_joint=content.get("part_of_joint"),
-            settings=content.get("settings", {}),
-            ended=content.get("starts_ended", {}),
+            insensitive=tuple(content["insensitive"]),
+            dataset=content["dataset"],
+            settings=content["settings"],
+            start_outcomes=content["start_outcomes"],
             numerical_error=None if error is None else stored_number(error),
-            resolution=content.get("resolution"),
-            alone=stored_alone(content.get("alone")),
+            resolution=content["resolution"],
+            without_discrepancy=stored_without_discrepancy(content["without_discrepancy"]),
         )
     except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
@@ -235,8 +240,8 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
         posterior = load(load_fit(directory), directory / CHAIN)
     except NoSteps:
         return None
-    allowed = summary.get("allow_short") is True and summary.get("steps", 0) <= len(posterior.chain)
-    return replace(posterior, allow_short=allowed)  # not by a summary of a longer chain, which has been replaced
+    allowed = summary.get("allow_unconverged") is True and summary.get("steps", 0) <= len(posterior.chain)
+    return replace(posterior, allow_unconverged=allowed)  # not by a summary of a longer chain, which has been replaced
 
 
 def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
@@ -249,7 +254,7 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
         "layerjax_result": SCHEMA,
         "versions": versions(),
         "converged": posterior.converged,
-        "allow_short": posterior.allow_short,
+        "allow_unconverged": posterior.allow_unconverged,
         "steps": len(posterior.chain),
         "walkers": posterior.chain.shape[1],
         "burn_in": posterior.burn_in,

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import layerjax as lj
 from fits.data.formats import read
 from fits.data.measurements import Measurements, Source
 from fits.data.spheres import Sphere, Spheres
 
 if TYPE_CHECKING:
-    from fits.optimise.result import Alone
+    from fits.optimise.result import WithoutDiscrepancy
     from fits.problem.problem import Problem
     from fits.problem.stack_file import ProblemFile
 
@@ -30,16 +29,10 @@ def stored_problem(content: dict[str, Any], given: "ProblemFile", data: Measurem
     """What was fitted to what: the stack file, with what the fit chose beside it."""
     from fits.problem.problem import Problem
     from fits.problem.toml import transport_from_dict
-    from fits.reports.earlier import noise_meant, transport_meant
 
     source = content["source"] | {"notes": tuple(content["source"]["notes"])}
-    if "transport" in content:  # with the resolution that the fit chose
-        transport = transport_from_dict(content["transport"])
-    else:
-        assert isinstance(given.stack, lj.Stack)  # there were no mixtures
-        transport = transport_meant(given.stack, given.transport)
-    noise = given.noise if content.get("alone") is None else replace(given.noise, correlated=True)
-    noise = noise_meant(noise, [entry["name"] for entry in content["parameters"]])
+    transport = transport_from_dict(content["transport"])  # with the resolution that the fit chose
+    noise = given.noise if content["without_discrepancy"] is None else replace(given.noise, discrepancy=True)
     scale = given.scale if given.scale is not None else content["fixed_scale"]
     data = replace(data, source=Source(**source))
     return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
@@ -55,20 +48,20 @@ def stored_array(values: list[Any], *shape: int) -> np.ndarray:
     return np.array(values, dtype=float).reshape(shape)
 
 
-def stored_alone(content: dict[str, Any] | None) -> "Alone | None":
+def stored_without_discrepancy(content: dict[str, Any] | None) -> "WithoutDiscrepancy | None":
     """The fit without errors that readings share."""
-    from fits.optimise.result import Alone
+    from fits.optimise.result import WithoutDiscrepancy
 
     if content is None:
         return None
 
-    return Alone(
+    return WithoutDiscrepancy(
         values={name: stored_number(value) for name, value in content["values"].items()},
         errors={name: stored_number(value) for name, value in content["errors"].items()},
         chi_square=stored_number(content["chi_square"]),
         degrees_of_freedom=content["degrees_of_freedom"],
         log_likelihood=stored_number(content["log_likelihood"]),
-        alike=stored_number(content["alike"]),
+        residual_autocorrelation=stored_number(content["residual_autocorrelation"]),
         pairs=content["pairs"],
     )
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from fits.optimise.result import Fit
     from fits.prediction.compare import Comparison, Row
-    from fits.prediction.model_scores import Foresight
+    from fits.prediction.model_scores import ModelScore
     from fits.sampling.posterior import Posterior
 
 MOST_MINIMA = 8
@@ -129,12 +129,12 @@ def parameter_table(fit: "Fit") -> Table:
 
 def alone_table(fit: "Fit") -> Table:
     """Values and errors of a fit beside those of the same stack with independent noise."""
-    assert fit.alone is not None
+    assert fit.without_discrepancy is not None
     rows = []
-    for name, value in fit.alone.values.items():
-        pairs = (fit.values[name], fit.standard_errors[name]), (value, fit.alone.errors[name])
+    for name, value in fit.without_discrepancy.values.items():
+        pairs = (fit.values[name], fit.standard_errors[name]), (value, fit.without_discrepancy.errors[name])
         rows.append((name, *(word for pair in pairs for word in with_error(*pair)), fit.units[name]))
-    ratio = fit.alone.chi_square / max(fit.alone.degrees_of_freedom, 1)
+    ratio = fit.without_discrepancy.chi_square / max(fit.without_discrepancy.degrees_of_freedom, 1)
     note = f"Chi-square per degree of freedom is {fit.reduced_chi_square:.3g} with and {ratio:.3g} without."
     columns = ("parameter", "with", "error", "without", "error", "unit")
     return Table("With and without the model discrepancy", columns, tuple(rows), note)
@@ -158,12 +158,12 @@ def minima_table(fit: "Fit") -> Table:
 def unresolved_table(fit: "Fit") -> Table:
     """Directions of parameter space that the data do not constrain: how badly, and what they know of each by itself."""
     rows = []
-    for place, combination in enumerate(fit.unresolved, 1):
-        weights, alone = combination.weights, combination.alone
+    for place, combination in enumerate(fit.unidentified, 1):
+        weights, alone = combination.weights, combination.conditional_errors
         size = f"{combination.error:.2g}" if math.isfinite(combination.error) else "infinite"
         mixture = ", ".join(f"{weight:+.2g} {name}" for name, weight in weights.items())
         known = ", ".join(f"{name} {error:.2g}" for name, error in alone.items())
-        rows.append((str(place), size, "unconstrained" if combination.open else "weak", mixture, known))
+        rows.append((str(place), size, "unconstrained" if combination.unconstrained else "weak", mixture, known))
     note = (
         "Standard errors from the likelihood only, in units of the prior range; where they exceed it, only bounds and "
         "priors decide. A parameter's own error along a direction is its weight times that. Last column: the error of "
@@ -227,14 +227,14 @@ def comparison_table(comparison: "Comparison") -> Table:
             ("BIC - best", lambda row: f"{row.bic - bic:.1f}"),
         ]
     if all(math.isfinite(row.loo) for row in compared):
-        columns += [("LOO behind best", lambda row: f"{row.loo_behind:.1f} ± {row.loo_behind_error:.1f}")]
-    if compared[0].foresight is not None:
+        columns += [("elpd_loo diff", lambda row: f"{row.loo_diff:.1f} ± {row.loo_dse:.1f}")]
+    if compared[0].model_score is not None:
         columns += [
-            ("left out: score", lambda row: f"{_seen(row).score:.1f}"),
-            ("behind best", lambda row: f"{_seen(row).behind:.1f} ± {_seen(row).behind_error:.1f}"),
+            ("elpd", lambda row: f"{_seen(row).elpd:.1f}"),
+            ("elpd_diff ± dse", lambda row: f"{_seen(row).elpd_diff:.1f} ± {_seen(row).dse:.1f}"),
             ("weight", lambda row: f"{_seen(row).weight:.2f}"),
-            ("log evidence", lambda row: f"{_seen(row).evidence.log:.1f} ± {_seen(row).evidence.error:.1f}"),
-            ("probability", lambda row: f"{_seen(row).probability:.2g}"),
+            ("log evidence", lambda row: f"{_seen(row).evidence.log_evidence:.1f} ± {_seen(row).evidence.error:.1f}"),
+            ("model probability", lambda row: f"{_seen(row).model_probability:.2g}"),
         ]
     columns += [
         ("converged", lambda row: "yes" if row.converged else "NO"),
@@ -246,9 +246,9 @@ def comparison_table(comparison: "Comparison") -> Table:
     return Table("Comparison", tuple(head for head, _ in columns), rows, note)
 
 
-def _seen(row: "Row") -> "Foresight":
-    assert row.foresight is not None
-    return row.foresight
+def _seen(row: "Row") -> "ModelScore":
+    assert row.model_score is not None
+    return row.model_score
 
 
 def degrees(angle: float) -> str:

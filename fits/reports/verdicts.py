@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.optimise.identifiability import OPEN_BEYOND, UNRESOLVED_BEYOND, Combination
+from fits.optimise.identifiability import OPEN_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
 from fits.optimise.resolution import ENOUGH
-from fits.optimise.result import ENDED
+from fits.optimise.result import OUTCOMES
 from fits.reports.agreement import (
     MISFIT_SIGMAS,
     agreement,
@@ -47,7 +47,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         width = float(fit.problem.high[index] - fit.problem.low[index])
         error = fit.standard_errors[name]
         partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
-        if name in fit.without_influence:
+        if name in fit.insensitive:
             words[name] = "NO INFLUENCE on the data"
         elif name in limits:
             words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
@@ -55,7 +55,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
             words[name] = "AT BOUND"
         elif name in limited:
             words[name] = f"LIMITED by the instrument: moves with {limited[name][0]}"
-        elif math.hypot(*(own := [one.error_of(name) for one in fit.unresolved])) > UNRESOLVED_BEYOND:
+        elif math.hypot(*(own := [one.error_of(name) for one in fit.unidentified])) > UNIDENTIFIED_BEYOND:
             kind = "unconstrained by the data" if math.hypot(*own) > OPEN_BEYOND else "weakly constrained"
             words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
         elif not math.isfinite(error):
@@ -80,7 +80,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
             f"The model does not explain the data to within its noise (chi-square per degree of freedom "
             f"{fit.reduced_chi_square:.3g}): the quoted errors are too small."
         )
-    elif structure.lag_one_sigma > MISFIT_SIGMAS and not fit.problem.noise.correlated:
+    elif structure.lag_one_sigma > MISFIT_SIGMAS and not fit.problem.noise.discrepancy:
         sentences.append(
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
@@ -96,10 +96,10 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
         )
     if fit.at_bound:
         sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
-    if fit.without_influence:
-        sentences.append(f"Without influence on the data: {', '.join(fit.without_influence)}.")
-    for combination in fit.unresolved[:1]:
-        sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unresolved) > 1 else ''}.")
+    if fit.insensitive:
+        sentences.append(f"Without influence on the data: {', '.join(fit.insensitive)}.")
+    for combination in fit.unidentified[:1]:
+        sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unidentified) > 1 else ''}.")
     if not undescribed:
         sentences += errors_of_one(fit)
     if undescribed or sentences:
@@ -115,7 +115,7 @@ def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
     """A few lines for the terminal: the verdict, how good, how sure, and what the data leave open."""
     lines, _ = in_short(fit, structure)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    if fit.problem.noise.correlated:
+    if fit.problem.noise.discrepancy:
         good = f"{good} with the discrepancy term, {without_discrepancy(fit):.4g} without"
     starts = f"{fit.minima[0].count} of {_started(fit)} ended here"
     others = f", other local minima that fit equally well: {len(fit.alternatives)}" if describes(fit) else ""
@@ -135,7 +135,7 @@ def noise_in_words(problem: "Problem") -> str:
         elif value > 0.0:
             assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
             parts.append(f"{value:.3g} {unit}{assumed}")
-    if noise.correlated:
+    if noise.discrepancy:
         parts.append("a model discrepancy (Gaussian process)")
     tails = (
         "Gaussian" if noise.tails == "gaussian" else f"Student-t with {noise.degrees_of_freedom:g} degrees of freedom"
@@ -170,30 +170,30 @@ def listed(names: Sequence[str]) -> str:
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
 
 
-def _not_separated(combination: Combination) -> str:
+def _not_separated(combination: Direction) -> str:
     error = {name: combination.error_of(name) for name in combination.weights}
-    names = [name for name in error if error[name] > UNRESOLVED_BEYOND] or [max(error, key=lambda name: error[name])]
+    names = [name for name in error if error[name] > UNIDENTIFIED_BEYOND] or [max(error, key=lambda name: error[name])]
     if len(names) > 1:
         return f"The data do not separate {listed(names)}"
-    return f"The data {'do not determine' if combination.open else 'weakly constrain'} {names[0]}"
+    return f"The data {'do not determine' if combination.unconstrained else 'weakly constrain'} {names[0]}"
 
 
 def determines(fit: "Fit") -> list[str]:
     """What the data leave open: condition number, combinations they do not separate, parameters at a bound."""
     sentences = [f"The condition number of the scaled problem is {fit.condition_number:.3g}."]
-    if fit.without_influence:
+    if fit.insensitive:
         sentences.append(
-            f"Without influence on the data: {', '.join(fit.without_influence)}. Any value explains them as well."
+            f"Without influence on the data: {', '.join(fit.insensitive)}. Any value explains them as well."
         )
-    if fit.unresolved:
+    if fit.unidentified:
         sentences.append(
-            f"{len(fit.unresolved)} of {len(fit.vector)} principal directions of parameter space are constrained by "
-            f"the data to no better than {100.0 * UNRESOLVED_BEYOND:g} % of the prior range; there, priors dominate."
+            f"{len(fit.unidentified)} of {len(fit.vector)} principal directions of parameter space are constrained by "
+            f"the data to no better than {100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range; there, priors dominate."
         )
     else:
         sentences.append(
             "The data constrain every principal direction of parameter space to better than "
-            f"{100.0 * UNRESOLVED_BEYOND:g} % of the prior range."
+            f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range."
         )
     if fit.at_bound:
         sentences.append(
@@ -205,11 +205,11 @@ def determines(fit: "Fit") -> list[str]:
 
 def starts_in_words(fit: "Fit") -> str:
     """How many starts there were, and where they ended, in one line."""
-    if not fit.ended:
+    if not fit.start_outcomes:
         return "not recorded"
     run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
-    where = ", ".join(f"{fit.ended[key]} {word}" for key, word in ENDED.items() if fit.ended[key])
-    ran = sum(fit.ended.values())
+    where = ", ".join(f"{fit.start_outcomes[key]} {word}" for key, word in OUTCOMES.items() if fit.start_outcomes[key])
+    ran = sum(fit.start_outcomes.values())
     if not _refitted(fit):
         return f"{ran} ({run}): {where}"
     given = fit.settings.get("starts", "?")
@@ -218,18 +218,18 @@ def starts_in_words(fit: "Fit") -> str:
 
 def _refitted(fit: "Fit") -> bool:
     """Whether it was fitted once more, with a model discrepancy, from starts of its own: see `shared_errors.points`."""
-    return fit.alone is not None
+    return fit.without_discrepancy is not None
 
 
 def _started(fit: "Fit") -> str:
     """How many starts led to the fit, in words."""
-    return f"{sum(fit.ended.values())} starts{' with the discrepancy term' if _refitted(fit) else ''}"
+    return f"{sum(fit.start_outcomes.values())} starts{' with the discrepancy term' if _refitted(fit) else ''}"
 
 
 def minima(fit: "Fit") -> list[str]:
     """How many starts agree on the minimum, and whether another local minimum fits equally well."""
-    best, total = fit.minima[0], sum(fit.ended.values()) or sum(minimum.count for minimum in fit.minima)
-    starts = _started(fit) if fit.ended else f"{total} starts"
+    best, total = fit.minima[0], sum(fit.start_outcomes.values()) or sum(minimum.count for minimum in fit.minima)
+    starts = _started(fit) if fit.start_outcomes else f"{total} starts"
     found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
     sentences = [f"{best.count} of {starts} reached the best minimum; {found}."]
     if best.count == 1 and total > 1:
@@ -261,4 +261,4 @@ def sampled(posterior: "Posterior") -> list[str]:
 
 def reportable(posterior: "Posterior") -> bool:
     """Whether estimates may be had from the chain."""
-    return posterior.converged or posterior.allow_short
+    return posterior.converged or posterior.allow_unconverged

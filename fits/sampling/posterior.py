@@ -60,7 +60,7 @@ class Posterior:
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
         converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
             changed by less than 5 % since the last check, and R-hat is below 1.05.
-        allow_short: estimates may be had from a chain that has not converged.
+        allow_unconverged: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
         divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
         modes: where the fit knows several minima that hold a share of the posterior: these, the largest share first.
@@ -73,7 +73,7 @@ class Posterior:
     autocorrelation_time: Floats
     acceptance: float
     converged: bool
-    allow_short: bool = False
+    allow_unconverged: bool = False
     status: str = ""
     divergences: int = 0
     modes: tuple[Mode, ...] = ()
@@ -134,7 +134,7 @@ class Posterior:
     def summary(self) -> dict[str, tuple[float, float, float, float, float]]:
         """For each parameter: median, ends of the central 68 % interval, mean, standard deviation.
 
-        Raises ValueError for a chain that has not converged, unless it was sampled with `allow_short`.
+        Raises ValueError for a chain that has not converged, unless it was sampled with `allow_unconverged`.
         """
         self._require_converged()
         kept = self.chain[self.burn_in :].reshape(-1, len(self.names))
@@ -179,17 +179,17 @@ class Posterior:
         )
 
     def _require_converged(self) -> None:
-        if self.converged or self.allow_short:
+        if self.converged or self.allow_unconverged:
             return
         raise ValueError(
             f"the chain of {len(self.chain)} steps is too short to report from: its longest autocorrelation time is "
             f"{np.max(self.autocorrelation_time):.0f} steps, and {LONG_ENOUGH:.0f} of them after burn-in are needed, "
             f"steady to {STEADY:.0%}, with R-hat below {MIXED:g} (it is {np.max(self.r_hat):.3g}); sample again with "
-            "the same path and a larger max_steps to go on, or with allow_short=True"
+            "the same path and a larger max_steps to go on, or with allow_unconverged=True"
         )
 
 
-def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Posterior:
+def posterior_of(fit: Fit, chain: MemoryChain, allow_unconverged: bool = False) -> Posterior:
     """What a chain of a fit's posterior says."""
     positions, moves = chain.get_chain(), chain.moves
     count = positions.shape[-1]
@@ -208,7 +208,7 @@ def posterior_of(fit: Fit, chain: MemoryChain, allow_short: bool = False) -> Pos
         autocorrelation_time=autocorrelation_times(chain, len(positions)),
         acceptance=taken,
         converged=long_enough(chain),
-        allow_short=allow_short,
+        allow_unconverged=allow_unconverged,
         status=words,
         divergences=divergences,
         modes=_modes(fit, moves, positions, values),
@@ -242,7 +242,7 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
             at = model.build(vector).correlation
             assert at is not None
             assert model.softness is not None
-            lack = model.process.drawn(numbers, at)
+            lack = model.process.sample(numbers, at)
             expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + lack)
         return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
 

@@ -37,7 +37,7 @@ def sample(
     ess: float | None = None,
     max_steps: int = 20_000,
     resume: bool = True,
-    allow_short: bool = False,
+    allow_unconverged: bool = False,
     progress: Progress | None = None,
 ) -> Posterior:
     """Sample the posterior of a fit until its chain is long enough, or `max_steps` steps.
@@ -61,7 +61,7 @@ def sample(
             more of them.
         max_steps: hard limit; a chain that reaches it may not be `converged`.
         resume: False replaces what `path` holds.
-        allow_short: let the result report estimates though the chain has not converged.
+        allow_unconverged: let the result report estimates though the chain has not converged.
         progress: called with ("sample", steps, None, note); before that with ("surrogate", evaluations, None, note) or
             ("warm-up", steps, all).
 
@@ -85,7 +85,7 @@ def sample(
         _run(moved, chain, max_steps, ess, progress)
     finally:
         chain.close()
-    return posterior_of(fit, chain, allow_short)
+    return posterior_of(fit, chain, allow_unconverged)
 
 
 def _run(
@@ -171,7 +171,7 @@ class NoSteps(ValueError):
     """A chain that has not begun."""
 
 
-def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
+def load(fit: Fit, path: str | Path, *, allow_unconverged: bool = False) -> Posterior:
     """The posterior kept in a file by `sample`, as far as it got. ValueError if the file is not a chain of this fit."""
     if not Path(path).is_file():
         raise ValueError(f"{path}: there is no chain")
@@ -182,7 +182,7 @@ def load(fit: Fit, path: str | Path, *, allow_short: bool = False) -> Posterior:
     chain = stored_chain(path, expected)
     if not chain.iteration:
         raise NoSteps(f"{path}: the chain has no steps yet")
-    return posterior_of(fit, chain, allow_short)
+    return posterior_of(fit, chain, allow_unconverged)
 
 
 def identity_of(problem: Problem, walkers: int, seed: int, sampler: str = "emcee") -> dict[str, Any]:

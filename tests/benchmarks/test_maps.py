@@ -64,7 +64,7 @@ def test_the_coat_may_share_a_base(monkeypatch: pytest.MonkeyPatch) -> None:
     coat = painted((2, 3), noise=0.0, shared=True)
     _, names, free = split(coat.stack)
     assert set(names) == set(coat.truth) == {*NAMES["coat"], "base.albedo"}
-    assert [name for name, entry in zip(names, free, strict=True) if entry.shared] == ["base.albedo"]
+    assert [name for name, entry in zip(names, free, strict=True) if entry.same_for_all_texels] == ["base.albedo"]
     (stack,) = seen
     np.testing.assert_array_equal(stack.layers[0].alpha, coat.truth["layers[0].alpha"].ravel())
     np.testing.assert_array_equal(stack.layers[1].thickness[:, 0], coat.truth["layers[1].thickness"].ravel())

@@ -20,8 +20,8 @@ def test_a_mixture_is_recovered():
 
 def test_an_instrument_is_part_of_one_problem_and_not_of_the_other():
     found, without = (case for case, _ in zip(cases.by_instruments(2), range(2), strict=False))
-    assert found.truth["instrument.offset"] == cases.LEANS
-    assert "instrument.offset" in found.problem.names
+    assert found.truth["instrument.tilt"] == cases.LEANS
+    assert "instrument.tilt" in found.problem.names
     assert not any(name.startswith("instrument") for name in without.problem.names)
     np.testing.assert_array_equal(found.values, without.values)
 

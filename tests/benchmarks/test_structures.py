@@ -8,12 +8,12 @@ import pytest
 
 from benchmarks.studies import structures
 from benchmarks.studies.structures import TRUTHS, Repeat
-from fits.structure_search.searching import named
+from fits.structure_search.search import named
 
 
-def repeat(index: int, place: int | None = 0, best: str | None = None, surely_behind: float | None = -1.0) -> Repeat:
+def repeat(index: int, place: int | None = 0, best: str | None = None, clear_diff: float | None = -1.0) -> Repeat:
     truth = named(TRUTHS[index])
-    return Repeat(index, truth, place, best or truth, 2.0, surely_behind, 14, 30.0)
+    return Repeat(index, truth, place, best or truth, 2.0, clear_diff, 14, 30.0)
 
 
 def test_places_are_counted(tmp_path: Path) -> None:
@@ -21,8 +21,8 @@ def test_places_are_counted(tmp_path: Path) -> None:
     done = [
         repeat(0),  # found
         repeat(1, place=2, best=complex_),  # among the first three, the more complex one ahead of it by chance
-        repeat(2, place=3, best=complex_, surely_behind=5.0),  # beaten by a more complex one
-        repeat(10, place=None, best=simple, surely_behind=None),  # not looked at, beaten by a simpler one
+        repeat(2, place=3, best=complex_, clear_diff=5.0),  # beaten by a more complex one
+        repeat(10, place=None, best=simple, clear_diff=None),  # not looked at, beaten by a simpler one
     ]
     text, paths = structures._save(done, tmp_path)
     assert "among the first three in 2 of 4" in text

@@ -13,7 +13,7 @@ kind = "Lambertian"
 albedo = { start = 0.5, low = 0.0, high = 1.0 }
 
 [noise]
-correlated = false
+discrepancy = false
 """
 COAT = """
 [[layers]]

@@ -158,14 +158,14 @@ def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any
     if case.errors:
         data = shared.with_errors(data, truth, generator)
     # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
-    correlated = fits.Correlated(**shared.FREE) if case.errors else False
-    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, correlated=correlated)
+    correlated = fits.Discrepancy(**shared.FREE) if case.errors else False
+    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, discrepancy=correlated)
     scale = case.free["scale"] if case.scale else None
     fit = fits.fit(
         case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
     )
     posterior = fits.sample(
-        fit, walkers=_walkers(case), seed=index, surrogate=surrogate, max_steps=case.most_steps, allow_short=True
+        fit, walkers=_walkers(case), seed=index, surrogate=surrogate, max_steps=case.most_steps, allow_unconverged=True
     )
     draws, apart = spread_draws(posterior)
     return Repeat(

@@ -59,9 +59,9 @@ def by_instruments(repeats: int) -> Iterator[Case]:
         for group in groups:
             gains[:, group.rows] = np.exp(GAIN * generator.standard_normal((repeats, 1, 1)))
         values = gains * exact * (1.0 + NOISE * generator.standard_normal((repeats, *exact.shape)))
-        instrument = fits.Instrument(detector=detector, offset=fits.Free(0.0, -2.0, 2.0), gain_per_incidence=GAIN)
+        instrument = fits.Instrument(detector_aperture=detector, tilt=fits.Free(0.0, -2.0, 2.0), gain_sd=GAIN)
         name = f"detector of {detector:g} degrees"
-        known = truth | {"instrument.offset": LEANS}
+        known = truth | {"instrument.tilt": LEANS}
         yield Case(name, "with the instrument", _problem(free, data, instrument=instrument), values, known)
         yield Case(name, "without", _problem(free, data), values, truth)
 

@@ -23,7 +23,7 @@ def main(path: str) -> None:
     began = time.perf_counter()
     data = fits.read(Path(path), bins="all")
     _, free = materials()["flakes over paint"]
-    noise = fits.Noise(relative=NOISE, floor=FLOOR, correlated=False)
+    noise = fits.Noise(relative=NOISE, floor=FLOOR, discrepancy=False)
     found = fits.fit(free, data, transport=lj.SingleScattering(), noise=noise, starts=2)
     unit = 1 if sys.platform == "darwin" else 1024
     content = {

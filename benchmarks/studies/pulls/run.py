@@ -33,7 +33,7 @@ errors; asked for: {enough:.0%}.
 
 A coat of alpha 0.08 over a diffuse base, at 10, 30, 50 and 70 degrees, every 2 degrees. Readings are means over the
 detector's cone by dense quadrature; the sample leans by {leans:g} degrees, and each incidence has a gain of its own,
-{gain:.0%} about 1. Fitted with `fits.Instrument(detector=..., offset=Free, gain_per_incidence={gain})`, and without.
+{gain:.0%} about 1. Fitted with `fits.Instrument(detector_aperture=..., tilt=Free, gain_sd={gain})`, and without.
 
 {instruments}
 ## Mixtures ({many} repeats)

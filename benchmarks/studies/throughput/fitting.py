@@ -178,7 +178,7 @@ def many_fits(problem: fits.Problem, size: Size) -> Row:
 def posterior(problem: fits.Problem, size: Size) -> Row:
     """Effective samples a second of `fits.sample`, until it stops by itself, beside emcee on the numpy likelihood."""
     fit = fit_problem(problem, starts=1)
-    fits.sample(fit, walkers=WALKERS, max_steps=100, allow_short=True)
+    fits.sample(fit, walkers=WALKERS, max_steps=100, allow_unconverged=True)
     chain = _NumpyChain(problem, fit)
     rounds = max(size.rounds // 2, 2)
     ours, speeds, posteriors = [], [], []

@@ -63,7 +63,7 @@ def translated(material: Material) -> Translation:
     sigma = np.abs(values) + DARK * material.shares(direction(np.array(INCIDENCE), 0.0))[0].mean() / np.pi
     names = channel_names(material.channels)
     data = Measurements(wi, wo, values, sigma, np.ones(len(wi), bool), names, Source("", "simulated"))
-    noise = Noise(relative=0.0, floor=0.0, correlated=False)
+    noise = Noise(relative=0.0, floor=0.0, discrepancy=False)
     found = [
         fit(
             freed(surface, material.channels),

@@ -119,7 +119,7 @@ def page(map: FittedMap, found: Summary, images: Pictures) -> str:
         ]
         if "correlation" in images:
             caption = "Correlation of the fitted values over the texels: of the material, and of the fits."
-            sections.append(section("Correlated parameters", image(images, "correlation", caption)))
+            sections.append(section("Discrepancy parameters", image(images, "correlation", caption)))
         sections.append(section("The worst texels", html_table(tables.worst_table(map))))
     stack = f"<pre>{html.escape(str(map.attributes.get('stack', '')))}</pre>"
     sections += [section("How it was made", html_table(tables.made_table(map)), stack), made_with()]

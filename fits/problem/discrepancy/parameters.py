@@ -1,4 +1,4 @@
-"""What is asked of errors that readings share: see `fits.problem.discrepancy.process`."""
+"""The parameters of the model discrepancy, and their priors: see `fits.problem.discrepancy.process`."""
 
 from dataclasses import dataclass, fields
 
@@ -8,29 +8,29 @@ from fits.problem.parameters import Free, LogNormal, Normal
 from fits.problem.values import shown
 
 LONGEST = 40.0
-"""Of a length whose prior is not given, in degrees. What is alike farther than that is no error of a shape: it would
-take the place of the stack's level."""
+"""Of a length scale whose prior is not given, in degrees: what is correlated farther would take the place of the
+stack's level."""
 
 ANGLES = (0.1, 360.0)
-RANGES = {"amplitude": (1e-6, 1.0), "growth": (0.0, 2.0), "channels": (0.0, 1.0)}
+RANGES = {"amplitude": (1e-6, 1.0), "grazing_exponent": (0.0, 2.0), "channel_correlation": (0.0, 1.0)}
 
 
 @dataclass(frozen=True)
-class Correlated:
-    """Errors of the model that neighbouring readings share, of its logarithm.
+class Discrepancy:
+    """Model discrepancy: a Gaussian process of the logarithm of the BSDF (Kennedy & O'Hagan 2001).
 
-    amplitude: their standard deviation where light and viewer are along the normal, unitless, in [1e-6, 1]. half,
-    difference: how far they reach, in degrees in [0.1, 360], in the angle of the half vector to the normal, and in that
-    of light and viewer to the half vector. growth: the standard deviation is that of the normal times (2 / (cos i + cos
-    o)) to this power, in [0, 2]. channels: correlation of two channels, in [0, 1]. Each a number, `Free`, or None for a
-    free one with a wide prior.
+    amplitude: its standard deviation where light and viewer are along the normal, unitless, in [1e-6, 1]. length_half,
+    length_difference: length scales of its Matern kernel, in degrees in [0.1, 360], in the angle of the half vector to
+    the normal, and in that of light and viewer to the half vector. grazing_exponent: the standard deviation is that of
+    the normal times (2 / (cos i + cos o)) to this power, in [0, 2]. channel_correlation: of two channels, in [0, 1].
+    Each a number, `Free`, or None for a free one with a wide prior.
     """
 
     amplitude: float | Free | None = None
-    half: float | Free | None = None
-    difference: float | Free | None = None
-    growth: float | Free | None = None
-    channels: float | Free | None = None
+    length_half: float | Free | None = None
+    length_difference: float | Free | None = None
+    grazing_exponent: float | Free | None = None
+    channel_correlation: float | Free | None = None
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -39,7 +39,7 @@ class Correlated:
             if isinstance(value, Free):
                 if value.shape != ():
                     raise ValueError(
-                        f"Noise.correlated.{entry.name} has {value.shape[0]} channels; it must be a single number"
+                        f"Noise.discrepancy.{entry.name} has {value.shape[0]} channels; it must be a single number"
                     )
                 ends = {f"{entry.name}.{end}": getattr(value, end) for end in ("low", "high")}
             else:
@@ -47,22 +47,24 @@ class Correlated:
             for name, number in ends.items():
                 if not (isinstance(number, int | float) and low <= number <= high):
                     raise ValueError(
-                        f"Noise.correlated.{name} is {shown(number)}; it must be a number in [{low:g}, {high:g}]"
+                        f"Noise.discrepancy.{name} is {shown(number)}; it must be a number in [{low:g}, {high:g}]"
                     )
 
 
-def numbers_of(given: Correlated, process: Process, channels: int) -> Correlation:
+def numbers_of(given: Discrepancy, process: Process, channels: int) -> Correlation:
     """The numbers of a process, those that are left out filled in."""
     half, difference = (_length(float(shortest)) for shortest in process.shortest)
-    own = given.channels
+    own = given.channel_correlation
     if own is None:
         own = Free(0.8, 0.0, 0.99) if channels > 1 else 0.0
     return Correlation(
         amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 1.0)) if given.amplitude is None else given.amplitude,
-        half=half if given.half is None else given.half,
-        difference=difference if given.difference is None else given.difference,
-        growth=Free(0.5, *RANGES["growth"], Normal(0.5, 0.5)) if given.growth is None else given.growth,
-        channels=own,
+        length_half=half if given.length_half is None else given.length_half,
+        length_difference=difference if given.length_difference is None else given.length_difference,
+        grazing_exponent=Free(0.5, *RANGES["grazing_exponent"], Normal(0.5, 0.5))
+        if given.grazing_exponent is None
+        else given.grazing_exponent,
+        channel_correlation=own,
     )
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, incidences, signed_angle
 from fits.prediction.predict import with_discrepancy
+from fits.problem.model import Density
 from fits.reports.diagnostics import bsdf, misfit, misfit_label, over_all_rows
 from fits.reports.plots.data import (
     ANGLE_LABEL,
@@ -100,7 +101,7 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
 
 def _residual_label(fit: "Fit") -> str:
     words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
-    return f"{words}\nwith discrepancy" if fit.problem.noise.correlated else words
+    return f"{words}\nwith discrepancy" if fit.problem.noise.discrepancy else words
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
@@ -121,7 +122,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
             image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
             hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
             signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-reach, reach), "PuOr")
-            model = "with discrepancy" if fit.problem.noise.correlated else "model"
+            model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
             for axes, what in zip(row, ("data", model, "residual"), strict=True):
                 axes.set_title(f"{incidence.label}: {what}")
         bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
@@ -177,7 +178,7 @@ def assumed_sigma(fit: "Fit") -> Floats:
 
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call("sigma_at", fit.vector, fit.predicted))
+    return np.asarray(fit.problem.call(Density.sigma_at, fit.vector, fit.predicted))
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
@@ -204,6 +205,6 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     curves = []
     for angle, end in zip(angles, ends, strict=True):
         own = slice(end - len(angle), end)
-        alone = values[0, own] if fit.problem.noise.correlated else None
+        alone = values[0, own] if fit.problem.noise.discrepancy else None
         curves.append(_Curve(angle, best[own], alone, None if band is None else band[:, own]))
     return curves

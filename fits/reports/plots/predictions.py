@@ -49,9 +49,9 @@ def bands_picture(prediction: "Prediction", readings: "Measurements") -> Figure 
 
 
 def _bands(axes: Axes, angle: np.ndarray, prediction: "Prediction", rows: np.ndarray, channel: int) -> None:
-    low, quarter, middle, three, high = prediction.reading.quantiles[:, rows, channel]
-    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % of readings")
+    low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
+    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % of new measurements")
     axes.fill_between(angle, quarter, three, color=CYCLE[0], alpha=0.35, linewidth=0, label="50 %")
     axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
-    alone = prediction.model.quantiles[2, rows, channel]
+    alone = prediction.latent.quantiles[2, rows, channel]
     axes.plot(angle, alone, color=CYCLE[1], linewidth=1.0, linestyle="dashed", label="stack alone")

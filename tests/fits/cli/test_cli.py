@@ -111,7 +111,7 @@ def test_a_layer_that_the_transport_cannot_carry_is_named(work: Path, capsys: py
         ),
         (["fit", "data.csv", "--stack", "coat.toml", "--out", "x", "--mask-grazing", "1"], "no sample"),
         ([*FIT, "--ess", "100"], "--ess is given without --sample"),
-        ([*FIT, "--allow-short"], "--allow-short is given without --sample"),
+        ([*FIT, "--allow-unconverged"], "--allow-unconverged is given without --sample"),
         ([*FIT, "--no-surrogate"], "--no-surrogate is given without --sample"),
         ([*FIT, "--sample", "--walkers", "7"], "walkers is 7; it must be even and at least 6 for 2 parameters"),
         ([*FIT, "--sample", "--max-steps", "5"], "max_steps is 5; it must be at least 100"),

@@ -122,13 +122,14 @@ def test_the_stack_file_says_the_rest(place: Path, monkeypatch: pytest.MonkeyPat
     made = found(place)
     called = _in_place(monkeypatch, lambda: made)
     text = (place / "coat.toml").read_text()
-    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\nshared = true\n"
-    (place / "coat.toml").write_text(text + more + "[instrument]\ndetector = 2.0\n")
+    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\n"
+    more += "same_for_all_texels = true\n"
+    (place / "coat.toml").write_text(text + more + "[instrument]\ndetector_aperture = 2.0\n")
     assert main([*WORDS, "--noise", "0.03"]) == 0
     assert called.given is not None
     assert called.given["noise"] == Noise(relative=0.03, tails="student")
-    assert called.given["options"].scale.shared
-    assert called.given["options"].instrument.detector == 2.0
+    assert called.given["options"].scale.same_for_all_texels
+    assert called.given["options"].instrument.detector_aperture == 2.0
 
 
 def test_what_was_found_is_printed(

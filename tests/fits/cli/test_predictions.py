@@ -23,7 +23,7 @@ def test_readings_are_held_out_and_scored(work: Path, capsys: pytest.CaptureFixt
     shown = capsys.readouterr().out
     assert "Readings that were held out" in shown
     assert "θᵢ = 50°" in shown
-    assert "noise.correlated.amplitude" in shown
+    assert "noise.discrepancy.amplitude" in shown
     data = load_fit("result").problem.data
     np.testing.assert_allclose(data.theta_i[data.mask], 10.0)
     assert np.all(np.abs(np.sin(np.radians(data.phi_o[data.mask]))) < 1e-9)
@@ -43,9 +43,9 @@ def test_predictions_are_written(work: Path, capsys: pytest.CaptureFixture[str],
     assert len(rows) == 3 * 35
     for row in rows:
         bands = {name: float(row[name]) for name in row if name.startswith(("bsdf", "model", "reading"))}
-        assert bands["reading_q2.5"] < bands["bsdf_q50"] < bands["reading_q97.5"]
+        assert bands["predictive_q2.5"] < bands["bsdf_q50"] < bands["predictive_q97.5"]
         assert 0.0 < bands["bsdf_sd"] < bands["reading_sd"]
-        assert bands["bsdf_mean"] == bands["model_mean"]  # no discrepancy is modelled
+        assert bands["bsdf_mean"] == bands["latent_mean"]  # no discrepancy is modelled
     names = [name.partition("_")[0] for name in rows[0]][5:]
     assert sorted(set(names), key=names.index) == ["bsdf", "reading", "model"]
     capsys.readouterr()

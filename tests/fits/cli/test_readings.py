@@ -57,7 +57,7 @@ def test_convert_and_simulate_write_csv(work: Path, coat_data: Measurements) -> 
 def test_what_a_stack_file_says_of_readings_is_not_simulated_and_told(
     work: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    more = "\n[noise]\nrelative = 0.1\n[instrument]\ndetector = 2.0\n"
+    more = "\n[noise]\nrelative = 0.1\n[instrument]\ndetector_aperture = 2.0\n"
     (work / "seen.toml").write_text((work / "coat.toml").read_text() + more)
     for name in ("coat", "seen"):
         assert main(["simulate", "--stack", f"{name}.toml", "--out", f"{name}.csv"]) == 0

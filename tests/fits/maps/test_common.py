@@ -13,14 +13,14 @@ from fits.data.measurements import Measurements
 from fits.maps.common import _Arrow, _step, common_names, fit_common, hold
 from fits.maps.descent import make_texels
 from fits.maps.options import MapOptions
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.parameters import is_free
 from fits.problem.spectra import PowerLaw
 from fits.problem.stack_file import read_problem, write_problem
 from tests.helpers import quick_maps
 
 TRANSPORT = lj.SingleScattering()
-NOISE = fits.Noise(relative=0.02, floor=1e-4, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 TRUTH = np.array([[0.3, 0.2], [0.5, 0.3], [0.8, 0.4], [1.2, 0.5]])
 G = 0.4
 SMALL = MapOptions(starts=2, chunk_size=4)
@@ -33,7 +33,9 @@ def coat(thickness, albedo, g):
 
 def free(low=-0.2, high=0.8, prior=None):
     return coat(
-        fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), fits.Free(0.2, low, high, prior=prior, shared=True)
+        fits.Free(0.5, 0.05, 3.0),
+        fits.Free(0.4, 0.0, 1.0),
+        fits.Free(0.2, low, high, prior=prior, same_for_all_texels=True),
     )
 
 
@@ -81,7 +83,7 @@ def test_the_joint_fit_of_a_pilot_is_that_of_joint(geometry, values, prior, boun
 
 
 def test_errors_of_what_a_pilot_does_not_know_are_infinite(geometry, values):
-    stack = coat(*(fits.Free(0.5, 0.1, 0.9, shared=k > 0) for k in range(3)))
+    stack = coat(*(fits.Free(0.5, 0.1, 0.9, same_for_all_texels=k > 0) for k in range(3)))
     problem, gradient = problem_of(stack, values[0], geometry), np.array([1.0, 0.0])
     for information in (np.zeros((2, 2)), np.diag([1e8, 0.0]), np.diag([1e8, -1e-9])):
         step, error, _ = _step(problem, np.array([1, 2]), _Arrow(0.0, gradient, information), np.array([0.5, 0.5]))
@@ -105,7 +107,7 @@ def test_a_map_holds_what_its_texels_have_in_common(tmp_path, geometry, values):
 
 def test_a_common_level_of_noise_is_found(tmp_path, geometry, values):
     stack = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), G)
-    noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, shared=True))
+    noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, same_for_all_texels=True))
     found = fits.fit_map(
         stack, geometry, values, tmp_path / "noise.zarr", noise=noise, transport=TRANSPORT, options=SMALL
     )
@@ -119,7 +121,7 @@ def test_a_common_level_of_noise_is_found(tmp_path, geometry, values):
 
 
 def test_a_map_of_common_parameters_alone_is_refused(tmp_path, geometry, values):
-    stack = coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, shared=True))
+    stack = coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, same_for_all_texels=True))
     with pytest.raises(ValueError, match="all free parameters are common"):
         fits.fit_map(stack, geometry, values, tmp_path / "none.zarr", noise=NOISE, transport=TRANSPORT)
     assert not (tmp_path / "none.zarr").exists()
@@ -128,8 +130,10 @@ def test_a_map_of_common_parameters_alone_is_refused(tmp_path, geometry, values)
 # ---- which they are, and the stack with them held ----
 
 
-HAZE = lj.Medium(fits.Free(0.5, 0.1, 2.0), [0.5, 0.6, 0.7], lj.HenyeyGreenstein(fits.Free(0.3, 0.0, 0.9, shared=True)))
-COAT = lj.Stack([HAZE], lj.Lambertian(fits.Free((0.1, 0.2, 0.3), 0.0, 1.0, shared=True)))
+HAZE = lj.Medium(
+    fits.Free(0.5, 0.1, 2.0), [0.5, 0.6, 0.7], lj.HenyeyGreenstein(fits.Free(0.3, 0.0, 0.9, same_for_all_texels=True))
+)
+COAT = lj.Stack([HAZE], lj.Lambertian(fits.Free((0.1, 0.2, 0.3), 0.0, 1.0, same_for_all_texels=True)))
 VALUES = {"layers[0].phase.g": 0.4, "base.albedo[0]": 0.5, "base.albedo[1]": 0.25, "base.albedo[2]": 0.125}
 
 
@@ -141,25 +145,27 @@ def _data(channels: int = 3) -> Measurements:
 
 def test_the_mark_is_shown_only_where_it_is_set() -> None:
     assert repr(fits.Free(0.5, 0.0, 1.0)) == "Free(0.5, 0.0, 1.0)"
-    assert repr(fits.Free(0.5, 0.0, 1.0, shared=True)) == "Free(0.5, 0.0, 1.0, shared=True)"
-    assert fits.Free(0.5, 0.0, 1.0, shared=True) != fits.Free(0.5, 0.0, 1.0)
+    assert repr(fits.Free(0.5, 0.0, 1.0, same_for_all_texels=True)) == "Free(0.5, 0.0, 1.0, same_for_all_texels=True)"
+    assert fits.Free(0.5, 0.0, 1.0, same_for_all_texels=True) != fits.Free(0.5, 0.0, 1.0)
     for wrong in (1, "yes", None):
-        with pytest.raises(ValueError, match=r"Free.shared is .*; it must be True or False"):
+        with pytest.raises(ValueError, match=r"Free.same_for_all_texels is .*; it must be True or False"):
             fits.Free(0.5, 0.0, 1.0, fits.Uniform(), None, wrong)  # type: ignore[arg-type]
 
 
 def test_a_stack_file_has_the_mark(tmp_path) -> None:
-    scale = fits.Free(1.0, 0.8, 1.25, shared=True)
+    scale = fits.Free(1.0, 0.8, 1.25, same_for_all_texels=True)
     path = tmp_path / "coat.toml"
     write_problem(path, COAT, scale=scale)
-    assert path.read_text().count("shared = true") == 3
+    assert path.read_text().count("same_for_all_texels = true") == 3
     again = read_problem(path)
     assert again.scale == scale
     assert again.stack.layers[0].thickness == HAZE.thickness
     assert again.stack.layers[0].phase.g == HAZE.phase.g
     assert again.stack.base.albedo == COAT.base.albedo
-    path.write_text("[base]\nkind = 'Lambertian'\nalbedo = { start = 0.5, low = 0, high = 1, shared = 1 }\n")
-    with pytest.raises(ValueError, match=r"base.albedo.shared is 1, must be true or false"):
+    path.write_text(
+        "[base]\nkind = 'Lambertian'\nalbedo = { start = 0.5, low = 0, high = 1, same_for_all_texels = 1 }\n"
+    )
+    with pytest.raises(ValueError, match=r"base.albedo.same_for_all_texels is 1, must be true or false"):
         read_problem(path)
 
 
@@ -170,23 +176,25 @@ def test_common_names_are_those_of_the_problem() -> None:
         _data(),
         lj.SingleScattering(),
         noise=fits.Noise(
-            relative=fits.Free(0.05, 0.01, 0.5), correlated=Correlated(amplitude=fits.Free(0.1, 0.01, 0.5, shared=True))
+            relative=fits.Free(0.05, 0.01, 0.5),
+            discrepancy=Discrepancy(amplitude=fits.Free(0.1, 0.01, 0.5, same_for_all_texels=True)),
         ),
-        scale=fits.Free(1.0, 0.8, 1.2, shared=True),
+        scale=fits.Free(1.0, 0.8, 1.2, same_for_all_texels=True),
         instrument=fits.Instrument(
-            offset=fits.Free(0.0, -1.0, 1.0, shared=True), floor=fits.Free(1e-3, 1e-4, 1e-2, shared=True)
+            tilt=fits.Free(0.0, -1.0, 1.0, same_for_all_texels=True),
+            floor=fits.Free(1e-3, 1e-4, 1e-2, same_for_all_texels=True),
         ),
     )
-    expected = {"layers[0].phase.g", "scale", "instrument.offset", "noise.floor", "noise.correlated.amplitude"}
+    expected = {"layers[0].phase.g", "scale", "instrument.tilt", "noise.floor", "noise.discrepancy.amplitude"}
     assert set(common_names(plain)) == expected
     assert common_names(plain) == tuple(name for name in plain.names if name in expected)
 
 
 def test_common_names_of_mixtures_and_power_laws() -> None:
     waves = (450.0, 550.0, 650.0)
-    law = PowerLaw(fits.Free(1.0, 0.1, 3.0), fits.Free(1.0, 0.5, 2.0, shared=True), waves)
+    law = PowerLaw(fits.Free(1.0, 0.1, 3.0), fits.Free(1.0, 0.5, 2.0, same_for_all_texels=True), waves)
     bare = lj.Stack([lj.Medium(law, 0.5)], lj.Lambertian(0.5))
-    mixed = lj.Mixture({"bare": bare, "coat": COAT}, [fits.Free(0.3, 0.0, 1.0, shared=True), None])
+    mixed = lj.Mixture({"bare": bare, "coat": COAT}, [fits.Free(0.3, 0.0, 1.0, same_for_all_texels=True), None])
     names = common_names(fits.Problem(mixed, _data(), lj.SingleScattering()))
     own = {"weights.bare", "bare.layers[0].thickness.exponent", *(f"coat.{name}" for name in VALUES)}
     assert set(names) == own
@@ -206,7 +214,12 @@ def test_common_parameters_are_held() -> None:
 
 def test_a_power_law_that_is_known_becomes_its_numbers() -> None:
     waves = (400.0, 800.0)
-    law = PowerLaw(fits.Free(1.0, 0.1, 3.0, shared=True), fits.Free(1.0, 0.5, 2.0, shared=True), waves, reference=400.0)
+    law = PowerLaw(
+        fits.Free(1.0, 0.1, 3.0, same_for_all_texels=True),
+        fits.Free(1.0, 0.5, 2.0, same_for_all_texels=True),
+        waves,
+        reference=400.0,
+    )
     stack = lj.Stack([lj.Medium(law, fits.Free(0.5, 0.0, 1.0))], lj.Lambertian(0.5))
     held = hold(stack, {"layers[0].thickness.amplitude": 2.0, "layers[0].thickness.exponent": 1.0})
     np.testing.assert_allclose(held.layers[0].thickness, [2.0, 1.0], rtol=1e-12)

@@ -83,7 +83,7 @@ def test_every_texel_ends_where_scipy_does(whole, geometry, values):
 
 def test_errors_and_chi_square_are_those_of_a_fit(tmp_path, whole, geometry, values):
     """Of a likelihood, of a named objective by its scatter, and behind an instrument."""
-    place, alone = (3, 5), replace(NOISE, correlated=False)
+    place, alone = (3, 5), replace(NOISE, discrepancy=False)
     data = problem_of(values[place], geometry).data
     found = fits.fit(FREE, data, transport=TRANSPORT, noise=alone, starts=2)
     assert_as_fit(whole, place, found)
@@ -92,18 +92,18 @@ def test_errors_and_chi_square_are_those_of_a_fit(tmp_path, whole, geometry, val
     assert_as_fit(
         named, (0, 5), fits.fit(FREE, data, transport=TRANSPORT, objective="cosine_l2", starts=2), values=False
     )
-    instrument = fits.Instrument(detector=2.0, floor=1e-4, gain_per_incidence=0.01)
+    instrument = fits.Instrument(detector_aperture=2.0, floor=1e-4, gain_sd=0.01)
     noise = fits.Noise(relative=0.02)
     seen = fitted(tmp_path / "seen.zarr", values[3:4], noise=noise, instrument=instrument)
-    noise = replace(noise, correlated=False)
+    noise = replace(noise, discrepancy=False)
     one = fits.fit(FREE, data, transport=TRANSPORT, noise=noise, instrument=instrument, starts=2)
     assert_as_fit(seen, (0, 5), one)
     assert seen.names == one.problem.names
     kept = zarr.open_group(tmp_path / "seen.zarr", mode="r")["pilot"].attrs["layerjax"]["rings"]
     assert kept == one.problem.instrument.rings == 1
     assert seen.numerical_error is not None
-    common = fits.Instrument(offset=fits.Free(0.0, -1.0, 1.0, shared=True))
-    with pytest.raises(ValueError, match=r"instrument\.offset is common"):
+    common = fits.Instrument(tilt=fits.Free(0.0, -1.0, 1.0, same_for_all_texels=True))
+    with pytest.raises(ValueError, match=r"instrument\.tilt is common"):
         fitted(tmp_path / "none.zarr", values, instrument=common)
 
 
@@ -215,7 +215,7 @@ def test_directions_of_their_own(tmp_path, geometry):
         assert found.errors[name][2] == pytest.approx(alone.errors[name][0], rel=1e-3)
     for options, words in (
         ({"emulator": True}, "emulator: there is none where every texel has directions of its own"),
-        ({"instrument": fits.Instrument(detector=2.0)}, "there can be no instrument"),
+        ({"instrument": fits.Instrument(detector_aperture=2.0)}, "there can be no instrument"),
     ):
         with pytest.raises(ValueError, match=words):
             fitted(tmp_path / "none.zarr", values, view=(wi, wo), **options)
@@ -231,7 +231,7 @@ def test_directions_of_their_own(tmp_path, geometry):
         ({"poor_probability": 2.0}, "poor_probability is 2.0; it must be a number from 0 to 1"),
         ({"emulator_error": "small"}, "emulator_error is 'small'; it must be a number from 0 to inf"),
         ({"noise": 0.02}, "noise is 0.02; it must be a fits.Noise, or None"),
-        ({"noise": fits.Noise(relative=0.02, correlated=True)}, "noise.correlated"),
+        ({"noise": fits.Noise(relative=0.02, discrepancy=True)}, "noise.discrepancy"),
     ],
 )
 def test_what_cannot_be_is_refused(tmp_path, values, options, words):

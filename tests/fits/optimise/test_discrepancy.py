@@ -10,15 +10,14 @@ from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
+from fits.optimise.multi_start import Floats
 from fits.optimise.result import Fit
-from fits.optimise.starts_file import Floats
-from fits.problem.base import Posed
 from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.kernel import log_sizes
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.kernel import log_scales
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.reports import tables, verdicts
 from fits.reports.agreement import discrepancy
 from fits.reports.results import load_fit, save_fit
@@ -46,23 +45,23 @@ def wrong() -> Fit:
 
 def test_a_wrong_shape_is_fitted_with_them(wrong: Fit) -> None:
     plain = fit(
-        STACK, readings(0.1), transport=line, noise=Noise(relative=0.02, floor=1e-4, correlated=False), starts=2
+        STACK, readings(0.1), transport=line, noise=Noise(relative=0.02, floor=1e-4, discrepancy=False), starts=2
     )
-    assert wrong.problem.noise.correlated == Correlated()
-    assert wrong.alone is not None
-    assert plain.alone is None
-    assert wrong.alone.values == pytest.approx(plain.values, rel=1e-6)
-    assert wrong.alone.chi_square == pytest.approx(plain.chi_square)
-    assert wrong.alone.alike > 0.8
+    assert wrong.problem.noise.discrepancy == Discrepancy()
+    assert wrong.without_discrepancy is not None
+    assert plain.without_discrepancy is None
+    assert wrong.without_discrepancy.values == pytest.approx(plain.values, rel=1e-6)
+    assert wrong.without_discrepancy.chi_square == pytest.approx(plain.chi_square)
+    assert wrong.without_discrepancy.residual_autocorrelation > 0.8
     assert wrong.log_likelihood > plain.log_likelihood + 20.0
-    assert 0.03 < wrong.values["noise.correlated.amplitude"] < 0.3
+    assert 0.03 < wrong.values["noise.discrepancy.amplitude"] < 0.3
     for name in plain.values:
         assert wrong.standard_errors[name] > 2.0 * plain.standard_errors[name]
 
 
 def test_repeats_are_fitted_by_what_their_own_readings_tell() -> None:
     """Where noise is a level, readings tell the less of their logarithms the smaller they are."""
-    data, noise = readings(0.1), Noise(relative=0.0, floor=0.05, correlated=Correlated(0.1, 10.0, 10.0, 0.0))
+    data, noise = readings(0.1), Noise(relative=0.0, floor=0.05, discrepancy=Discrepancy(0.1, 10.0, 10.0, 0.0))
     small = replace(data, values=0.2 * data.values)
     by_others, by_themselves = (fit_many(Problem(STACK, one, line, noise), small.values[None]) for one in (data, small))
     np.testing.assert_allclose(by_others.vectors, by_themselves.vectors, rtol=1e-6)
@@ -76,15 +75,15 @@ def test_simulated_readings_share_errors(wrong: Fit) -> None:
     simulated = posterior.inference_data.posterior_predictive["value"].to_numpy().reshape(-1, *wrong.predicted.shape)
     found = simulated / wrong.predicted
     at = wrong.problem.build(wrong.vector).correlation
-    shared = at.amplitude * np.exp(at.growth * np.asarray(log_sizes(places(GEOMETRY.wi, GEOMETRY.wo))))
+    shared = at.amplitude * np.exp(at.grazing_exponent * np.asarray(log_scales(places(GEOMETRY.wi, GEOMETRY.wo))))
     # of 2048 draws, and a regression on nodes between them
     np.testing.assert_allclose(np.log(found).std(axis=0)[:, 0], np.hypot(shared, 0.02), rtol=0.1)
 
 
 def test_a_right_one_is_not() -> None:
     found = fit(STACK, readings(0.0), transport=line, noise=NOISE, starts=2)
-    assert found.alone is None
-    assert not found.problem.noise.correlated
+    assert found.without_discrepancy is None
+    assert not found.problem.noise.discrepancy
     assert list(found.values) == ["['a']", "['b']"]
 
 
@@ -92,14 +91,17 @@ def test_a_right_one_is_not() -> None:
 def test_where_they_cannot_be_counted_they_are_not(noise: Noise) -> None:
     objective = "likelihood" if noise.tails == "student" else "cube_root"
     noise = noise if objective == "likelihood" else Noise()
-    assert fit(STACK, readings(0.1), transport=line, noise=noise, starts=1, objective=objective).alone is None
+    assert (
+        fit(STACK, readings(0.1), transport=line, noise=noise, starts=1, objective=objective).without_discrepancy
+        is None
+    )
 
 
 def test_both_are_told(wrong: Fit) -> None:
     words = " ".join(discrepancy(wrong))
     assert "neighbouring residuals correlate by +0." in words
-    assert "Set `correlated = false` to disable it" in words
-    assert f"deviation of {100.0 * wrong.values['noise.correlated.amplitude']:.2g} % of the BRDF" in words
+    assert "Set `discrepancy = false` to disable it" in words
+    assert f"deviation of {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BRDF" in words
     table = tables.alone_table(wrong)
     assert [row[0] for row in table.rows] == ["['a']", "['b']"]
     assert len(table.rows[0]) == len(table.columns)
@@ -107,18 +109,20 @@ def test_both_are_told(wrong: Fit) -> None:
 
 def test_a_noise_that_was_assumed_is_in_the_status_of_a_fit(wrong: Fit) -> None:
     assert "assumed" not in wrong.status
-    plain = fit(STACK, readings(0.0), transport=line, noise=Noise(correlated=False), starts=1)
+    plain = fit(STACK, readings(0.0), transport=line, noise=Noise(discrepancy=False), starts=1)
     assert "a noise of 5 % of the model's value was assumed" in plain.status
 
 
 def test_starts_are_those_that_were_asked_for(wrong: Fit) -> None:
     """Two with independent noise, then one from each of their minima and two more with the discrepancy."""
-    again = sum(wrong.ended.values())
+    again = sum(wrong.start_outcomes.values())
     assert again > 2
     words = verdicts.starts_in_words(wrong)
     assert words.startswith("2 with independent noise (seed 0, solver least_squares), then ")
     assert f"then {again} with the discrepancy term: " in words
-    plain = replace(wrong, alone=None, ended={**wrong.ended, "this minimum": 2, "other minima": 0})
+    plain = replace(
+        wrong, without_discrepancy=None, start_outcomes={**wrong.start_outcomes, "best minimum": 2, "local minima": 0}
+    )
     assert verdicts.starts_in_words(plain).startswith("2 (seed 0, solver least_squares): ")
     assert f"{wrong.minima[0].count} of {again} starts with the discrepancy term" in verdicts.minima(wrong)[0]
 
@@ -135,7 +139,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     run: list[str] = []
     end = starts_module.rough_end
 
-    def counted(problem: Posed, point: Floats) -> starts_module.End:
+    def counted(problem: FittingProblem, point: Floats) -> starts_module.End:
         run.append(type(problem).__name__)
         return end(problem, point)
 
@@ -147,13 +151,13 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
 
 
 def test_a_result_directory_keeps_it(tmp_path, coat_fit: Fit) -> None:
-    from fits.optimise.discrepancy import alone
+    from fits.optimise.discrepancy import without_discrepancy
 
-    problem = replace(coat_fit.problem, noise=Noise(relative=0.03, correlated=True))
+    problem = replace(coat_fit.problem, noise=Noise(relative=0.03, discrepancy=True))
     found = fit(problem.stack, problem.data, transport=problem.transport, noise=problem.noise, starts=1)
-    found = replace(found, alone=alone(coat_fit))
+    found = replace(found, without_discrepancy=without_discrepancy(coat_fit))
     save_fit(found, tmp_path / "result")
     again = load_fit(tmp_path / "result")
-    assert again.alone == found.alone
+    assert again.without_discrepancy == found.without_discrepancy
     assert again.problem.noise == found.problem.noise
     assert again.values == found.values

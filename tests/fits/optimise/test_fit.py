@@ -14,7 +14,7 @@ from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
 from fits.optimise.descent import PROMISE
 from fits.optimise.fit import fit, fit_problem, start_points
-from fits.optimise.identifiability import Combination
+from fits.optimise.identifiability import Direction
 from fits.problem.compilation import _run
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
@@ -58,7 +58,7 @@ def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
     np.testing.assert_allclose(lobe_fit.correlation, covariance / np.outer(errors, errors), atol=2e-3)
     assert lobe_fit.reduced_chi_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / 594))
     assert not lobe_fit.at_bound
-    assert not any(combination.open for combination in lobe_fit.unresolved)
+    assert not any(combination.unconstrained for combination in lobe_fit.unidentified)
 
 
 def test_starts_are_counted(lobe_fit) -> None:
@@ -136,8 +136,8 @@ def test_a_product_leaves_its_direction_open() -> None:
     data = measured(design(COUNT)[:, 1:] * 0.25, 0.01)
     stack = {"a": Free(0.5, 0.1, 1.0, LogUniform()), "b": Free(0.5, 0.1, 1.0, LogUniform())}
     result = fit(stack, data, transport=product, starts=4)
-    (combination,) = result.unresolved
-    assert combination.open
+    (combination,) = result.unidentified
+    assert combination.unconstrained
     assert combination.error > 1e3
     weights = combination.weights
     assert weights["['a']"] == pytest.approx(-weights["['b']"], rel=1e-4)
@@ -156,8 +156,8 @@ def test_a_prior_closes_an_open_direction() -> None:
     assert result.standard_errors["['a']"] == pytest.approx(0.2, rel=1e-6)
     left = np.sqrt(2.0 * PROMISE) * 0.2  # a step that promises less ends the fit
     assert named(result) == pytest.approx({"a": 0.3, "b": 0.7}, abs=left)
-    (combination,) = result.unresolved  # it is the prior that decides, and the data are said not to
-    assert combination.open
+    (combination,) = result.unidentified  # it is the prior that decides, and the data are said not to
+    assert combination.unconstrained
 
 
 def test_a_parameter_without_effect_is_not_determined() -> None:
@@ -165,10 +165,10 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     assert result.standard_errors["['c']"] == np.inf
     assert result.condition_number == np.inf
     assert np.isfinite(result.standard_errors["['a']"])
-    assert result.unresolved == (Combination(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
-    assert result.without_influence == ("['c']",)
+    assert result.unidentified == (Direction(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
+    assert result.insensitive == ("['c']",)
     assert result.at_bound == ()
-    assert "the data leave 1 direction(s) unresolved" in result.status
+    assert "the data leave 1 direction(s) unidentified" in result.status
     assert verdicts.identifiability(result)["['c']"] == "NO INFLUENCE on the data"
 
 
@@ -181,7 +181,7 @@ def test_errors_do_not_overflow_where_hardly_anything_is_known(strength: float) 
 
     free = {**LINE, "c": Free(0.5, 0.0, 1.0), "d": Free(0.5, 0.0, 1.0)}
     result = fit(free, noisy_line(1.0, 0.5), transport=faint, starts=2)
-    assert result.without_influence == ("['c']", "['d']")
+    assert result.insensitive == ("['c']", "['d']")
     assert result.standard_errors["['c']"] == np.inf
     assert result.standard_errors["['a']"] == pytest.approx(
         fit(LINE, noisy_line(1.0, 0.5), transport=line, starts=1).standard_errors["['a']"], rel=1e-6

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from fits.data.geometry import slices
-from fits.optimise.discrepancy import counting
+from fits.optimise.discrepancy import with_discrepancy
 from fits.optimise.fit import fit
 from fits.prediction.compare import compare
-from fits.prediction.cross_validation import leave_out
+from fits.prediction.cross_validation import cross_validate
 from fits.prediction.evidence import evidence
 from fits.prediction.predict import predict
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.joint import Joint
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, Normal
@@ -107,11 +107,13 @@ def test_a_part_is_a_fit_of_its_own(joint):
 
 def test_a_part_is_not_asked_without_the_others(joint):
     first = joint.part("first")
-    for ask in (sample, evidence, leave_out):
+    for ask in (sample, evidence, cross_validate):
         with pytest.raises(ValueError, match=f"{ask.__name__}: 'first' is a part of a joint fit"):
             ask(first)
-    with pytest.raises(ValueError, match="leave_out: it takes a fit of one measurement by itself, not a joint one"):
-        leave_out(joint)
+    with pytest.raises(
+        ValueError, match="cross_validate: it takes a fit of one measurement by itself, not a joint one"
+    ):
+        cross_validate(joint)
 
 
 def test_what_tells_of_one_measurement_asks_for_a_part(joint):
@@ -154,7 +156,7 @@ def test_the_posterior_is_that_of_all(joint):
 
 
 def test_a_surrogate_moves_a_chain_of_several_measurements(joint):
-    found = sample(joint, walkers=16, max_steps=100, surrogate=True, allow_short=True)
+    found = sample(joint, walkers=16, max_steps=100, surrogate=True, allow_unconverged=True)
     assert found.status.startswith("proposals from a surrogate of degree 2")
     expected, covariance = least_squares(prior=False)
     errors = np.sqrt(np.diagonal(covariance))
@@ -168,7 +170,9 @@ def test_measurements_that_share_nothing_are_each_alone():
     level, shared = (measured((values * (1 + part))[:, None]) for part in noise)
     problems = {
         "level": Problem(LINE, level, line, Noise(relative=Free(0.1, 0.001, 1.0, LogNormal(0.05, 2.0)))),
-        "shared": Problem(LINE, shared, line, Noise(relative=0.02, correlated=Correlated(half=10.0, difference=10.0))),
+        "shared": Problem(
+            LINE, shared, line, Noise(relative=0.02, discrepancy=Discrepancy(length_half=10.0, length_difference=10.0))
+        ),
     }
     together = fit(Joint(problems), starts=3)
     for name, one in problems.items():
@@ -182,8 +186,11 @@ def test_what_is_new_in_one_measurement_is_not_shared():
     """Errors that readings of one of them share have names that begin as those of levels of noise do."""
     noise = Noise(relative=Free(0.1, 0.01, 1.0))
     both = Joint({name: Problem(LINE, data(name), line, noise) for name in TRUE}, shared=["noise", SLOPE])
-    changed = both.with_problems({"first": counting(both.parts["first"])})
-    added = {f"first.noise.correlated.{name}" for name in ("amplitude", "half", "difference", "growth")}
+    changed = both.with_problems({"first": with_discrepancy(both.parts["first"])})
+    added = {
+        f"first.noise.discrepancy.{name}"
+        for name in ("amplitude", "length_half", "length_difference", "grazing_exponent")
+    }
     assert set(changed.names) == set(both.names) | added
     assert changed.names[:2] == (SLOPE, "noise.relative")
 

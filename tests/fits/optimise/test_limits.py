@@ -26,7 +26,7 @@ def fitted(alpha: float, step: float = 1.0, instrument: fits.Instrument | None =
     geometry = fits.slices([30.0], np.arange(-80.0, 80.5, step))
     data = fits.simulate(metal(alpha), geometry, SINGLE, 0.02, 1e-4)
     if instrument is not None:
-        seen = mean_over_cones(metal(alpha), geometry.wi, geometry.wo, 0.0, instrument.detector)
+        seen = mean_over_cones(metal(alpha), geometry.wi, geometry.wo, 0.0, instrument.detector_aperture)
         data = replace(data, values=seen * data.values / lj.evaluate(metal(alpha), geometry.wi, geometry.wo, SINGLE))
     free = metal(Free(0.1, 1e-3, 1.0, LogUniform()))
     return fits.fit(free, data, transport=SINGLE, starts=4, instrument=instrument)
@@ -43,7 +43,7 @@ def fitted(alpha: float, step: float = 1.0, instrument: fits.Instrument | None =
     ],
 )
 def test_a_lobe_narrower_than_steps_or_aperture_is_limited(alpha, step, detector, limited) -> None:
-    found = fitted(alpha, step, fits.Instrument(detector=detector) if detector else None)
+    found = fitted(alpha, step, fits.Instrument(detector_aperture=detector) if detector else None)
     limits = instrument_limits(found)
     assert bool(limits) == limited
     row = parameter_table(found).rows[0]

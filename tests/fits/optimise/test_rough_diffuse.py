@@ -39,7 +39,7 @@ def found(sand):
         "Oren-Nayar": lj.OrenNayar(COLOURS, WIDTH),
         "Lambertian": lj.Lambertian(COLOURS),
     }
-    noise = fits.Noise(correlated=False)  # else errors that readings share would take the place of the wrong shapes
+    noise = fits.Noise(discrepancy=False)  # else errors that readings share would take the place of the wrong shapes
     return {
         name: fits.fit(lj.Stack([], surface), sand, noise=noise, starts=4, seed=1) for name, surface in surfaces.items()
     }

@@ -64,7 +64,7 @@ def test_totals_and_values_together_tell_more_than_either():
     read = np.array([near, far + np.exp(-0.8)]) + 0.003 * noise
     totals = Problem(stack, Totals.of(reflectance=read[0], transmittance=read[1], sigma=0.003), SINGLE)
     view = simulate(true, slices((20, 50)), transport=SINGLE, noise=0.05, seed=2)
-    values = Problem(stack, view, SINGLE, Noise(relative=0.05, correlated=False))
+    values = Problem(stack, view, SINGLE, Noise(relative=0.05, discrepancy=False))
     alone = [fit(p.stack, p.data, transport=SINGLE, noise=p.noise, starts=3) for p in (totals, values)]
     joint = fit(Joint({"sphere": totals, "angles": values}, shared=["layers"]), starts=3)
     for name, truth in (("layers[0].thickness", 0.8), ("layers[0].albedo", 0.6)):
@@ -117,6 +117,6 @@ def test_bad_totals_are_named():
         Totals.of(reflectance=0.6, transmittance=0.41)  # within its errors
     given = Totals.of(reflectance=0.5)
     with pytest.raises(ValueError, match="instrument is given, but the data are totals"):
-        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, instrument=Instrument(detector=1.0))
+        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, instrument=Instrument(detector_aperture=1.0))
     with pytest.raises(ValueError, match=r"noise\.correlated is given, but the data are totals"):
-        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, noise=Noise(correlated=True))
+        Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, noise=Noise(discrepancy=True))

@@ -69,10 +69,10 @@ def test_every_parameter_comes_back_within_its_errors(coat_fit: Fit) -> None:
 
 
 def test_index_extinction_and_absorption_are_said_to_be_inseparable(coat_fit: Fit) -> None:
-    (combination,) = coat_fit.unresolved
+    (combination,) = coat_fit.unidentified
     assert set(combination.weights) == {"base.ior", "base.k", "layers[1].thickness"}
-    assert combination.open
-    for name, alone in combination.alone.items():
+    assert combination.unconstrained
+    for name, alone in combination.conditional_errors.items():
         assert alone < 0.05 * coat_fit.standard_errors[name], name
     sentences, _ = verdicts.in_short(coat_fit, residual_structure(coat_fit.problem.data, standardised(coat_fit)))
     (sentence,) = (line for line in sentences if line.startswith("The data do not separate"))
@@ -83,7 +83,7 @@ def test_along_it_the_light_returned_stays_the_same(coat_fit: Fit) -> None:
     """That light is the combination which the data do hold: 20 times better than index or extinction."""
     values = [coat_fit.values[name] for name in ORDER]
     slopes = np.array(jax.grad(returned, argnums=(0, 1, 2, 3))(*values))
-    (combination,) = coat_fit.unresolved
+    (combination,) = coat_fit.unidentified
     widths = dict(
         zip(coat_fit.problem.names, coat_fit.problem.model.box.slope(jnp.asarray(coat_fit.vector)), strict=True)
     )

@@ -56,8 +56,8 @@ def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
         error = np.sqrt(2 / posteriors[row.name].effective_samples.min())
         assert row.loo == pytest.approx(exact, abs=4 * error * cost)
         assert row.unreliable == 0
-    assert comparison.rows[0].loo_behind == 0
-    assert comparison.rows[1].loo_behind > 3 * comparison.rows[1].loo_behind_error
+    assert comparison.rows[0].loo_diff == 0
+    assert comparison.rows[1].loo_diff > 3 * comparison.rows[1].loo_dse
     assert comparison.verdict[0].startswith("The data prefer line to flat: it expects new data")
 
 

@@ -41,7 +41,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_integral_over_the_box(name: str) -> None:
     transport, stack, truth = CASES[name]
-    found = fit(stack, measured(transport, truth), transport=transport, noise=Noise(correlated=False), starts=2)
+    found = fit(stack, measured(transport, truth), transport=transport, noise=Noise(discrepancy=False), starts=2)
     problem: Problem = found.problem
     count = 1500
     sides = [np.linspace(low, high, count + 1) for low, high in zip(problem.low, problem.high, strict=True)]
@@ -63,7 +63,7 @@ def test_it_is_the_integral_over_the_box(name: str) -> None:
     exact = float(logsumexp(logs) - 2.0 * np.log(count))
     estimate = evidence(found)
     assert estimate.reliable
-    assert abs(estimate.log - exact) < 4.0 * estimate.error
+    assert abs(estimate.log_evidence - exact) < 4.0 * estimate.error
     assert estimate.error < 0.1
 
 
@@ -78,7 +78,7 @@ def test_it_is_that_of_nested_sampling() -> None:
 
     stack = {"a": Free(0.3, 0.0, 2.0, Normal(0.3, 0.3)), "b": Free(1.0, 0.0, 5.0), "c": Free(0.2, 0.01, 2.0)}
     data = measured(lobe, {"a": 0.3, "b": 0.4, "c": 0.3})
-    found = fit(stack, data, transport=lobe, noise=Noise(correlated=False), starts=4)
+    found = fit(stack, data, transport=lobe, noise=Noise(discrepancy=False), starts=4)
     problem = found.problem
     likelihood = jax.jit(problem.log_likelihood)
     prior = stats.truncnorm((0.0 - 0.3) / 0.3, (2.0 - 0.3) / 0.3, 0.3, 0.3)
@@ -93,5 +93,5 @@ def test_it_is_that_of_nested_sampling() -> None:
     estimate = evidence(found)
     assert estimate.reliable
     error = np.hypot(estimate.error, sampler.results.logzerr[-1])
-    assert abs(estimate.log - sampler.results.logz[-1]) < 4.0 * error
+    assert abs(estimate.log_evidence - sampler.results.logz[-1]) < 4.0 * error
     assert error < 0.3

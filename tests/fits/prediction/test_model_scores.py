@@ -14,9 +14,9 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.average import average
 from fits.prediction.compare import compare
-from fits.prediction.cross_validation import LeftOut, groups_of, leave_out
+from fits.prediction.cross_validation import CrossValidation, cross_validate, groups_of
 from fits.prediction.evidence import Evidence, evidence, posterior_draws
-from fits.prediction.model_scores import foresights, stacking, together
+from fits.prediction.model_scores import model_scores, rank_models, stacking
 from fits.prediction.predict import predict
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform, Normal
@@ -40,12 +40,12 @@ def readings(seed: int = 0) -> Measurements:
 
 @pytest.fixture(scope="module")
 def found() -> Fit:
-    return fit(STACK, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+    return fit(STACK, readings(), transport=line, noise=Noise(discrepancy=False), starts=2)
 
 
 @pytest.fixture(scope="module")
 def flat() -> Fit:
-    return fit(FLAT, readings(), transport=line, noise=Noise(correlated=False), starts=2)
+    return fit(FLAT, readings(), transport=line, noise=Noise(discrepancy=False), starts=2)
 
 
 def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,7 +60,7 @@ def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def test_rows_that_are_left_out_count_for_nothing(found: Fit) -> None:
     rows = np.arange(len(readings())) % 3 == 0
     left = without(found.problem, rows)
-    fewer = Problem(STACK, readings().where(~rows), line, Noise(correlated=False))
+    fewer = Problem(STACK, readings().where(~rows), line, Noise(discrepancy=False))
     for vector in (found.vector, np.array([0.0, 2.0])):
         gaps = [float(of.log_likelihood(vector) - of.log_likelihood([1.0, 0.5])) for of in (left, fewer)]
         assert gaps[0] == pytest.approx(gaps[1], abs=1e-6)
@@ -68,7 +68,7 @@ def test_rows_that_are_left_out_count_for_nothing(found: Fit) -> None:
 
 def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
     rows = np.arange(len(readings())) % 3 == 0
-    noise = Noise(correlated=True)
+    noise = Noise(discrepancy=True)
     whole, fewer = (Problem(STACK, data, line, noise) for data in (readings(), readings().where(~rows)))
     # of so few readings all are nodes, in both
     for of in (whole, fewer):
@@ -80,7 +80,7 @@ def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
 
 
 def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
-    left, data = leave_out(found, draws=2000), readings()
+    left, data = cross_validate(found, draws=2000), readings()
     assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")
     assert left.converged
     for rows in left.rows:
@@ -90,7 +90,7 @@ def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
         width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
         expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
-    assert left.score == pytest.approx(left.by_group.sum())
+    assert left.elpd == pytest.approx(left.by_group.sum())
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -99,11 +99,11 @@ def test_what_leaves_a_ridge_open_is_foretold(known: bool, monkeypatch: pytest.M
     data = readings(1)
     level = replace(data, values=1.0 + data.values - np.asarray(line({"a": 1.0, "b": 0.5}, data.wi, data.wo)))
     stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
-    open_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(correlated=False), starts=2)
+    open_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(discrepancy=False), starts=2)
     draws = posterior_draws(open_fit) if known else None
     followed: list[Fit] = []
     monkeypatch.setattr(Mixture, "of", lambda fit, of=Mixture.of: followed.append(fit) or of(fit))
-    left = leave_out(open_fit, draws=2000, known=draws)
+    left = cross_validate(open_fit, draws=2000, known=draws)
     assert len(followed) == (0 if known else 3)
     for rows in left.rows:
         others = np.setdiff1d(np.arange(len(level)), rows)
@@ -130,11 +130,11 @@ def test_readings_in_no_group_say_nothing_of_what_is_foretold() -> None:
     wo = data.wo.copy()
     wo[aside] = wo[aside][:, [1, 0, 2]]
     few = replace(data, wo=wo).where(scan)
-    left = leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+    left = cross_validate(fit(STACK, few, transport=line, noise=Noise(discrepancy=False), starts=1))
     alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
     assert alone.size == 3
     assert np.all(left.log_density[alone] == 0.0)
-    assert left.score == pytest.approx(left.by_group.sum())
+    assert left.elpd == pytest.approx(left.by_group.sum())
 
 
 @pytest.mark.parametrize("stack", ["line", "flat"])
@@ -151,7 +151,7 @@ def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> No
     assert got.reliable
     assert got.error < 0.03
     # bounds cut less than 1e-8 of the priors off
-    assert got.log == pytest.approx(expected, abs=5.0 * got.error)
+    assert got.log_evidence == pytest.approx(expected, abs=5.0 * got.error)
 
 
 def test_weights_of_stacking_are_the_best() -> None:
@@ -173,11 +173,11 @@ def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
     assert compared.sorted_by == "left_out"
     best, other = compared.rows
     assert (best.name, other.name) == ("line", "flat")
-    assert best.foresight.behind == 0.0
-    assert other.foresight.behind == pytest.approx(best.foresight.score - other.foresight.score)
-    assert best.foresight.weight + other.foresight.weight == pytest.approx(1.0)
-    odds = np.exp(best.foresight.evidence.log - other.foresight.evidence.log)
-    assert best.foresight.probability / other.foresight.probability == pytest.approx(odds)
+    assert best.model_score.elpd_diff == 0.0
+    assert other.model_score.elpd_diff == pytest.approx(best.model_score.elpd - other.model_score.elpd)
+    assert best.model_score.weight + other.model_score.weight == pytest.approx(1.0)
+    odds = np.exp(best.model_score.evidence.log_evidence - other.model_score.evidence.log_evidence)
+    assert best.model_score.model_probability / other.model_score.model_probability == pytest.approx(odds)
     assert "foretells incidences that are left out" in compared.verdict[0]
     table = tables.comparison_table(compared)
     assert {"left out: score", "weight", "log evidence", "probability"} <= set(table.columns)
@@ -187,7 +187,7 @@ def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
     candidates, at = {"line": found, "flat": flat}, readings()
     alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
     one = predict(found, at, draws=1000)
-    np.testing.assert_allclose(alone.reading.mean, one.reading.mean, atol=0.01)
+    np.testing.assert_allclose(alone.predictive.mean, one.predictive.mean, atol=0.01)
     np.testing.assert_allclose(alone.log_density(at.values), one.log_density(at.values), atol=1e-6)
     both = predict(average(candidates, {"line": 3.0, "flat": 1.0}), at, draws=4000)
     parts = [np.exp(predict(of, at, draws=2000).log_density(at.values)) for of in (found, flat)]
@@ -212,7 +212,7 @@ def test_bad_weights_are_refused(found: Fit, flat: Fit, weights: dict, message: 
 
 def test_averages_are_weighted_by_stacking(found: Fit, flat: Fit) -> None:
     both = average({"line": found, "flat": flat})
-    weights = {name: seen.weight for name, seen in foresights({"line": found, "flat": flat}).items()}
+    weights = {name: seen.weight for name, seen in model_scores({"line": found, "flat": flat}).items()}
     assert both.weights == pytest.approx(weights)
     assert predict(both, readings()).scores.count == readings().values.size
     with pytest.raises(ValueError, match="there is no fit to average"):
@@ -223,13 +223,13 @@ def test_fits_that_say_nothing_of_readings_are_refused() -> None:
     free = {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
     named = fit(free, readings(), transport=line, objective="cube_root", starts=1)
     with pytest.raises(ValueError, match="a fit of 'cube_root' has no noise model"):
-        leave_out(named)
+        cross_validate(named)
     with pytest.raises(ValueError, match="a fit of 'cube_root' has none"):
         evidence(named)
     data = readings()
     few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
     with pytest.raises(ValueError, match="too few to leave some of them out"):
-        leave_out(fit(STACK, few, transport=line, noise=Noise(correlated=False), starts=1))
+        cross_validate(fit(STACK, few, transport=line, noise=Noise(discrepancy=False), starts=1))
 
 
 @pytest.mark.parametrize(
@@ -244,9 +244,9 @@ def test_fits_that_say_nothing_of_readings_are_refused() -> None:
 def test_what_is_worse_everywhere_is_told_apart(gaps: tuple[float, ...], told: bool) -> None:
     """Three groups of ten readings, over which a gap is spread evenly."""
     rows = tuple(np.split(np.arange(30), 3))
-    best = LeftOut(("1", "2", "3"), rows, np.zeros((30, 1)), True)
-    other = LeftOut(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
+    best = CrossValidation(("1", "2", "3"), rows, np.zeros((30, 1)), True)
+    other = CrossValidation(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
     known = Evidence(0.0, 0.1, 0.1)
-    seen = together({"best": best, "other": other}, {"best": known, "other": known})["other"]
-    assert (seen.surely_behind > 0.0) == told
-    assert seen.least_behind == pytest.approx(min(gaps) / 10.0)
+    seen = rank_models({"best": best, "other": other}, {"best": known, "other": known})["other"]
+    assert (seen.clear_diff > 0.0) == told
+    assert seen.least_diff == pytest.approx(min(gaps) / 10.0)

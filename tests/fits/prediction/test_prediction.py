@@ -13,7 +13,7 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.predict import predict
 from fits.prediction.prediction import scores
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -31,14 +31,14 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     generator = np.random.default_rng(seed)
     count = len(GEOMETRY)
     empty = Measurements(GEOMETRY.wi, GEOMETRY.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
-    noise = Noise(relative=sigma, floor=1e-4, correlated=Correlated(max(wrong, 1e-6), 12.0, 12.0, 0.0))
+    noise = Noise(relative=sigma, floor=1e-4, discrepancy=Discrepancy(max(wrong, 1e-6), 12.0, 12.0, 0.0))
     model = Problem(STACK, empty, line, noise).model
     exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
     process, at = model.process, model.build(np.array([1.0, 0.5])).correlation
     assert process is not None
     assert at is not None
     white = generator.standard_normal((1, len(process.where)))
-    lack = np.asarray(process.drawn(white, at))
+    lack = np.asarray(process.sample(white, at))
     values = exact * (np.exp(lack) + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
 
@@ -61,10 +61,10 @@ def test_bands_of_a_line_are_those_of_regression() -> None:
     covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
     # 4,000 draws, of some 5,000 that are worth it: 1.5 % of a standard deviation, at 4 standard errors
-    np.testing.assert_allclose(at.model.sd[:, 0], expected, rtol=0.06)
-    np.testing.assert_allclose(at.reading.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
-    np.testing.assert_allclose(at.model.mean, found.predicted, atol=0.1 * expected.max())
-    wide = at.reading.quantiles[-1] - at.reading.quantiles[0]
+    np.testing.assert_allclose(at.latent.sd[:, 0], expected, rtol=0.06)
+    np.testing.assert_allclose(at.predictive.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
+    np.testing.assert_allclose(at.latent.mean, found.predicted, atol=0.1 * expected.max())
+    wide = at.predictive.quantiles[-1] - at.predictive.quantiles[0]
     np.testing.assert_allclose(wide[:, 0], 2 * stats.norm.ppf(0.975) * np.hypot(expected, 0.05), rtol=0.06)
 
 
@@ -72,8 +72,8 @@ def test_a_posterior_says_the_same() -> None:
     found = line_fit()
     posterior = sample(found, walkers=16, max_steps=4000, progress=None)
     at, by_fit = (predict(of, found.problem.data, draws=1000) for of in (posterior, found))
-    np.testing.assert_allclose(at.reading.sd, by_fit.reading.sd, rtol=0.08)
-    np.testing.assert_allclose(at.model.mean, by_fit.model.mean, atol=0.2 * by_fit.model.sd.max())
+    np.testing.assert_allclose(at.predictive.sd, by_fit.predictive.sd, rtol=0.08)
+    np.testing.assert_allclose(at.latent.mean, by_fit.latent.mean, atol=0.2 * by_fit.latent.sd.max())
     assert at.reliable
     assert by_fit.reliable
 
@@ -82,7 +82,7 @@ def test_draws_that_may_miss_a_part_are_said_to() -> None:
     found = line_fit()
     at = predict(found, found.problem.data)
     assert UNRELIABLE not in scores_table(at, found.problem.data, "").note
-    lost = replace(at, shape=0.8)
+    lost = replace(at, pareto_k=0.8)
     assert not lost.reliable
     assert UNRELIABLE in scores_table(lost, found.problem.data, "").note
 
@@ -96,10 +96,10 @@ def test_wrong_models_need_shared_errors() -> None:
         fitted, unseen = split(readings(seed, 0.1))
         found = {}
         for shared in held:
-            noise = Noise(relative=SIGMA, floor=1e-4, correlated=shared)
+            noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
             found[shared] = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen).scores
             held[shared].append(found[shared].coverage[0.95])
-        better.append(found[True].log_score - found[False].log_score)
+        better.append(found[True].elpd - found[False].elpd)
     # 82 unseen readings a set are alike: the standard error of the mean of 10 sets is about 0.03
     assert 0.86 < np.mean(held[True]) < 0.99
     assert np.mean(held[False]) < 0.7
@@ -109,15 +109,15 @@ def test_wrong_models_need_shared_errors() -> None:
 @pytest.mark.parametrize("shared", [False, True])
 def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     fitted, unseen = split(readings(3, 0.1))
-    noise = Noise(relative=SIGMA, floor=1e-4, correlated=shared)
+    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
     at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen)
-    assert np.array_equal(at.mean, at.model.mean) != shared
+    assert np.array_equal(at.mean, at.latent.mean) != shared
     # by 2,048 draws: the standard error of a quantile is at most 0.06 sd, at 4 or 5 of them
-    for level, of_bsdf, of_reading in zip(at.levels, at.bsdf.quantiles, at.reading.quantiles, strict=True):
+    for level, of_bsdf, of_reading in zip(at.levels, at.bsdf.quantiles, at.predictive.quantiles, strict=True):
         np.testing.assert_allclose(at.quantile(level), of_bsdf, atol=0.3 * at.sd.max())
-        np.testing.assert_allclose(at.rank(at.reading_quantile(level)), level, atol=1e-9)
-        np.testing.assert_allclose(at.reading_quantile(level), of_reading, atol=0.25 * at.reading.sd.max())
-    low, high = (at.reading_quantile(level) for level in (0.025, 0.975))
+        np.testing.assert_allclose(at.rank(at.predictive_quantile(level)), level, atol=1e-9)
+        np.testing.assert_allclose(at.predictive_quantile(level), of_reading, atol=0.25 * at.predictive.sd.max())
+    low, high = (at.predictive_quantile(level) for level in (0.025, 0.975))
     expected = np.mean((unseen.used().values > low) & (unseen.used().values < high))
     assert at.scores.coverage[0.95] == pytest.approx(expected)
     assert at.scores == scores(at, unseen)
@@ -130,7 +130,7 @@ def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
     for seed in range(2):
         fitted, _ = split(readings(seed, 0.1))
         _, truth = split(without_noise(seed, 0.1))
-        noise = Noise(relative=SIGMA, floor=1e-4, correlated=True)
+        noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
         at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), truth)
         exact = truth.used().values
         for name, held in inside.items():
@@ -140,7 +140,7 @@ def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
         np.testing.assert_array_equal(at.sd, at.bsdf.sd)
         # a measurement adds independent noise: of the logarithm, which is the relative deviation here
         np.testing.assert_allclose(at.scales**2, at.unknown**2 + SIGMA**2, rtol=1e-3)
-        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.model.mean / exact - 1.0)))
+        closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
     # neighbours are alike: a set of 82 is worth some ten, whose share scatters by 0.07, the mean of 2 by 0.05
     assert np.mean(inside["bsdf"]) > 0.85
     assert np.mean(inside["model"]) < 0.7
@@ -157,9 +157,9 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
 
 def test_right_models_lose_little_by_it() -> None:
     fitted, unseen = split(readings(1, 0.0))
-    noise = Noise(relative=SIGMA, floor=1e-4, correlated=True)
+    noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
     found = fit(STACK, fitted, transport=line, noise=noise, starts=2)
-    assert found.values["noise.correlated.amplitude"] < SIGMA
+    assert found.values["noise.discrepancy.amplitude"] < SIGMA
     got = predict(found, unseen).scores
     assert got.coverage[0.95] > 0.9
     assert got.median_error < SIGMA
@@ -173,7 +173,7 @@ def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
     at = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
     np.testing.assert_allclose(at.scales, SIGMA * np.abs(at.means), rtol=0.05)
     again = predict(found, slices([30.0], np.arange(-60.0, 61.0, 20.0)))
-    np.testing.assert_array_equal(at.reading.quantiles, again.reading.quantiles)
+    np.testing.assert_array_equal(at.predictive.quantiles, again.predictive.quantiles)
 
 
 def test_bad_requests_are_refused() -> None:
@@ -181,7 +181,7 @@ def test_bad_requests_are_refused() -> None:
     with pytest.raises(ValueError, match=r"level is 1.0; it must be in \(0, 1\)"):
         predict(found, found.problem.data, levels=(0.5, 1.0))
     directions = predict(found, slices([30.0]), draws=2)
-    for quantile in (directions.quantile, directions.reading_quantile):
+    for quantile in (directions.quantile, directions.predictive_quantile):
         with pytest.raises(ValueError, match=r"level is 0.0; it must be in \(0, 1\)"):
             quantile(0.0)
     with pytest.raises(ValueError, match="directions alone were predicted"):
@@ -213,9 +213,9 @@ def test_of_a_product_the_bands_hold_though_its_factors_are_open(sigma) -> None:
     found = fit({"a": Free(1.0, 0.1, 10.0), "b": Free(0.9, 0.0, 10.0)}, data, transport=product, starts=4)
     at = predict(found, data, draws=1000)
     expected = exact[:, 0] * sigma / np.sqrt(np.sum(exact**2))
-    ratio = at.model.sd[:, 0] / expected
+    ratio = at.latent.sd[:, 0] / expected
     # weights that are reliable are worth some hundred draws, 4 standard errors of whose deviation are 0.2; others make
     # bands wider, never narrower
     assert np.all(ratio > 0.8)
     assert np.all(ratio < (1.2 if at.reliable else 10.0))
-    assert np.all(np.abs(at.model.mean - found.predicted)[:, 0] < at.model.sd[:, 0])
+    assert np.all(np.abs(at.latent.mean - found.predicted)[:, 0] < at.latent.sd[:, 0])

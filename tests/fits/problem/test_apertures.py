@@ -82,11 +82,11 @@ def through(alpha: float, ratio: float, noise: float = 0.01, seed: int = 3) -> t
     values = exact * (1.0 + noise * np.random.default_rng(seed).standard_normal(exact.shape))
     count = len(geometry)
     data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(count, bool), ("value",))
-    return data, Instrument(detector=ratio * width)
+    return data, Instrument(detector_aperture=ratio * width)
 
 
 FREE = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
-NOISE = fits.Noise(relative=0.01, floor=1e-4, correlated=False)
+NOISE = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
 
 
 def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -> None:
@@ -95,14 +95,14 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=4)
     for name, truth in (("base.alpha", 0.02), ("base.k", 3.5)):
         assert abs(found.values[name] - truth) < 3.0 * found.standard_errors[name]
-    expected = means(found.stack, data, 0.0, seen.detector)
+    expected = means(found.stack, data, 0.0, seen.detector_aperture)
     error = np.abs(found.predicted - expected)
     assert np.max(error) < 1e-3 * np.max(expected)
     # the error that the fit tells holds what there is, in standard deviations of the noise
     assert np.max(error / (0.01 * expected + 1e-4)) <= found.numerical_error + 1e-3
     assert found.numerical_error <= 0.1
     assert "rings of rays a cone" in found.status
-    # what the width of the unresolved lobe decides is named beside it
+    # what the width of the unidentified lobe decides is named beside it
     words = verdicts.identifiability(found)
     assert words["base.k"] == "LIMITED by the instrument: moves with base.alpha"
     lines, resolved = verdicts.in_short(found, residual_structure(found.problem.data, standardised(found)))
@@ -110,7 +110,9 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     assert not resolved
     # few rays again, as given: the error is told, and is what they lack
     few = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=replace(seen, rings=1), starts=4)
-    lack = np.max(np.abs(few.predicted - means(few.stack, data, 0.0, seen.detector)) / (0.01 * few.predicted + 1e-4))
+    lack = np.max(
+        np.abs(few.predicted - means(few.stack, data, 0.0, seen.detector_aperture)) / (0.01 * few.predicted + 1e-4)
+    )
     assert few.numerical_error == pytest.approx(lack, rel=0.2)
     assert lack > 2.0
 

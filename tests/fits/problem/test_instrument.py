@@ -50,7 +50,7 @@ def test_readings_are_means_over_cones(source: float, detector: float, alpha: fl
 def test_means_are_taken_only_where_a_lobe_may_be_narrow() -> None:
     """By directions: more for each reading near the mirror, one for what no bound lets be narrow."""
     count = len(GEOMETRY)
-    kinds = (Instrument(), 0.02), (Instrument(detector=1.0), 0.2), (Instrument(detector=1.0), 0.02)
+    kinds = (Instrument(), 0.02), (Instrument(detector_aperture=1.0), 0.2), (Instrument(detector_aperture=1.0), 0.02)
     plain, wide, narrow = (problem(*kind).model.optics for kind in kinds)
     assert plain.row is None
     assert len(wide.wi) < len(narrow.wi) <= 14 * count
@@ -73,14 +73,14 @@ def test_means_cost_four_readings_where_a_lobe_is_narrow_and_nothing_where_it_is
         lowered = jax.jit(lambda vector: of.model.predict(vector)).lower(of.start)
         return float(lowered.cost_analysis()["flops"])
 
-    assert operations(Instrument(detector=3.0), 0.06) < 4.2 * operations(None, 0.06)
-    assert operations(Instrument(detector=0.5), 0.5) == operations(None, 0.5)
+    assert operations(Instrument(detector_aperture=3.0), 0.06) < 4.2 * operations(None, 0.06)
+    assert operations(Instrument(detector_aperture=0.5), 0.5) == operations(None, 0.5)
 
 
 def test_readings_in_the_tangent_plane_are_dark() -> None:
     """As they are without an aperture: a mean would be divided by a cosine of nothing."""
     geometry = fits.slices([30.0], [80.0, 90.0])
-    found = problem(Instrument(source=1.0, detector=2.0), geometry=geometry).predict([0.3])
+    found = problem(Instrument(source_aperture=1.0, detector_aperture=2.0), geometry=geometry).predict([0.3])
     assert np.isfinite(found).all()
     assert found[1, 0] == 0.0
 
@@ -89,18 +89,18 @@ def test_readings_in_the_tangent_plane_are_dark() -> None:
 def test_a_sample_that_leans_is_seen_at_other_angles(free: bool) -> None:
     lean = 1.5
     offset = Free(0.0, -5.0, 5.0) if free else lean
-    of = problem(Instrument(offset=offset))
+    of = problem(Instrument(tilt=offset))
     found = of.predict([0.3, lean] if free else [0.3])
     signed = np.degrees(np.arctan2(GEOMETRY.wo[:, 0], GEOMETRY.wo[:, 2]))
     wi, wo = (lj.direction(np.radians(of.data.theta_i + lean), np.pi), lj.direction(np.radians(signed - lean), 0.0))
     np.testing.assert_allclose(found, lj.evaluate(metal(0.3), wi, wo, SINGLE), rtol=1e-9)
-    assert of.names[1:] == (("instrument.offset",) if free else ())
-    assert of.units.get("instrument.offset", "deg") == "deg"
+    assert of.names[1:] == (("instrument.tilt",) if free else ())
+    assert of.units.get("instrument.tilt", "deg") == "deg"
 
 
 def test_leaning_out_of_the_plane_keeps_angles_between() -> None:
     geometry = fits.slices([0.0, 30.0], [20.0, 50.0], [0.0, 60.0])
-    optics = problem(Instrument(offset=4.0), geometry=geometry).model.optics
+    optics = problem(Instrument(tilt=4.0), geometry=geometry).model.optics
     wi, wo = np.asarray(optics.wi), np.asarray(optics.wo)
     np.testing.assert_allclose(np.sum(wi * wo, axis=-1), np.sum(geometry.wi * geometry.wo, axis=-1), atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(wo, axis=-1), 1.0, atol=1e-12)
@@ -114,13 +114,13 @@ def test_means_are_taken_about_the_peak_of_a_sample_that_leans(free: bool) -> No
     lean, alpha, geometry = 4.0, 0.1, fits.slices([0.0, 40.0], np.arange(-60.0, 61.0, 4.0))
     offset = Free(0.0, -5.0, 5.0) if free else lean
     found = problem(Instrument(1.5, 0.5, offset), 0.1, geometry).predict([alpha, lean] if free else [alpha])
-    leaning = problem(Instrument(offset=lean), geometry=geometry).model.optics
+    leaning = problem(Instrument(tilt=lean), geometry=geometry).model.optics
     expected = mean_over_cones(metal(alpha), np.asarray(leaning.wi), np.asarray(leaning.wo), 1.5, 0.5)
     np.testing.assert_allclose(found, expected, rtol=2e-3)
 
 
 def test_derivatives_by_the_offset() -> None:
-    of = problem(Instrument(detector=1.0, offset=Free(0.0, -5.0, 5.0)))
+    of = problem(Instrument(detector_aperture=1.0, tilt=Free(0.0, -5.0, 5.0)))
 
     def slope(model: Model, vector: jax.Array) -> jax.Array:
         return jax.jacfwd(model.predict)(vector)[..., 1]
@@ -132,7 +132,7 @@ def test_derivatives_by_the_offset() -> None:
 
 
 def test_every_incidence_has_a_gain() -> None:
-    of = problem(Instrument(gain_per_incidence=0.03))
+    of = problem(Instrument(gain_sd=0.03))
     assert of.names == ("base.alpha", "instrument.gains[0]", "instrument.gains[1]", "instrument.gains[2]")
     gains = np.array([0.97, 1.0, 1.05])
     found, plain = of.predict([0.3, *gains]), problem(None).predict([0.3])
@@ -148,30 +148,30 @@ def test_light_at_one_polar_angle_has_one_gain() -> None:
     given = fits.slices([10.0, 40.0], np.arange(-60.0, 61.0, 20.0))
     theta, phi = np.degrees(np.arccos(given.wi[:, 2])), np.tile([0.0, 90.0, 180.0], len(given))[: len(given)]
     wi = direction(theta + 0.05 * np.sin(7.0 * np.arange(len(given))), phi)
-    optics = problem(Instrument(gain_per_incidence=0.03), geometry=fits.Geometry(wi, given.wo)).model.optics
+    optics = problem(Instrument(gain_sd=0.03), geometry=fits.Geometry(wi, given.wo)).model.optics
     np.testing.assert_array_equal(optics.incidence, theta > 25.0)
 
 
 def test_readings_at_other_incidences_have_a_gain_that_is_not_known() -> None:
     data = fits.simulate(metal(0.3), GEOMETRY, SINGLE, 0.01, 1e-5)
-    gains = Instrument(gain_per_incidence=0.1)
+    gains = Instrument(gain_sd=0.1)
     found = fits.fit(metal(Free(0.2, 0.05, 1.0)), data, transport=SINGLE, starts=1, instrument=gains)
     known, other = (fits.predict(found, fits.slices([angle], [5.0])) for angle in (40.0, 50.0))
-    assert known.reading.sd / known.reading.mean == pytest.approx(0.01, rel=0.3)
-    assert other.reading.sd / other.reading.mean == pytest.approx(0.1, rel=0.2)
+    assert known.predictive.sd / known.predictive.mean == pytest.approx(0.01, rel=0.3)
+    assert other.predictive.sd / other.predictive.mean == pytest.approx(0.1, rel=0.2)
 
 
 def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
     """A detector of 3 degrees, a sample that leans by 0.3 and gains of 3 %: of 100 repeats 98 lie within three standard
     errors. Without the model of the instrument not one does."""
     truth, gains = 0.05, np.array([1.03, 0.98, 1.01])
-    leaning = problem(Instrument(offset=0.3)).model.optics
+    leaning = problem(Instrument(tilt=0.3)).model.optics
     seen = mean_over_cones(metal(truth), np.asarray(leaning.wi), np.asarray(leaning.wo), 0.0, 3.0)
     seen = seen * gains[np.searchsorted([10.0, 40.0, 65.0], readings().theta_i - 0.1)][:, None]
     generator = np.random.default_rng(5)
     values = seen * (1.0 + 0.02 * generator.standard_normal((100, *seen.shape)))
     noise = fits.Noise(relative=0.02, floor=1e-4)
-    model = Instrument(detector=3.0, offset=Free(0.0, -2.0, 2.0), gain_per_incidence=0.03)
+    model = Instrument(detector_aperture=3.0, tilt=Free(0.0, -2.0, 2.0), gain_sd=0.03)
     stack = metal(Free(0.1, 0.02, 0.5, LogNormal(0.1, 1.0)))
     data = Measurements(GEOMETRY.wi, GEOMETRY.wo, values[0], None, np.ones(len(seen), bool), ("value",))
     of, blind = (Problem(stack, data, SINGLE, noise, instrument=one) for one in (model, None))
@@ -198,14 +198,17 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"detector": -1.0}, r"Instrument.detector is -1.0; it must be a number in \[0, 30\]"),
-        ({"source": 31.0}, r"Instrument.source is 31.0; it must be a number in \[0, 30\]"),
-        ({"source": Free(1.0, 0.0, 2.0)}, r"Instrument.source is Free.*; it must be a number in \[0, 30\]"),
-        ({"offset": Free(0.0, -20.0, 5.0)}, r"Instrument.offset.low is -20.0; it must be a number in \[-10, 10\]"),
-        ({"gain_per_incidence": 0.0}, r"Instrument.gain_per_incidence is 0.0; it must be a number in \[0.0001, 1\]"),
+        ({"detector_aperture": -1.0}, r"Instrument.detector_aperture is -1.0; it must be a number in \[0, 30\]"),
+        ({"source_aperture": 31.0}, r"Instrument.source_aperture is 31.0; it must be a number in \[0, 30\]"),
+        (
+            {"source_aperture": Free(1.0, 0.0, 2.0)},
+            r"Instrument.source_aperture is Free.*; it must be a number in \[0, 30\]",
+        ),
+        ({"tilt": Free(0.0, -20.0, 5.0)}, r"Instrument.tilt.low is -20.0; it must be a number in \[-10, 10\]"),
+        ({"gain_sd": 0.0}, r"Instrument.gain_sd is 0.0; it must be a number in \[0.0001, 1\]"),
         ({"rings": 9}, r"Instrument.rings is 9; it must be an integer in \[1, 8\]"),
         ({"rings": 1.5}, r"Instrument.rings is 1.5; it must be an integer in \[1, 8\]"),
-        ({"gain_per_incidence": True}, "Instrument.gain_per_incidence is True"),
+        ({"gain_sd": True}, "Instrument.gain_sd is True"),
     ],
 )
 def test_bad_instruments_are_refused(given: dict, message: str) -> None:
@@ -218,10 +221,10 @@ def test_bad_tables_are_refused(tmp_path: Path) -> None:
     fits.write_problem(path, metal(0.3))
     whole = path.read_text()
     for table, message in (
-        ("detector = 31.0", r"instrument.detector is 31.0; it must be a number in \[0, 30\]"),
+        ("detector_aperture = 31.0", r"instrument.detector_aperture is 31.0; it must be a number in \[0, 30\]"),
         ("rings = 0", r"instrument.rings is 0; it must be an integer in \[1, 8\]"),
         ("aperture = 1.0", "instrument has an unknown key 'aperture'"),
-        ("offset = { start = 0.0, low = -1.0 }", "instrument.offset has no high"),
+        ("tilt = { start = 0.0, low = -1.0 }", "instrument.tilt has no high"),
     ):
         path.write_text(f"{whole}\n[instrument]\n{table}\n")
         with pytest.raises(ValueError, match=message):

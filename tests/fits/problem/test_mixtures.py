@@ -82,7 +82,7 @@ def test_all_orders_choose_one_resolution_for_all_parts() -> None:
         {"coat": lj.Stack([lj.Interface(1.5, 0.2)], coat.base), "bare": mixed.parts["bare"]}, [0.7, None]
     )
     data = fits.simulate(truth, GEOMETRY, lj.AddingDoubling(nodes=16, modes=24), 0.02, 1e-4)
-    found = fits.fit(mixed, data, starts=2, noise=fits.Noise(correlated=False))
+    found = fits.fit(mixed, data, starts=2, noise=fits.Noise(discrepancy=False))
     assert found.numerical_error is not None
     assert found.numerical_error < 0.1
     for name, value in (("weights.coat", 0.7), ("coat.layers[0].alpha", 0.2)):

@@ -75,9 +75,9 @@ def test_maps_of_stacks_are_refused_by_name() -> None:
 
 
 def test_what_holds_channels_together_has_no_weight_beside_a_named_objective() -> None:
-    stack = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, smooth=0.1)))
+    stack = lj.Stack([], lj.Lambertian(Free((0.4, 0.4), 0.0, 1.0, random_walk_sd=0.1)))
     both = replace(DATA, values=np.repeat(DATA.values, 2, axis=1), sigma=None, channels=("a", "b"))
-    with pytest.raises(ValueError, match=r"Free.smooth is 0.1, but has no weight beside objective 'cosine_l2'"):
+    with pytest.raises(ValueError, match=r"Free.random_walk_sd is 0.1, but has no weight beside objective 'cosine_l2'"):
         Problem(stack, both, objective="cosine_l2")
 
 

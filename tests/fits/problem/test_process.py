@@ -10,7 +10,7 @@ from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
 from fits.optimise.descent import here
 from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.parameters import Correlated
+from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.discrepancy.process import make_process
 from fits.problem.discrepancy.whitening import Correlation
 from fits.problem.model import Model
@@ -50,7 +50,7 @@ def problem(layout: str, channels: int = 1, relative: float | Free = 0.01, **cor
     values = values * (1.0 + 0.1 * generator.standard_normal(values.shape))
     everywhere = np.ones(len(values), bool)
     data = Measurements(geometry.wi, geometry.wo, values, sigma, everywhere, channel_names(channels))
-    return Problem(stack, data, transport, Noise(relative=relative, correlated=Correlated(**correlated)))
+    return Problem(stack, data, transport, Noise(relative=relative, discrepancy=Discrepancy(**correlated)))
 
 
 def matern(distance: np.ndarray, length: float) -> np.ndarray:
@@ -82,9 +82,9 @@ def folded(data: Measurements) -> np.ndarray:
 
 def kernel(one: np.ndarray, other: np.ndarray, at: Correlation) -> np.ndarray:
     """Of relative errors between places."""
-    tilt = matern(np.abs(one[:, None, 0] - other[None, :, 0]), float(at.half))
+    tilt = matern(np.abs(one[:, None, 0] - other[None, :, 0]), float(at.length_half))
     apart = np.linalg.norm(one[:, None, 1:3] - other[None, :, 1:3], axis=-1)
-    alike = tilt * matern(apart, float(at.difference)) * (one[:, None, 3] == other[None, :, 3])
+    alike = tilt * matern(apart, float(at.length_difference)) * (one[:, None, 3] == other[None, :, 3])
     return float(at.amplitude) ** 2 * alike * np.outer(larger(one, at), larger(other, at))
 
 
@@ -92,7 +92,7 @@ def larger(where: np.ndarray, at: Correlation) -> np.ndarray:
     """Than along the normal, by the angles of half vector and difference, neither above 85 degrees."""
     angles = np.abs(where[:, 0]), np.linalg.norm(where[:, 1:3], axis=-1)
     cosines = np.prod([np.cos(np.radians(np.minimum(angle, 85.0))) for angle in angles], axis=0)
-    return (1.0 / cosines) ** float(at.growth)
+    return (1.0 / cosines) ** float(at.grazing_exponent)
 
 
 def soft(of: Problem) -> np.ndarray:
@@ -111,7 +111,11 @@ def dense(of: Problem, vector: np.ndarray, nodes: bool = True) -> tuple[np.ndarr
     weights, grid = np.asarray(process.weights), np.asarray(process.where)
     own = folded(of.data)
     shared = weights @ kernel(grid, grid, at) @ weights.T if nodes else kernel(own, own, at)
-    colours = float(at.channels) + (1.0 - float(at.channels)) * np.eye(channels) if channels > 1 else np.ones((1, 1))
+    colours = (
+        float(at.channel_correlation) + (1.0 - float(at.channel_correlation)) * np.eye(channels)
+        if channels > 1
+        else np.ones((1, 1))
+    )
     full = np.einsum("nm,cd->ncmd", shared, colours).reshape(count * channels, -1)
     values, s = of.data.values, soft(of)
     noise = np.sqrt((s / 4.0) ** 2 + (0.01 * values) ** 2) / np.hypot(values, s)
@@ -211,7 +215,7 @@ def test_nodes_cannot_be_told_from_the_exact_process(layout: str) -> None:
 
 
 def test_errors_elsewhere_are_those_of_regression() -> None:
-    of = problem("two incidences", amplitude=0.2, half=20.0, difference=18.0)
+    of = problem("two incidences", amplitude=0.2, length_half=20.0, length_difference=18.0)
     model = of.model
     at, process = model.build(jnp.asarray(of.start)).correlation, model.process
     assert process is not None
@@ -224,7 +228,7 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
     solved = np.linalg.solve(covariance, across.T).T
     expected = solved @ (logarithms(of)[0] - mean)
     variance = (0.2 * larger(folded(new), at)) ** 2 - np.sum(solved * across, axis=-1)
-    found, sd = of.call(Model.lack_at, of.start, of.predict(of.start), places(new.wi, new.wo))
+    found, sd = of.call(Model.discrepancy_at, of.start, of.predict(of.start), places(new.wi, new.wo))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-5)
     np.testing.assert_allclose(np.ravel(sd), np.sqrt(variance), atol=1e-4)
 
@@ -258,7 +262,7 @@ def test_readings_below_their_noise_are_taken_as_they_are() -> None:
     values = 1e-3 * generator.standard_normal(of.data.values.shape)
     dark = Measurements(of.data.wi, of.data.wo, values, np.full_like(values, 1e-3), of.data.mask, ("value",))
     stack = {"a": Free(1e-4, 0.0, 1e-3), "colour": 1e-3}
-    noises = (Noise(correlated=Correlated(amplitude=1e-6)), Noise())
+    noises = (Noise(discrepancy=Discrepancy(amplitude=1e-6)), Noise())
     shared, plain = (Problem(stack, dark, transport, noise) for noise in noises)
     levels = [[float(of.log_likelihood([a, *of.start[1:]])) for a in (1e-4, 1e-3)] for of in (shared, plain)]
     # of a reading of x = d / s, s four sigma, residuals about 0 are sqrt(1 + x^2) asinh(x) / x = 1 + x^2 / 3 times
@@ -316,12 +320,16 @@ def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
 
 
 def test_what_is_given_is_no_parameter() -> None:
-    every = tuple(f"noise.correlated.{name}" for name in ("amplitude", "half", "difference", "growth", "channels"))
+    every = tuple(
+        f"noise.discrepancy.{name}"
+        for name in ("amplitude", "length_half", "length_difference", "grazing_exponent", "channel_correlation")
+    )
     assert problem("one scan").names == ("['a']", *every[:4])
     assert problem("two planes", 3).names[1:] == every
-    fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0), growth=0.0)
-    assert fixed.names == ("['a']", "noise.correlated.difference")
-    assert fixed.units["noise.correlated.difference"] == "deg"
+    free = Free(20.0, 10.0, 50.0)
+    fixed = problem("two planes", amplitude=0.1, length_half=20.0, length_difference=free, grazing_exponent=0.0)
+    assert fixed.names == ("['a']", "noise.discrepancy.length_difference")
+    assert fixed.units["noise.discrepancy.length_difference"] == "deg"
 
 
 def test_readings_all_over_the_hemisphere_are_carried() -> None:
@@ -335,13 +343,13 @@ def test_readings_all_over_the_hemisphere_are_carried() -> None:
 
 
 def test_bad_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"Noise.tails is 'student'; with correlated noise it must be gaussian"):
-        Noise(tails="student", correlated=True)
-    with pytest.raises(ValueError, match=r"Noise.correlated is 0.3; it must be true, false or Correlated"):
-        Noise(correlated=0.3)
+    with pytest.raises(ValueError, match=r"Noise.tails is 'student'; with model discrepancy it must be gaussian"):
+        Noise(tails="student", discrepancy=True)
+    with pytest.raises(ValueError, match=r"Noise.discrepancy is 0.3; it must be true, false or Discrepancy"):
+        Noise(discrepancy=0.3)
     data = problem("one scan").data
-    with pytest.raises(ValueError, match=r"noise.correlated stands beside objective 'cube_root'"):
-        Problem({"a": FREE, "colour": 1.0}, data, transport, Noise(correlated=True), objective="cube_root")
+    with pytest.raises(ValueError, match=r"noise.discrepancy stands beside objective 'cube_root'"):
+        Problem({"a": FREE, "colour": 1.0}, data, transport, Noise(discrepancy=True), objective="cube_root")
 
 
 def test_priors_of_one_s_own() -> None:

@@ -15,7 +15,7 @@ from fits.problem.stack_file import read_problem, write_problem
 
 WAVELENGTHS = (450.0, 550.0, 650.0, 750.0)
 GEOMETRY = fits.slices(incidence=(10.0, 50.0), outgoing=np.arange(-70.0, 71.0, 10.0))
-NOISE = fits.Noise(relative=0.02, floor=1e-6, correlated=False)
+NOISE = fits.Noise(relative=0.02, floor=1e-6, discrepancy=False)
 
 
 def paint(mu_s, mu_a=0.5) -> lj.Stack:
@@ -45,7 +45,7 @@ def test_a_power_law_is_recovered(exact: np.ndarray) -> None:
     assert posed.names == ("layers[0].mu_s.amplitude", "layers[0].mu_s.exponent")
     assert posed.units == {"layers[0].mu_s.amplitude": "1/mm", "layers[0].mu_s.exponent": "1"}
     data = replace(posed.data, sigma=0.02 * exact)
-    fit = fits.fit(posed.stack, data, transport=posed.transport, noise=fits.Noise(correlated=False), starts=2)
+    fit = fits.fit(posed.stack, data, transport=posed.transport, noise=fits.Noise(discrepancy=False), starts=2)
     assert list(fit.values.values()) == pytest.approx([6.0, 1.5], rel=1e-6)
     # what is fitted is a stack with a number a channel
     np.testing.assert_allclose(fit.stack.layers[0].mu_s, 6.0 * (np.array(WAVELENGTHS) / 600.0) ** -1.5, rtol=1e-6)
@@ -101,7 +101,7 @@ def test_channels_that_do_not_go_together_are_named(exact: np.ndarray) -> None:
 
 
 def test_both_are_written_and_read(tmp_path) -> None:
-    stack = paint(law(reference=600.0), Free((0.5,) * 4, 0.1, 5.0, LogUniform(), smooth=(0.1, 0.2, 0.3)))
+    stack = paint(law(reference=600.0), Free((0.5,) * 4, 0.1, 5.0, LogUniform(), random_walk_sd=(0.1, 0.2, 0.3)))
     write_problem(tmp_path / "paint.toml", stack)
     read = read_problem(tmp_path / "paint.toml").stack
     assert read.layers[0].mu_s == stack.layers[0].mu_s
@@ -114,7 +114,7 @@ def test_both_are_written_and_read(tmp_path) -> None:
 
 def test_a_smooth_prior_is_a_random_walk() -> None:
     """Its density is that of neighbours' differences, normalised: flat ones count once."""
-    box = Box.of([Free((1.0, 2.0, 3.0), 0.0, 10.0, smooth=(0.5, 0.2))])
+    box = Box.of([Free((1.0, 2.0, 3.0), 0.0, 10.0, random_walk_sd=(0.5, 0.2))])
     x = np.array([4.0, 4.3, 4.2])
     expected = -np.log(10.0) + stats.norm.logpdf(0.3, scale=0.5) + stats.norm.logpdf(-0.1, scale=0.2)
     assert float(box.log_prior(x)) == pytest.approx(expected)
@@ -123,7 +123,7 @@ def test_a_smooth_prior_is_a_random_walk() -> None:
 @pytest.mark.parametrize("logarithmic", [False, True])
 def test_with_a_gaussian_prior_it_is_one_gaussian(logarithmic: bool) -> None:
     prior = LogNormal(2.0, 0.3) if logarithmic else Normal(2.0, 0.3)
-    box = Box.of([Free((2.0, 2.0, 2.0), 1e-6, 1e3, prior, smooth=0.1)])
+    box = Box.of([Free((2.0, 2.0, 2.0), 1e-6, 1e3, prior, random_walk_sd=0.1)])
     step = np.diff(np.eye(3), axis=0) / 0.1
     covariance = np.linalg.inv(np.eye(3) / 0.3**2 + step.T @ step)
     x = np.array([2.1, 2.2, 1.9])
@@ -138,10 +138,10 @@ def test_a_smooth_prior_draws_a_channel_to_its_neighbours(exact: np.ndarray) -> 
     values[:, 1] *= 1.3
     alone, tied, rigid = (
         fits.fit(
-            paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), smooth=smooth)),
+            paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), random_walk_sd=smooth)),
             problem(paint(law()), values).data,
             transport=lj.SingleScattering(),
-            noise=fits.Noise(relative=0.5, floor=1e-6, correlated=False),
+            noise=fits.Noise(relative=0.5, floor=1e-6, discrepancy=False),
             starts=1,
         )
         for smooth in (None, 0.3, 1e-4)
@@ -155,9 +155,9 @@ def test_a_smooth_prior_draws_a_channel_to_its_neighbours(exact: np.ndarray) -> 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((1.0, 0.0, 2.0, None, 0.1), "Free.smooth is given for a single number"),
-        (((1.0, 1.0), 0.0, 2.0, None, (0.1, 0.2)), "Free.smooth has 2 entries; it must have one, or 1"),
-        (((1.0, 1.0), 0.0, 2.0, None, 0.0), "Free.smooth is 0.0; it must be above 0"),
+        ((1.0, 0.0, 2.0, None, 0.1), "Free.random_walk_sd is given for a single number"),
+        (((1.0, 1.0), 0.0, 2.0, None, (0.1, 0.2)), "Free.random_walk_sd has 2 entries; it must have one, or 1"),
+        (((1.0, 1.0), 0.0, 2.0, None, 0.0), "Free.random_walk_sd is 0.0; it must be above 0"),
     ],
 )
 def test_bad_smoothness(arguments: tuple, message: str) -> None:
@@ -166,11 +166,11 @@ def test_bad_smoothness(arguments: tuple, message: str) -> None:
 
 
 def test_shared_channels_are_smooth_once_in_a_joint_fit(exact: np.ndarray) -> None:
-    posed = problem(paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), smooth=0.1)), exact)
+    posed = problem(paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), random_walk_sd=0.1)), exact)
     joint = fits.Joint({"one": posed, "two": posed}, shared=["layers"])
     np.testing.assert_allclose(joint.model.box.between, posed.model.box.between)
     apart = fits.Joint({"one": posed, "two": posed})
     assert apart.model.box.between.shape == (6, 8)
-    other = problem(paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), smooth=0.2)), exact)
+    other = problem(paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), random_walk_sd=0.2)), exact)
     with pytest.raises(ValueError, match="has other bounds or another prior in 'two' than in 'one'"):
         fits.Joint({"one": posed, "two": other}, shared=["layers"])

@@ -310,11 +310,11 @@ def test_there_are_examples():
 
 def test_an_instrument_is_read_by_itself(tmp_path: Path) -> None:
     path = tmp_path / "seen.toml"
-    path.write_text("[instrument]\ndetector = 2.0\noffset = { start = 0.0, low = -1.0, high = 1.0 }\n")
-    assert read_instrument(path) == Instrument(detector=2.0, offset=Free(0.0, -1.0, 1.0))
+    path.write_text("[instrument]\ndetector_aperture = 2.0\ntilt = { start = 0.0, low = -1.0, high = 1.0 }\n")
+    assert read_instrument(path) == Instrument(detector_aperture=2.0, tilt=Free(0.0, -1.0, 1.0))
     for text, message in (
         ("[noise]\nfloor = 1e-4\n", "there is no .instrument."),
-        ("[instrument]\ndetector = 40\n", "detector is 40"),
+        ("[instrument]\ndetector_aperture = 40\n", "detector_aperture is 40"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=rf"seen.toml: .*{message}"):

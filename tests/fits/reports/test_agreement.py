@@ -13,6 +13,7 @@ from fits.data.neighbours import alike, neighbours
 from fits.data.scans import signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
+from fits.problem.model import Density
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -26,7 +27,7 @@ from tests.helpers.models import line
 GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
 STACK = {"a": Free(0.9, 0.1, 3.0), "b": Free(0.1, -1.0, 3.0)}
 TRUTH = np.array([1.0, 0.5, 0.1, 12.0, 12.0, 0.3])  # the line, and the discrepancy: amplitude, lengths, growth
-NOISE = Noise(relative=0.02, floor=1e-4, correlated=True)
+NOISE = Noise(relative=0.02, floor=1e-4, discrepancy=True)
 
 
 def assumed(values: np.ndarray) -> Problem:
@@ -42,7 +43,7 @@ def simulated(seed: int, factor: float = 1.0) -> Problem:
     model = assumed(exact).model
     process, at = model.process, model.build(TRUTH).correlation
     assert process is not None
-    lack = np.asarray(process.drawn(generator.standard_normal((1, len(process.where))), at))
+    lack = np.asarray(process.sample(generator.standard_normal((1, len(process.where))), at))
     return assumed(factor * exact * np.exp(lack) * (1.0 + 0.02 * generator.standard_normal(exact.shape)))
 
 
@@ -109,16 +110,18 @@ def test_a_stack_that_misses_is_said_to_though_the_discrepancy_explains_all(fitt
     assert float(said[1]) == pytest.approx(100.0 * np.median(off.predicted / values - 1.0), abs=1.0)
     assert float(said[2]) == pytest.approx(2.0)
     last = verdicts.outcome(off, residual_structure(off.problem.data, standardised(off)))[-1]
-    without = np.sum(np.square(off.problem.call("offsets_at", off.vector, off.predicted))) / off.degrees_of_freedom
+    without = (
+        np.sum(np.square(off.problem.call(Density.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
+    )
     assert f"with the discrepancy term, {without:.4g} without" in last
     assert misdescribed(replace(fitted, problem=simulated(0), vector=TRUTH)) != []  # 10 % beside a noise of 2 %
-    right = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, correlated=False))
+    right = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, discrepancy=False))
     assert misdescribed(replace(fitted, problem=right, vector=TRUTH[:2])) == []
 
 
 def test_another_minimum_is_not_praised_where_nothing_fits(fitted: Fit) -> None:
     structure = residual_structure(fitted.problem.data, standardised(fitted))
-    right = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, correlated=False))
+    right = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, discrepancy=False))
     good = replace(fitted, problem=right, vector=TRUTH[:2], alternatives=fitted.minima[:1])
     said = " ".join(verdicts.in_short(good, structure)[0])
     assert "Another local minimum of the same model fits equally well" in said

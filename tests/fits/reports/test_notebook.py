@@ -50,8 +50,8 @@ def test_what_is_open_is_told(result: Fit) -> None:
     assert found[A][-1] == "AT BOUND"
     assert found[A][2] == "unknown"
     assert f"At a bound: {A}." in text(bound._repr_html_())
-    combination = fits.Combination(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
-    loose = replace(result, unresolved=(combination,))._repr_html_()
+    combination = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
+    loose = replace(result, unidentified=(combination,))._repr_html_()
     assert f"The data do not separate {A} and {B}" in text(loose)
     assert any(row[2:4] == ["unconstrained", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
 

@@ -14,7 +14,7 @@ from fits.data.measurements import Measurements, Source
 from fits.data.neighbours import autocorrelation
 from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
-from fits.optimise.identifiability import Combination
+from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -160,8 +160,8 @@ def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
 
 def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     first, second = coat_fit.problem.names
-    together = Combination(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
-    undecided = Altered(coat_fit, unresolved=(together,), at_bound=(second,))
+    together = Direction(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
+    undecided = Altered(coat_fit, unidentified=(together,), at_bound=(second,))
     words = " ".join(verdicts.determines(undecided))
     assert "1 of 2 principal directions of parameter space are constrained by the data to no better than 10 %" in words
     assert f"At a bound: {second}" in words
@@ -170,7 +170,7 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
     (line,) = (line for line in verdicts.outcome(undecided, structure) if line.startswith("The data"))
     assert line == f"The data do not separate {first} and {second}."
-    several = Altered(coat_fit, unresolved=(together, together, together))
+    several = Altered(coat_fit, unidentified=(together, together, together))
     (line,) = (line for line in verdicts.outcome(several, structure) if line.startswith("The data"))
     assert line.endswith("(and more).")  # still one line
     short, fine = verdicts.in_short(undecided, structure)
@@ -180,7 +180,7 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
     assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
     apart = Altered(coat_fit, correlation=np.eye(2))
     assert verdicts.identifiability(apart)[first] == "yes"
-    unseen = Altered(coat_fit, unresolved=(Combination(np.inf, {first: 1.0}, {first: np.inf}),))
+    unseen = Altered(coat_fit, unidentified=(Direction(np.inf, {first: 1.0}, {first: np.inf}),))
     assert f"The data do not determine {first}." in verdicts.outcome(unseen, structure)
     assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "unconstrained")
     assert verdicts.identifiability(unseen)[first] == "unconstrained by the data: see direction 1"
@@ -189,19 +189,19 @@ def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
 def test_a_small_share_in_a_loose_direction_does_not_make_a_parameter_loose(coat_fit: Fit) -> None:
     """alpha 0.284 +- 0.017 was called loose for a weight of 0.028: it is known to 2 % of its range."""
     first, second = coat_fit.problem.names
-    mostly = Combination(0.6, {first: 0.9996, second: 0.028}, {first: 0.01, second: 0.02})
-    apart = Altered(coat_fit, unresolved=(mostly,), correlation=np.eye(2))
+    mostly = Direction(0.6, {first: 0.9996, second: 0.028}, {first: 0.01, second: 0.02})
+    apart = Altered(coat_fit, unidentified=(mostly,), correlation=np.eye(2))
     assert verdicts.identifiability(apart) == {first: "weakly constrained: see direction 1", second: "yes"}
     structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
     assert f"The data weakly constrain {first}." in verdicts.in_short(apart, structure)[0]
     # of two directions, the one that a parameter owes more of its variance
-    other = Combination(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
-    both = Altered(coat_fit, unresolved=(mostly, other), correlation=np.eye(2))
+    other = Direction(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
+    both = Altered(coat_fit, unidentified=(mostly, other), correlation=np.eye(2))
     words = verdicts.identifiability(both)
     assert words == {first: "weakly constrained: see direction 1", second: "weakly constrained: see direction 2"}
     # a box and a half across, of which a parameter has a third
-    wide = Combination(1.5, {first: 0.94, second: 0.34}, {first: 0.01, second: 0.02})
-    words = verdicts.identifiability(Altered(coat_fit, unresolved=(wide,), correlation=np.eye(2)))
+    wide = Direction(1.5, {first: 0.94, second: 0.34}, {first: 0.01, second: 0.02})
+    words = verdicts.identifiability(Altered(coat_fit, unidentified=(wide,), correlation=np.eye(2)))
     assert words[first].startswith("unconstrained by the data")
     assert words[second].startswith("weakly constrained")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.optimise.identifiability import Combination
+from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit, Minimum
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
@@ -25,7 +25,7 @@ STORED = ("vector", "errors", "covariance", "cost", "condition_number")
 def assert_same(loaded: Fit, saved: Fit) -> None:
     for name in STORED:
         np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
-    for name in ("at_bound", "converged", "status", "iterations", "unresolved", "units", "values"):
+    for name in ("at_bound", "converged", "status", "iterations", "unidentified", "units", "values"):
         assert getattr(loaded, name) == getattr(saved, name), name
     assert [one.values for one in loaded.minima] == [one.values for one in saved.minima]
     assert len(loaded.alternatives) == len(saved.alternatives)
@@ -63,7 +63,7 @@ def unfitted(problem: Problem) -> Fit:
         status="made by hand",
         iterations=0,
         condition_number=1.0,
-        unresolved=(Combination(np.inf, {problem.names[0]: 1.0}, {problem.names[0]: np.inf}),),
+        unidentified=(Direction(np.inf, {problem.names[0]: 1.0}, {problem.names[0]: np.inf}),),
         minima=(minimum,),
         alternatives=(minimum,),
     )
@@ -176,7 +176,7 @@ def test_a_damaged_result_is_named(coat_fit: Fit, tmp_path: Path, name: str, con
 
 
 def test_one_of_several_measurements_is_not_sampled_by_itself_where_it_was_saved(coat_fit: Fit, tmp_path: Path) -> None:
-    save_fit(replace(coat_fit, part_of_joint="plane"), tmp_path / "fit")
+    save_fit(replace(coat_fit, dataset="plane"), tmp_path / "fit")
     with pytest.raises(ValueError, match="sample: 'plane' is a part of a joint fit"):
         sample(load_fit(tmp_path / "fit"))
 

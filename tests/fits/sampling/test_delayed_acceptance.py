@@ -95,12 +95,14 @@ def test_a_surrogate_that_does_not_hold_is_left_out(result: Fit) -> None:
     fitted = dataclasses.replace(result, problem=Problem(LINE, line_data(), striped))
     notes = []
     posterior = sample(
-        fitted, **SHORT | {"allow_short": True}, progress=lambda stage, done, total, note: notes.append((stage, note))
+        fitted,
+        **SHORT | {"allow_unconverged": True},
+        progress=lambda stage, done, total, note: notes.append((stage, note)),
     )
     assert "does not hold" in posterior.status
     assert "left out" in posterior.status
     assert ("surrogate", "") in notes
-    plain = sample(fitted, **SHORT | {"allow_short": True, "surrogate": False})
+    plain = sample(fitted, **SHORT | {"allow_unconverged": True, "surrogate": False})
     np.testing.assert_array_equal(posterior.chain, plain.chain)
 
 
@@ -111,14 +113,14 @@ def test_a_model_that_is_finite_at_its_best_alone_has_no_surrogate(result: Fit) 
         return line(stack, wi, wo) + jnp.where(jnp.abs(stack["a"] - best) < 1e-4, 0.0, jnp.nan)
 
     fitted = dataclasses.replace(result, problem=Problem(LINE, line_data(), finite_there))
-    posterior = sample(fitted, **SHORT | {"allow_short": True})
+    posterior = sample(fitted, **SHORT | {"allow_unconverged": True})
     assert posterior.status == "no surrogate, for want of finite values about the best fit"
     assert len(posterior.chain) == 200
 
 
 def test_more_parameters_than_a_surrogate_can_have(result: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(surrogate, "MOST_TERMS", 3)
-    posterior = sample(result, **SHORT | {"allow_short": True})
+    posterior = sample(result, **SHORT | {"allow_unconverged": True})
     assert posterior.status == "no surrogate of 2 parameters: exact evaluations alone"
     assert len(posterior.chain) == 200
 
@@ -127,7 +129,7 @@ def test_it_is_chosen_by_the_clock(result: Fit, monkeypatch: pytest.MonkeyPatch,
     """And the chain remembers it, whatever the clock says later."""
     path, options = (
         tmp_path / "chain.h5",
-        {"walkers": 16, "seed": 1, "path": tmp_path / "chain.h5", "allow_short": True},
+        {"walkers": 16, "seed": 1, "path": tmp_path / "chain.h5", "allow_unconverged": True},
     )
     monkeypatch.setattr(ensemble, "COSTLY", 0.0)
     sample(result, **options, max_steps=100)

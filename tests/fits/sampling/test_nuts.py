@@ -71,7 +71,7 @@ def test_a_torn_journal_costs_one_step(result: Fit, short: Posterior, tmp_path: 
     path = tmp_path / "chain.h5"
     with largest_file(100_000), pytest.raises(OSError, match="too large"):
         sample(result, **SHORT, path=path)
-    kept = load(result, path, allow_short=True)
+    kept = load(result, path, allow_unconverged=True)
     assert 10 < len(kept.chain) < 100
     np.testing.assert_array_equal(kept.chain, short.chain[: len(kept.chain)])
     np.testing.assert_array_equal(sample(result, **SHORT, path=path).chain, short.chain)
@@ -120,11 +120,11 @@ def test_the_command_samples_with_it(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     save_fit(coat_fit, "result")
-    assert main(["sample", "result", "--sampler", "nuts", "--max-steps", "100", "--allow-short"]) == 1
+    assert main(["sample", "result", "--sampler", "nuts", "--max-steps", "100", "--allow-unconverged"]) == 1
     shown = capsys.readouterr()
     assert "The sampler: NUTS, 0 divergent steps of 400" in shown.out
     assert "layerjax: warm-up 150/150" in shown.err
-    assert main(["sample", "result", "--max-steps", "200", "--allow-short"]) == 1  # the chain's own sampler
+    assert main(["sample", "result", "--max-steps", "200", "--allow-unconverged"]) == 1  # the chain's own sampler
     posterior = load_posterior("result")
     assert posterior is not None
     assert posterior.chain.shape[:2] == (200, 4)

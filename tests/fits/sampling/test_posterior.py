@@ -168,7 +168,7 @@ def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Pat
         short.summary()
     with pytest.raises(ValueError, match="too short"):
         _ = short.inference_data
-    told = load(result, tmp_path / "chain.h5", allow_short=True)
+    told = load(result, tmp_path / "chain.h5", allow_unconverged=True)
     assert set(told.summary()) == set(short.names)
 
 

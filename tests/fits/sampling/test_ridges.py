@@ -55,7 +55,7 @@ def test_trajectories_leap_along_it_and_go_on_from_their_file(tmp_path):
     """By NUTS, from end to end within steps: correlation goes with the leaps that are taken, not with the length."""
     pytest.importorskip("blackjax")
     fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
-    how = {"sampler": "nuts", "seed": 0, "allow_short": True}
+    how = {"sampler": "nuts", "seed": 0, "allow_unconverged": True}
     posterior = sample(fitted, **how, max_steps=600)
     levels = LEVEL / 10.0 + (1.0 - LEVEL / 10.0) * np.array([0.1, 0.3, 0.5, 0.7, 0.9])
     found, error = shares_below(posterior, "base.albedo", levels)
