@@ -31,7 +31,7 @@ def undecided(problem: Problem) -> bool:
 
 
 def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
-    """What is to be said of a fit without shared errors."""
+    """What is to be said of a fit without model discrepancy."""
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
     return WithoutDiscrepancy(
         values=fit.values,
@@ -62,8 +62,8 @@ def with_discrepancy(problem: Problem) -> Problem:
 
 
 def start_points_with_discrepancy(problem: FittingProblem, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
-    """Where to start from, (K, P) in the unit box of a problem with shared errors, after a fit without: its minima, and
-    some of as many starts as it had.
+    """Where to start from, (K, P) in the unit box of a problem with model discrepancy, after a fit without: its minima,
+    and some of as many starts as it had.
     """
     found = []
     for minimum in fit.minima[:MOST_STARTS]:
