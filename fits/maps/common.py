@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fits.maps.descent import Texels, model_of
 from fits.maps.options import MapOptions
 from fits.maps.search import Fits, search, solve, starts_at, to_units
-from fits.optimise.descent import PROMISE, descend
+from fits.optimise.descent import COST_TOLERANCE, descend
 from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.optimise.multi_start import start_points
 from fits.optimise.uncertainty import ON_BOUND
@@ -250,7 +250,7 @@ def _information(model: Model, vectors: Array, pilot: Texels) -> tuple[Any, ...]
 
     def one(row: tuple[Array, Texels]) -> tuple[Any, ...]:
         own, unit = model_of(model, row[1]), model.box.to_unit(row[0])
-        found = descend(own, unit, jnp.asarray(False), jnp.asarray(1), jnp.asarray(PROMISE))
+        found = descend(own, unit, jnp.asarray(False), jnp.asarray(1), jnp.asarray(COST_TOLERANCE))
         return found.cost, found.gradient, found.root, unit
 
     return jax.lax.map(one, (vectors, pilot))

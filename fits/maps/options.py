@@ -113,7 +113,7 @@ class MapOptions:
     flagged_share: float = 0.05
     """Of the fitted texels, that may be at a bound, poor or unresolved in such a map."""
     numerical_error: float = 0.1
-    """Of the model, in standard deviations of the data, that is small."""
+    """Of the model, in standard deviations of the data, that is small: a resolution that is chosen stays below it."""
     chi_square_sigmas: float = 3.0
     """The median chi-square is no chance this many of a texel's standard deviations from 1."""
 
@@ -168,5 +168,5 @@ def _number(name: str, value: Any, low: float, high: float) -> float:
 
 USUAL = MapOptions()
 
-VERDICTS = {"converged_share", "flagged_share", "numerical_error", "chi_square_sigmas", "settled"}
+VERDICTS = {"converged_share", "flagged_share", "chi_square_sigmas", "settled"}
 """Options that change no number of a store: another value is not another fit."""

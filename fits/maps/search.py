@@ -28,9 +28,9 @@ from fits.maps.descent import (
     model_of,
 )
 from fits.maps.options import MapOptions
-from fits.optimise.descent import PROMISE
+from fits.optimise.descent import COST_TOLERANCE
 from fits.optimise.identifiability import LARGEST_ERROR, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
-from fits.optimise.uncertainty import LEAST_PULL, ON_BOUND
+from fits.optimise.uncertainty import LEAST_GRADIENT, ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -79,7 +79,7 @@ class Fits(NamedTuple):
 
     def better(self, other: "Fits", rows: Any) -> Truths:
         """Where another one, of these rows, is lower by more than is left to gain, (len(rows),) bool."""
-        return np.asarray(other.cost < self.cost[rows] - 10.0 * PROMISE)
+        return np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
 
     def put(self, rows: Any, other: "Fits") -> None:
         """Take over another one at these rows."""
@@ -244,7 +244,7 @@ def _fit_at(model: Model, end: Ending, texel: Texels) -> Fits:
 def _errors(model: Model, end: Ending, root: Array, scatter: Array) -> tuple[Array, Array, Array]:
     """As `fits.optimise.uncertainty`, for a compiled program."""
     box, unit, count = model.box, end.unit, end.unit.size
-    root, pull = root / jnp.sqrt(scatter), LEAST_PULL * scatter
+    root, pull = root / jnp.sqrt(scatter), LEAST_GRADIENT * scatter
     known = jnp.isfinite(end.cost) & jnp.all(jnp.isfinite(root))
     root = jnp.where(known, root, 0.0)
     idle = jnp.linalg.norm(root, axis=0) * UNKNOWN_BEYOND < 1.0

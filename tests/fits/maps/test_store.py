@@ -268,7 +268,7 @@ def test_what_differs_is_named(whole, given, changed, named):
 
 
 def test_thresholds_of_verdicts_make_no_other_fit(out, given, whole):
-    assert_same(fitted(out, given, converged_share=0.5, numerical_error=0.2), whole)
+    assert_same(fitted(out, given, converged_share=0.5, chi_square_sigmas=5.0), whole)
 
 
 @pytest.mark.parametrize("force", [False, True])
