@@ -7,10 +7,8 @@ each channel has the coordinates of the parameters that matter to it alone. Line
 each series needs, and solutions elsewhere whether they were enough.
 """
 
-import itertools
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -173,6 +171,14 @@ class _Space:
     high: Floats
     logarithmic: NDArray[np.bool_]
 
+    def ends(self) -> tuple[Floats, Floats]:
+        """Of the coordinates."""
+        low, high = (
+            np.where(self.logarithmic, np.log(np.where(self.logarithmic, end, 1.0)), end)
+            for end in (self.low, self.high)
+        )
+        return low, high
+
     def vectors(self, points: Floats) -> Floats:
         """Parameters (G, P) at points (G, D) of [-1, 1]."""
         low, high = self.ends()
@@ -183,30 +189,11 @@ class _Space:
             vectors[:, of_channel] = np.clip(physical, self.low, self.high)
         return vectors
 
-    def ends(self) -> tuple[Floats, Floats]:
-        """Of the coordinates."""
-        tame = np.where(self.logarithmic, self.low, 1.0), np.where(self.logarithmic, self.high, 1.0)
-        low, high = (
-            np.where(self.logarithmic, np.log(part), end) for part, end in zip(tame, (self.low, self.high), strict=True)
-        )
-        return low, high
-
     def values(self, points: Floats) -> tuple[Floats, Floats]:
-        """BSDF without the common scale at points (G, D), (G, N, C) in 1/sr, and standard deviations of data."""
-        values, sigma = in_shares(
-            lambda rows: self.problem.call(_unscaled, rows),
-            self.vectors(points),
-            max(1, min(SHARE, -(-len(points) // cores()))),
-        )
+        """BSDF without the common scale at points (G, D), (G, N, C) in 1/sr, and standard deviations of the data."""
+        share = max(1, min(SHARE, -(-len(points) // cores())))
+        values, sigma = in_shares(lambda rows: self.problem.call(_unscaled, rows), self.vectors(points), share)
         return values, sigma
-
-
-class _Choice(NamedTuple):
-    """Terms of each series, (D,), which coordinates are logarithms, and the offset as a multiple of the mean."""
-
-    terms: tuple[int, ...]
-    logarithmic: NDArray[np.bool_]
-    offset: float
 
 
 def emulate(problem: Problem, options: MapOptions = USUAL) -> Tried:
@@ -214,22 +201,21 @@ def emulate(problem: Problem, options: MapOptions = USUAL) -> Tried:
     places = _places(problem)
     if isinstance(places, str):
         return Tried(None, np.inf, places)
-    low, high = problem.low[places[0]], problem.high[places[0]]
-    for of_channel in places:
-        low, high = np.minimum(low, problem.low[of_channel]), np.maximum(high, problem.high[of_channel])
     most, tolerance = options.emulator_max_solves, 0.5 * options.emulator_error
-    space = _Space(problem, places, low, high, np.zeros(places.shape[1], bool))
-    choice, mean = _chosen(space, tolerance)
-    if choice is None:
+    low, high = problem.low[places].min(axis=0), problem.high[places].max(axis=0)
+    space = _Space(problem, places, low, high, np.zeros(len(low), bool))
+    chosen = _chosen(space, tolerance)
+    if chosen is None:
         return Tried(None, np.inf, f"no series of less than {LINE_NODES} terms a parameter holds")
-    space = _Space(problem, places, low, high, choice.logarithmic)
-    terms, error = tuple(max(2, int(count / MORE)) for count in choice.terms), np.inf
+    needed, logarithmic, offset = chosen
+    space, error = replace(space, logarithmic=logarithmic), np.inf
+    terms = tuple(max(2, int(count / MORE)) for count in needed)
     for _ in range(ROUNDS):
         solves = int(np.prod(terms))
         if solves > most:
             break
         options.tell("emulator", 0, solves, " x ".join(map(str, terms)))
-        emulator = _made(space, terms, choice.offset * mean, tolerance)
+        emulator = _made(space, terms, offset, tolerance)
         ready = problem.with_model(with_emulator(problem.model, emulator))
         error = _error(space, ready)
         words = f"an emulator of {len(emulator.orders):,} terms from {solves:,} solutions, error {error:.2g} sd"
@@ -248,105 +234,92 @@ def _places(problem: Problem) -> Integers | str:
     common: list[int] = []
     own: dict[str, dict[int, int]] = {}
     for place, name in enumerate(problem.names[: model.moving]):
-        if name == "scale":
-            continue
-        found = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        if found:
+        if found := re.fullmatch(r"(.*)\[(\d+)\]", name):
             own.setdefault(found[1], {})[int(found[2])] = place
-        else:
+        elif name != "scale":
             common.append(place)
-    channels = model.values.shape[-1]
-    if any(set(places) != set(range(channels)) for places in own.values()):
+    channels = range(model.values.shape[-1])
+    if any(set(places) != set(channels) for places in own.values()):
         return "numbers of channels do not match those of the data"
     if not common and not own:
         return "no parameter of the stack is free"
-    return np.array([[*common, *(places[channel] for places in own.values())] for channel in range(channels)])
+    return np.array([[*common, *(places[channel] for places in own.values())] for channel in channels])
 
 
-def _chosen(space: _Space, tolerance: float) -> tuple[_Choice | None, Floats]:
-    """How many terms each coordinate needs, by lines through the box, and the mean of each datum on them, (N, C)."""
-    count = space.places.shape[1]
-    nodes = np.cos(np.pi * (np.arange(LINE_NODES) + 0.5) / LINE_NODES)
-    through = _through(count)
-    ways = [np.zeros(count, bool), space.low > 0.0]
-    found: dict[tuple[int, bool], tuple[Floats, Floats]] = {}
-    for coordinate, logarithmic in itertools.product(range(count), (False, True)):
-        if logarithmic and not ways[1][coordinate]:
-            continue
+def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[np.bool_], Floats] | None:
+    """How many terms each coordinate needs, which are logarithms, and the offset (N, C), by lines through the box."""
+    count, nodes = len(space.low), _nodes(LINE_NODES)
+    # through its middle and some of its corners, near which series are worst
+    corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
+    through = np.concatenate([np.zeros((1, count)), 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0])
+    found: list[dict[bool, list[Floats]]] = []
+    for coordinate in range(count):
         lines = np.repeat(through, LINE_NODES, axis=0)
         lines[:, coordinate] = np.tile(nodes, len(through))
-        way = np.zeros(count, bool)
-        way[coordinate] = logarithmic
-        own = _Space(space.problem, space.places, space.low, space.high, way)
-        values, sigma = own.values(lines)
-        found[coordinate, logarithmic] = tuple(
-            part.reshape(-1, LINE_NODES, *part.shape[1:]) for part in (values, sigma)
-        )  # type: ignore[assignment]
-    mean = np.mean([np.mean(np.abs(values), axis=(0, 1)) for values, _ in found.values()], axis=0)
-    best: _Choice | None = None
+        ways = [False, True] if space.low[coordinate] > 0.0 else [False]
+        found.append({})
+        for way in ways:
+            both = replace(space, logarithmic=way & (np.arange(count) == coordinate)).values(lines)
+            found[-1][way] = [part.reshape(-1, LINE_NODES, *part.shape[1:]) for part in both]
+    means = [np.mean(np.abs(values), axis=(0, 1)) for ways in found for values, _ in ways.values()]
+    best = None
     for offset in OFFSETS:
-        terms, logs = [], []
-        for coordinate in range(count):
-            ways_of = {
-                logarithmic: _terms(*found[coordinate, logarithmic], offset * mean, tolerance)
-                for logarithmic in (False, True)
-                if (coordinate, logarithmic) in found
-            }
-            logs.append(min(ways_of, key=lambda way: ways_of[way]))
-            terms.append(ways_of[logs[-1]])
-        if max(terms) < LINE_NODES and (best is None or np.prod(terms) < np.prod(best.terms)):
-            best = _Choice(tuple(terms), np.array(logs), offset)
-    return best, mean
-
-
-def _through(count: int) -> Floats:
-    """What lines through the box pass: its middle and some of its corners, near which series are worst, (lines, D)."""
-    corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
-    signs = 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0
-    return np.concatenate([np.zeros((1, count)), signs])
+        shift = offset * np.mean(means, axis=0)
+        terms = [{way: _terms(*lines, shift, tolerance) for way, lines in ways.items()} for ways in found]
+        logs = [min(ways, key=lambda way, ways=ways: ways[way]) for ways in terms]
+        needed = tuple(ways[way] for ways, way in zip(terms, logs, strict=True))
+        if max(needed) < LINE_NODES and (best is None or np.prod(needed) < np.prod(best[0])):
+            best = needed, np.array(logs), shift
+    return best
 
 
 def _terms(values: Floats, sigma: Floats, offset: Floats, tolerance: float) -> int:
     """Terms that a series needs on lines, (lines, nodes, N, C); as many as there are nodes where none suffice."""
     if np.any(values + offset <= 0.0):
         return LINE_NODES
-    series = np.abs(_series(np.log(values + offset), (1,)))
+    series = np.abs(_series(np.log(values + offset), 1))
     tails = np.cumsum(series[:, ::-1], axis=1)[:, ::-1]  # of what is left out from each term on
     influence = np.max((values + offset) / sigma, axis=1, keepdims=True)
-    errors = np.max(tails * influence, axis=(0, 2, 3))
-    enough = np.flatnonzero(errors < tolerance)
+    enough = np.flatnonzero(np.max(tails * influence, axis=(0, 2, 3)) < tolerance)
     return max(2, int(enough[0])) if enough.size else LINE_NODES
 
 
-def _series(values: Floats, axes: Sequence[int]) -> Floats:
-    """Coefficients of Chebyshev series from values at the polynomials' zeros."""
-    for axis in axes:
-        values = fft.dct(values, type=2, axis=axis) / values.shape[axis]
-        first = [slice(None)] * values.ndim
-        first[axis] = slice(0, 1)
-        values[tuple(first)] *= 0.5
-    return values
+def _nodes(count: int) -> Floats:
+    """Zeros of a Chebyshev polynomial."""
+    return np.cos(np.pi * (np.arange(count) + 0.5) / count)
+
+
+def _series(values: Floats, axis: int) -> Floats:
+    """Coefficients of Chebyshev series along an axis from values at the polynomial's zeros."""
+    found = fft.dct(values, type=2, axis=axis) / values.shape[axis]
+    np.moveaxis(found, axis, 0)[0] *= 0.5
+    return np.asarray(found)
 
 
 def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
-    nodes = [np.cos(np.pi * (np.arange(count) + 0.5) / count) for count in terms]
-    points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, len(terms))
-    values, sigma = space.values(points)
+    def grid(axes: list[Any]) -> NDArray[Any]:
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(terms))
+
+    values, sigma = space.values(grid([_nodes(count) for count in terms]))
     smallest = np.max(np.abs(values), axis=0) * np.finfo(float).tiny + np.finfo(float).tiny
     logarithms = np.log(np.maximum(values + offset, smallest))  # (G, N, C)
     mean = logarithms.mean(axis=0)
     influence = np.max((values + offset) / sigma, axis=0)
     parts = [_compressed((logarithms - mean)[:, :, c], influence[:, c], tolerance) for c in range(values.shape[2])]
     rank = max(len(directions) for _, directions in parts)
+    series = np.stack([np.pad(left, [(0, 0), (0, rank - left.shape[1])]).reshape(*terms, rank) for left, _ in parts])
+    for axis in range(len(terms)):
+        series = _series(series, axis + 1)
+    series = series.reshape(len(parts), -1, rank)
+    directions = np.stack([np.pad(own, [(0, rank - len(own)), (0, 0)]) for _, own in parts])
+    # terms are left out that come to a fifth of the tolerance at most: signs of so many are as good as random
+    sizes = np.max(np.abs(series @ (directions * influence.T[:, None, :])), axis=(0, 2))
+    order = np.argsort(sizes)
+    kept = np.ones(len(sizes), bool)
+    kept[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
     low, high = space.ends()
-    shape = (*terms, rank)
-    filled = [_filled(left, rank, 1).reshape(shape) for left, _ in parts]
-    series = np.stack([_series(one, range(len(terms))).reshape(-1, rank) for one in filled])
-    directions = np.stack([_filled(directions, rank, 0) for _, directions in parts])
-    orders = np.stack(np.meshgrid(*map(np.arange, terms), indexing="ij"), axis=-1).reshape(-1, len(terms))
-    kept = _needed(series, directions * influence.T[:, None, :], tolerance)
     return Emulator(
-        orders=jnp.asarray(orders[kept]),
+        orders=jnp.asarray(grid([np.arange(count) for count in terms])[kept]),
         coefficients=jnp.asarray(series[:, kept]),
         directions=jnp.asarray(directions),
         mean=jnp.asarray(mean.T),
@@ -359,19 +332,6 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
     )
 
 
-def _needed(series: Floats, directions: Floats, tolerance: float) -> NDArray[np.bool_]:
-    """Which of the terms, (C, M, R), are needed: the others come to a fifth of the tolerance at most.
-
-    directions: (C, R, N), of data in units of their standard deviations.
-    """
-    sizes = np.max(np.abs(series @ directions), axis=(0, 2))
-    order = np.argsort(sizes)
-    needed = np.ones(len(sizes), bool)
-    # signs of so many terms are as good as random
-    needed[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
-    return needed
-
-
 def _compressed(values: Floats, influence: Floats, tolerance: float) -> tuple[Floats, Floats]:
     """Values (G, N) as a product of (G, R) and (R, N), to a fifth of the tolerance."""
     left, sizes, right = np.linalg.svd(values * influence, full_matrices=False)
@@ -381,17 +341,10 @@ def _compressed(values: Floats, influence: Floats, tolerance: float) -> tuple[Fl
     return left[:, :rank] * sizes[:rank], right[:rank] / influence
 
 
-def _filled(part: Floats, size: int, axis: int) -> Floats:
-    """With zeros at the end of an axis."""
-    return np.pad(part, [(0, size - part.shape[axis]) if k == axis else (0, 0) for k in range(part.ndim)])
-
-
 def _error(space: _Space, ready: Problem) -> float:
     """The largest error of an emulator at points that it has not seen, in standard deviations of the data."""
-    count = space.places.shape[1]
-    points = 2.0 * qmc.Sobol(count, rng=np.random.default_rng(1)).random(CHECKS) - 1.0
+    points = 2.0 * qmc.Sobol(len(space.low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0
     values, sigma = space.values(points)
-    assert isinstance(ready.model, EmulatedModel)
     found = np.asarray(ready.call(_emulated, space.vectors(points)), float)
     return float(np.max(np.abs(found - values) / sigma))
 

@@ -64,7 +64,7 @@ def draw(map: FittedMap, progress: Progress | None = None) -> dict[str, bytes]:
             if smoothed is not None and smoothed_errors is not None:  # in the colours of the plain one
                 value, error = f"{name}, smoothed", f"error of {name}, smoothed"
                 figures[f"smoothed value {name}"] = pictures.value_picture(
-                    smoothed[name], fitted, shown, value, unit, "viridis", values
+                    smoothed[name], fitted, shown, value, unit, "viridis", pictures.scale_of(values[fitted])
                 )
                 figures[f"smoothed error {name}"] = pictures.value_picture(
                     smoothed_errors[name], fitted, shown, error, unit, "plasma"
