@@ -7,6 +7,7 @@ whose flags are 0 is not there yet, whatever else is. One process at a time writ
 nothing.
 """
 
+import asyncio
 import functools
 import glob
 import itertools
@@ -15,7 +16,7 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import CodeType
@@ -26,6 +27,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
+from zarr.core.sync import sync
 
 from fits._files import named, permissions, plain, require_there
 from fits.maps.inputs import UNREADABLE, Block
@@ -212,10 +214,15 @@ class Store:
 
         results: by path, such as ``"values/base.albedo"``, the block's numbers of every array.
         """
+
+        async def write(names: Iterable[str]) -> None:  # together, which takes half the time
+            parts = {name: np.asarray(results[name], self.types[name][0]) for name in names}
+            await asyncio.gather(*(self.arrays[name].async_array.setitem(block, part) for name, part in parts.items()))
+
         with named(self.path):
             os.stat(self.path)  # one that was removed is not made again
-            for name, (dtype, _) in self.types.items():
-                self.arrays[name][block] = np.asarray(results[name], dtype)
+            sync(write(self.types.keys() - {"flags"}))
+            sync(write(["flags"]))
 
     def flags(self, block: Block) -> NDArray[np.uint16] | None:
         """The flags of a part of the map; None if it is not whole: a flag is 0, an array is damaged or lacks values."""
