@@ -36,7 +36,7 @@ LANES = 4
 """Texels that take their steps side by side: more do not make the arithmetic of each cheaper."""
 
 LAST = 0.01
-"""Of what a full step may promise at the end of a descent: so much is left after a last step that is not looked at."""
+"""Of the decrease that a full step may have left at the end: so much is left after a last step, not evaluated."""
 
 _SOLVER = BoxLevenbergMarquardt()
 
@@ -212,7 +212,7 @@ def descents(
     texels: Texels,
     number: Array,
     fresh: Array,
-    look: Array,
+    only_evaluate: Array,
     units: Array,
     known: Linearisation | None,
     which: Array,
@@ -220,9 +220,10 @@ def descents(
     """Ends of M texels, (M, ...), of which the first `number` count.
 
     Args:
-        fresh: whether starts are far from minima. look: whether each ends where it begins, with what is known there.
+        fresh: whether starts are far from minima.
+        only_evaluate: whether each ends where it begins, with its linearisation.
         units: starts, (K, P) in the unit box. which: of each texel, (M,).
-        known: what the model says at the starts, (K, ...), or with `look` anything; None: that is to be found.
+        known: what the model says at the starts, (K, ...), or with `only_evaluate` anything; None: that is to be found.
     """
     run = _Lanes(model, texels, fresh, units, known, which)
     lanes, _ = run.begun(jnp.full(LANES, texels.number))  # no texel's
@@ -234,9 +235,9 @@ def descents(
         following, lanes, trial, turn, out = carry
         after, ended, converged = run.stepped(lanes, trial)
         lanes = jax.tree.map(partial(_choose, turn), after, lanes)
-        ended = ((ended | look) & turn) | (following == 0)
+        ended = ((ended | only_evaluate) & turn) | (following == 0)
         ends = _ends(lanes, converged)
-        seen = jax.tree.map(partial(jnp.where, look), trial, ends.known)
+        seen = jax.tree.map(partial(jnp.where, only_evaluate), trial, ends.known)
         rows = jax.vmap(lambda end: ravel_pytree(end)[0])(ends._replace(known=seen))
         kept = ended & (lanes.texel < number)
         for lane in range(LANES):  # of all others into a last row, which is no texel's
@@ -244,7 +245,7 @@ def descents(
             out = jax.lax.dynamic_update_slice(out, rows[lane][None], (to, jnp.zeros_like(to)))
         new, said = run.begun(following + jnp.cumsum(ended) - 1)
         lanes, trial = jax.tree.map(partial(_choose, ended), (new, said), (lanes, trial))
-        turn = ended & (lanes.texel < number) & (known is not None) & ~look
+        turn = ended & (lanes.texel < number) & (known is not None) & ~only_evaluate
         return following + jnp.sum(ended), lanes, trial, turn, out
 
     def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -358,8 +359,8 @@ class _Lanes:
         return _Lane(lane.texel, lane.rough & ~stop, lane.sigma, unit, state), stop & ~lane.rough, converged
 
     def _is_last(self, before: Any, state: Any) -> Array:
-        """Whether the next step ends a descent: it is a full one, and another will promise too little if promises go on
-        to fall as they did (after Hairer and Wanner 1996, IV.8)."""
+        """Whether the next step ends a descent: it is a full one, and the decrease of another is too small if
+        decreases go on to shrink as they did (after Hairer and Wanner 1996, IV.8)."""
         followed = state.full_decrease**2 <= LAST * COST_TOLERANCE * before.full_decrease
         full = state.full_decrease - state.predicted <= LAST * COST_TOLERANCE
         return followed & full & jnp.isfinite(before.full_decrease) & (self.model.objective == "likelihood")

@@ -118,12 +118,9 @@ def _fit(
     require_smoothable(pilot.problem, options)
 
     # all chunks
-    here = client is None and options.processes == 1
-    shared = replace(options, progress=None)
-    job = Job(
-        str(path.resolve()), pilot.problem, pilot.starts, pilot.floor, shared, pilot.numerical_error,
-        data if here else data.portable,
-    )  # fmt: skip
+    source = data if client is None and options.processes == 1 else data.portable
+    common = (pilot.problem, pilot.starts, pilot.floor, replace(options, progress=None), pilot.numerical_error)
+    job = Job(str(path.resolve()), *common, source)
     if failures := _fit_chunks(store, job, data, client, options):
         told = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
         raise ValueError(f"{path}: {'; '.join(told)}; all other chunks are done, and another run does these")

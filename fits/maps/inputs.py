@@ -149,15 +149,21 @@ def _group(given: Any, wanted: str) -> tuple[dict[str, Array], str | None, str]:
     if isinstance(given, str | os.PathLike):
         return _in_file(str(given))
     if isinstance(given, xr.DataArray):
-        beside = {str(name): _array(one, f"{wanted}/{name}") for name, one in given.coords.items()}
-        return beside | {wanted: _array(given, wanted)}, wanted, wanted
-    if isinstance(given, Mapping):  # a Dataset of xarray and a group of h5py are such
-        given = {**given.coords, **given} if isinstance(given, xr.Dataset) else given
-        arrays = {str(name): one for name, one in given.items() if not isinstance(one, Mapping)}
-        return {name: _array(one, f"{wanted}/{name}") for name, one in arrays.items()}, None, wanted
-    if hasattr(given, "arrays"):  # a group of zarr
-        return {name: _array(one, f"{wanted}/{name}") for name, one in given.arrays()}, None, wanted
+        return _members(given.coords, f"{wanted}/") | {wanted: _array(given, wanted)}, wanted, wanted
+    if isinstance(given, Mapping) or hasattr(given, "array_keys"):  # Datasets of xarray and groups are such
+        coordinates = _members(given.coords, f"{wanted}/") if isinstance(given, xr.Dataset) else {}
+        return coordinates | _members(given, f"{wanted}/"), None, wanted
     return {wanted: _array(given, wanted)}, wanted, wanted
+
+
+def _members(group: Any, where: str) -> dict[str, Array]:
+    """The arrays of numbers in a group; whatever else lies there is left out."""
+    items = group.arrays() if hasattr(group, "array_keys") else group.items()
+    return {
+        str(name): _array(one, f"{where}{name}")
+        for name, one in items
+        if not isinstance(one, Mapping) and (not hasattr(one, "dtype") or one.dtype.kind in "biuf")
+    }
 
 
 def _in_file(given: str) -> tuple[dict[str, Array], str | None, str]:
@@ -177,20 +183,17 @@ def _in_file(given: str) -> tuple[dict[str, Array], str | None, str]:
         )
     try:
         root = _open(path, suffix)
-        found = root[name] if name else root
-        parent, last = (root[name.rpartition("/")[0] or "/"], name.rpartition("/")[2]) if name else (found, None)
+        found, (folder, _, last) = root[name] if name else root, name.rpartition("/")
+        parent = root[folder or "/"] if name else None
     except KeyError:
         raise ValueError(f"{path}: holds no {name!r}") from None
     except Exception as error:  # codecs raise what they like
         raise ValueError(f"{path}: cannot be read: {_reason(error)}") from None
-    if hasattr(found, "dtype") and last is None:
+    if not hasattr(found, "dtype"):
+        return _members(found, f"{path}:/{name}/" if name else f"{path}:/"), None, given
+    if not name:
         return {"": _array(found, given)}, "", given
-    group, chosen = (parent, last) if hasattr(found, "dtype") else (found, None)
-    members = group.items() if suffix in (".h5", ".hdf5") else group.arrays()
-    where = f"{path}:/" + "".join(
-        f"{part}/" for part in (name.rpartition("/")[0] if chosen else name).split("/") if part
-    )
-    return {key: _array(one, f"{where}{key}") for key, one in members if hasattr(one, "dtype")}, chosen, given
+    return _members(parent, f"{path}:/{folder}/" if folder else f"{path}:/") | {last: _array(found, given)}, last, given
 
 
 def _open(path: str, suffix: str) -> Any:

@@ -81,7 +81,7 @@ class MapOptions:
     seed: int = 0
     """Of these starts."""
     pilot_texels: int = 64
-    """Texels that are fitted first: starts, resolution and shared parameters come from them."""
+    """Texels that are fitted first: starts, resolution and common parameters come from them."""
     chunk_size: int = 1024
     """Texels that are fitted and written together."""
     restarts: int = 3

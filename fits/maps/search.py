@@ -126,7 +126,7 @@ def linearise_all(problem: Problem, units: Floats, texels: Texels, size: int) ->
     nothing = Linearisation(np.zeros((len(every), *shape)), np.zeros((*every.shape, *shape)))
     parts = []
     for first in range(0, count, together):
-        _, seen = _call(problem, every, nothing, which, rows, which[first : first + together], size, look=True)
+        _, seen = _call(problem, every, nothing, which, rows, which[first : first + together], size, only_evaluate=True)
         parts.append(seen)
     return Linearisation(*map(np.concatenate, zip(*parts, strict=True)))
 
@@ -187,13 +187,13 @@ def _call(
     some: Integers,
     size: int,
     fresh: bool = False,
-    look: bool = False,
+    only_evaluate: bool = False,
 ) -> tuple[Fits, Linearisation]:
     """Fits of some of the texels, at most `size`, and the model where the first `TOGETHER` of them ended."""
     count = len(some)
     places = some[_filled(count, size)]
     starts, begun = (units, which[places]) if known is not None else (units[places], np.arange(len(places)))
-    given = (starts, known, begun, texels.rows(places), *map(np.asarray, (count, fresh, look)))
+    given = (starts, known, begun, texels.rows(places), *map(np.asarray, (count, fresh, only_evaluate)))
     found, seen = problem.call(_program, *given)
     return (
         Fits(*(np.asarray(part)[:count] for part in found)),
@@ -209,10 +209,10 @@ def _program(
     texels: Texels,
     number: Array,
     fresh: Array,
-    look: Array,
+    only_evaluate: Array,
 ) -> tuple[Fits, Linearisation]:
     """Fits of the first `number` of the texels; of others whatever."""
-    ends = descents(model, texels, number, fresh, look, units, known, which)
+    ends = descents(model, texels, number, fresh, only_evaluate, units, known, which)
     found = first_mapped(lambda row: _fit_at(model, *row), (ends, texels), number)
     return found, jax.tree.map(lambda part: part[:TOGETHER], ends.known)
 

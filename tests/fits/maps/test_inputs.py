@@ -49,25 +49,20 @@ def _source(kind: str, folder: Path) -> Any:
     return {"xarray": turned, "xarray, dataset": xarray.Dataset({"values": turned})}[kind]
 
 
-KINDS = (
-    *(
-        "numpy",
-        "mapped",
-        "npy",
-        "hdf5",
-        "hdf5, name",
-        "hdf5, one",
-        "hdf5, object",
-        "zarr",
-        "zarr, name",
-        "zarr, folder",
-    ),
-    *("zarr, one", "zarr, object", "zarr, group", "zarr, memory", "xarray", "xarray, dataset"),
-)
-BY_NAME = ("npy", "hdf5", "hdf5, name", "hdf5, one", "zarr", "zarr, name", "zarr, folder", "zarr, one")
+BY_NAME = ["npy", "hdf5", "hdf5, name", "hdf5, one", "zarr", "zarr, name", "zarr, folder", "zarr, one"]
+OBJECTS = [
+    "numpy",
+    "mapped",
+    "hdf5, object",
+    "zarr, object",
+    "zarr, group",
+    "zarr, memory",
+    "xarray",
+    "xarray, dataset",
+]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", BY_NAME + OBJECTS)
 def test_each_source_gives_the_same_block(tmp_path: Path, kind: str) -> None:
     found = map_data(_source(kind, tmp_path), VIEW)
     assert (found.shape, found.samples, found.channels) == (SHAPE, N, C)
@@ -240,6 +235,11 @@ def test_a_group_with_several_arrays_says_which(tmp_path: Path) -> None:
         map_data(tmp_path / "v.zarr", VIEW)
     with pytest.raises(ValueError, match=r"v.zarr: holds no 'third'"):
         map_data(f"{tmp_path}/v.zarr:/third", VIEW)
+    labels = np.array([b"gloss", b"matt"])
+    hdf5_file(tmp_path / "v.h5", {"anything": VALUES, "labels": labels})  # words count for nothing
+    np.testing.assert_array_equal(map_data(tmp_path / "v.h5", VIEW).read(()), VALUES)
+    with pytest.raises(ValueError, match=r"v.h5:/labels holds \|S5, must hold real numbers"):
+        map_data(f"{tmp_path}/v.h5:/labels", VIEW)
 
 
 def test_numbers_that_stand_for_nothing_are_nan(tmp_path: Path) -> None:
