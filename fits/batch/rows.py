@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from fits.prediction.compare import LEANING
+from fits.prediction.options import ComparisonOptions
 
 if TYPE_CHECKING:
     from fits.batch.fitting import Fitted
@@ -134,7 +134,7 @@ def standings(rows: Sequence[Row]) -> dict[tuple[str, str], str]:
         excess = max(1.0, best.reduced_chi_square) if best.measure == "AIC" else 1.0
         for row in own:
             behind = (row.loss - best.loss) / (1.0 if math.isnan(excess) else excess)
-            alike = behind < LEANING and row.measure in ("AIC", "score") and row.converged
+            alike = behind < ComparisonOptions().slight_difference and row.measure in ("AIC", "score") and row.converged
             words[row.file, row.stack] = BEST if row is best else AS_GOOD if alike else f"{behind:+.1f}"
     return words
 

@@ -167,7 +167,7 @@ class Model(Density):
         assert self.process is not None
         return self.process.whitened(*self._logarithmic(predicted, noise), self._correlation(vector, shared))
 
-    def lack_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
+    def discrepancy_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
         """What the model's logarithm lacks at other `places`, as far as the data say: mean and sd, (M, C)."""
         at = self._correlation(vector)
         assert self.process is not None

@@ -224,7 +224,7 @@ def test_errors_elsewhere_are_those_of_regression() -> None:
     solved = np.linalg.solve(covariance, across.T).T
     expected = solved @ (logarithms(of)[0] - mean)
     variance = (0.2 * larger(folded(new), at)) ** 2 - np.sum(solved * across, axis=-1)
-    found, sd = of.call(Model.lack_at, of.start, of.predict(of.start), places(new.wi, new.wo))
+    found, sd = of.call(Model.discrepancy_at, of.start, of.predict(of.start), places(new.wi, new.wo))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-5)
     np.testing.assert_allclose(np.ravel(sd), np.sqrt(variance), atol=1e-4)
 

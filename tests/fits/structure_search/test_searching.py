@@ -10,7 +10,7 @@ import fits
 import layerjax as lj
 from fits._files import locked
 from fits.optimise.result import Fit
-from fits.prediction import cross_validation as left_out
+from fits.prediction import cross_validation as cross_validation
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -99,7 +99,7 @@ def test_a_closer_look_goes_on_at_the_incidence_where_it_was(
     whole = look.read_text()
     look.unlink()
     left: list[str] = []
-    refit = left_out.refit
+    refit = cross_validation.refit
 
     def counted(*arguments: object) -> Fit:
         if len(left) == 2:
@@ -108,7 +108,7 @@ def test_a_closer_look_goes_on_at_the_incidence_where_it_was(
         return refit(*arguments)
 
     settings = {"layers": 1, "transport": lj.Statistical(), "noise": NOISE, "starts": 2, "directory": directory}
-    monkeypatch.setattr(left_out, "refit", counted)
+    monkeypatch.setattr(cross_validation, "refit", counted)
     with pytest.raises(KeyboardInterrupt):
         search(data, LIBRARY, **settings)
     assert groups.is_file()
