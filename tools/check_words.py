@@ -4,7 +4,8 @@
 
 A word is in the tables if it can hardly be right, alone or with its neighbours. Words that also have a plain or a
 technical sense are not: `read`, a gerund as in "reading a file", `share` of energy, `alone` and `again` as adverbs,
-`shape` and `behind` in space, `size`, `nodes`, `table`, `score`. Short local names are free but for `NAMES`.
+`shape` and `behind` in space, `size`, `nodes`, `table`, `score`. Local names are checked by `NAMES` only, and `of` as a
+parameter only, as it is a constructor in `Totals.of`.
 """
 
 import ast
@@ -55,7 +56,7 @@ NAMES = {
 """Parts of names, between underscores or capitals."""
 
 WHOLE_NAMES = {
-    r"of|found|seen|kept|given|there|beside|beyond|apart|within|behind|between|alone|every|own|here|again|look": (
+    r"found|seen|kept|given|there|beside|beyond|apart|within|behind|between|alone|every|own|here|again|look": (
         "a verb or a noun of the field"
     ),
 }
@@ -91,6 +92,9 @@ def _in_sentence(line: int, sentence: str) -> Iterator[Finding]:
 
 def _in_names(node: ast.AST) -> Iterator[Finding]:
     match node:
+        case ast.arg(arg="of"):
+            yield node.lineno, "of", "a noun of the field"
+            return
         case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
             tables = {**NAMES, **WHOLE_NAMES}
         case ast.AnnAssign(target=ast.Name(id=name)) | ast.Attribute(attr=name, ctx=ast.Store()):
