@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
-from layerjax.directions import Vector
+from layerjax.directions import Vector, half_vector
 from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
-from layerjax.surfaces.interface import interface_reflection
+from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_light import (
     Normals,
     facet_energies,
@@ -29,7 +30,7 @@ from layerjax.transport.adding_doubling.facet_light import (
 from layerjax.transport.adding_doubling.grid import Grid, Region, joined, spread
 from layerjax.transport.adding_doubling.inverse import inverse
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import cosines, modes_at_nodes, scaled_to_energy
+from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scaled_to_energy
 
 STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
@@ -49,6 +50,9 @@ RESOLVED = 0.2
 BLUR = 5.6
 """Of alpha / (1 + 2 alpha) over the facets from pole to rim, half the width in s^2 over which rays move from one panel
 to another: as far apart as they are next to each other, or a few times that."""
+
+CRITICAL = 2.0
+"""Times the distance between azimuths: half the width over which the critical angle is rounded off."""
 
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
@@ -175,8 +179,23 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
     energy = at_most(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
-    (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, *normals)], region, region, modes)
-    return scaled_to_energy(region, kernel, energy)
+
+    def reflection(wi: Vector, wo: Vector) -> list[Array]:
+        h, cosine = half_vector(wi, wo, same_side=True)
+        level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes)))
+        return [level * mirror_lobe(h, wi, wo, *normals)]
+
+    return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes)[0], energy)
+
+
+def _critical_blur(wi: Vector, wo: Vector, ior: Array, apart: float) -> Array:
+    """See `fresnel.dielectric`: a few azimuths that are so far apart, so that none meets the root at the critical angle.
+
+    Reflectance would change by leaps with the index there, and its derivative be that of no difference of values.
+    """
+    along, across = wi[0] * wo[0], wi[0] * wo[1]
+    step = apart * jnp.sqrt(across * across + (apart * along) ** 2) / (2.0 * ior * ior)
+    return at_most(CRITICAL * step, 0.5 * at_least((1.0 - ior) * (1.0 + ior), 0.0) / (ior * ior))
 
 
 def _adjoint(flux: Array, leaving: Array, far: Region) -> Array:
