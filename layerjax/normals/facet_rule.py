@@ -99,7 +99,7 @@ def parallels(
         last = VMF_REACH / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
         end = at_most(end, 0.5 * last * (1.0 + last * last))
     start = None
-    if distribution == "vmf" and way == "refracted":
+    if way == "refracted":
         total = ratio < 1.0  # else all of the light comes through
         n = jnp.where(total, ratio, 0.5)
         # of normals, mz at most: mu / (c - n cos(theta_t)), without the difference
@@ -171,11 +171,10 @@ def polar_angles(
         inner = at_most(critical, end)
     else:
         cut, end = quarter - theta, at_most(critical, quarter) * jnp.ones_like(theta)
-        inner = _grazing(cosine, sine, ratio, end) if distribution == "vmf" else end
+        inner = _grazing(cosine, sine, ratio, end)
     cut = at_most(cut, end)
     low, high = jnp.where(cut < inner, cut, inner), jnp.where(cut < inner, inner, cut)
-    two = way == "refracted" and distribution == "ggx"
-    edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end][: 3 if two else 4], axis=1)
+    edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end], axis=1)
     places = _place((edges - theta) / alpha, distribution)
     first, width = places[:, :-1, None], (places[:, 1:] - places[:, :-1])[..., None]
     x, w = (jnp.asarray(array, theta.dtype) for array in gauss_legendre(points))
