@@ -22,7 +22,7 @@ from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_light import (
     Normals,
     facet_energies,
-    polar_count,
+    facet_spacing,
     reflected_energy,
     refracted_densely,
     refracted_rays,
@@ -47,9 +47,9 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
-BLUR = 5.6
-"""Of alpha / (1 + 2 alpha) over the facets from pole to rim, half the width in s^2 over which rays move from one panel
-to another: as far apart as they are next to each other, or a few times that."""
+BLUR, BLUR_BETWEEN = 5.6, 2.5
+"""Half the width in s^2 over which rays move from one panel to another, as far apart as they are next to each other, or
+a few times that: of a single interface times the distance between facets; of several times that between rays."""
 
 CRITICAL = 2.0
 """Times the distance between azimuths: half the width over which the critical angle is rounded off."""
@@ -112,7 +112,7 @@ def _operators(
     inside, up, lost_inside = facet_energies(far, near, normals)
     unresolved = _unresolved(grid, normals)
     through = _deposit(
-        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, normals)
+        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
     )
     through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
@@ -151,7 +151,7 @@ def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes:
         rays = refracted_rays(asked, ratio, normals, points)
     else:
         rays = refracted_densely(grid, asked, inner, normals, modes)
-    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, normals))
+    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, asked, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(asked.weight), inner)
     return [Parts(operator) for operator in (None, through, back, _face(inner, inside, 1.0 / ratio, normals, modes))]
@@ -161,16 +161,17 @@ def _unresolved(grid: Grid, normals: Normals) -> Array:
     return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
 
 
-def _blur(grid: Grid, normals: Normals) -> Array:
+def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
 
-    None between several interfaces either: light that is kept there by total reflection meets the edge again and again,
-    and a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
+    Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
+    again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    alpha = jnp.asarray(normals.alpha)
-    if grid.interfaces > 1:
-        return jnp.zeros_like(alpha)
-    return BLUR / polar_count(grid) * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
+    apart = facet_spacing(grid, normals) * (1.0 - _unresolved(grid, normals))
+    if grid.interfaces == 1:
+        return BLUR * apart * jnp.ones_like(grid.edges)
+    steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
+    return BLUR_BETWEEN * apart * jnp.abs(1.0 - near.ior / far.ior) * steepness
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:
@@ -189,13 +190,14 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
 
 def _critical_blur(wi: Vector, wo: Vector, ior: Array, apart: float) -> Array:
-    """See `fresnel.dielectric`: a few azimuths that are so far apart, so that none meets the root at the critical angle.
+    """See `fresnel.dielectric`: as wide as a few azimuths are apart.
 
-    Reflectance would change by leaps with the index there, and its derivative be that of no difference of values.
+    With the root at the critical angle between them, values would change by steps as the index does, and derivatives
+    would be those of no difference of values.
     """
     along, across = wi[0] * wo[0], wi[0] * wo[1]
     step = apart * jnp.sqrt(across * across + (apart * along) ** 2) / (2.0 * ior * ior)
-    return at_most(CRITICAL * step, 0.5 * at_least((1.0 - ior) * (1.0 + ior), 0.0) / (ior * ior))
+    return CRITICAL * step
 
 
 def _adjoint(flux: Array, leaving: Array, far: Region) -> Array:
