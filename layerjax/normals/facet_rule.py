@@ -42,7 +42,7 @@ class Parallels(NamedTuple):
 
     sine, cosine: of theta_d less theta. facing, across: cosine and sine of theta_d. squeeze: of tan(psi/2), for the
     density of normals; end: of what is squeezed, where the normal, or the light mirrored at it, reaches the horizon;
-    start: where refracted light comes above it (None: 0, not told).
+    start: where refracted light comes above it (None: 0, of reflected light).
     level: the density of normals (vMF: 1) times the visible area, without what psi changes.
     """
 
@@ -159,8 +159,7 @@ def polar_angles(
 ) -> tuple[Array, Array]:
     """theta_d - theta and its measure, (nodes, panels * points).
 
-    ratio: index on the far side over that on the side of w. points: a panel; there are three, for GGX normals and
-    "refracted" two.
+    ratio: index on the far side over that on the side of w. points: a panel; there are three.
     """
     theta = jnp.arctan2(sine, cosine)[:, None]
     total = ratio < 1.0  # reflection beyond the critical angle
