@@ -265,7 +265,7 @@ def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[n
     best = None
     for offset in OFFSETS:
         shift = offset * np.mean(means, axis=0)
-        terms = [{way: _terms(*lines, shift, tolerance) for way, lines in ways.items()} for ways in found]
+        terms = [{way: _terms(lines[0], lines[1], shift, tolerance) for way, lines in ways.items()} for ways in found]
         logs = [min(ways, key=ways.__getitem__) for ways in terms]
         needed = tuple(ways[way] for ways, way in zip(terms, logs, strict=True))
         if max(needed) < LINE_NODES and (best is None or np.prod(needed) < np.prod(best[0])):
