@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
-    from fits.maps.smoothing import Smoothness as Smoothness
+    from fits.maps.options import MapOptions as MapOptions
+    from fits.maps.options import SpatialPrior as SpatialPrior
     from fits.optimise.fit import fit as fit
     from fits.optimise.identifiability import Direction as Direction
     from fits.optimise.options import FitOptions as FitOptions
@@ -88,7 +89,8 @@ _HOMES = {
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
-    "Smoothness": "maps.smoothing",
+    "MapOptions": "maps.options",
+    "SpatialPrior": "maps.options",
     "ModelScore": "prediction.model_scores",
     "read": "data.formats",
     "write_csv": "data.formats.csv",

@@ -15,8 +15,8 @@ from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
 from fits.cli.many import search as search
-from fits.cli.map_reports import report_map
 from fits.cli.maps import fit_map as fit_map
+from fits.cli.maps import is_map, report_map
 from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
@@ -29,7 +29,6 @@ from fits.cli.reading import measurements, reading
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
-from fits.maps.fitted_map import is_store
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
@@ -164,7 +163,7 @@ def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
 
 def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, if asked for beside others; or that of a fitted map."""
-    if is_store(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
+    if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
     from fits.reports import results
