@@ -326,7 +326,7 @@ def _done_before(job: Job, task: Task, out: Path, done: Store | None) -> Row | N
         return None
     words = differences(kept["of"], job.fingerprint(task))
     if words and not job.force:
-        raise ValueError(another(directory, words))
+        raise ValueError(f"{another(directory, words)}; --force, or force=True, fits it again")
     try:
         read_json(directory / FIT)
     except (ValueError, OSError) as error:
