@@ -14,16 +14,25 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.optimise import apertures
-from fits.optimise.descent import PROMISE, ROUGHLY
+from fits.optimise.descent import COST_TOLERANCE, ROUGH_TOLERANCE
 from fits.optimise.discrepancy import (
     datasets_with_discrepancy,
     start_points_with_discrepancy,
     with_discrepancy,
     without_discrepancy,
 )
-from fits.optimise.identifiability import OPEN_BEYOND
-from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, starts_store, unit_of
-from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
+from fits.optimise.identifiability import UNCONSTRAINED_BEYOND
+from fits.optimise.multi_start import (
+    Solver,
+    StartOutcome,
+    multi_start,
+    rough_descent,
+    screened_starts,
+    start_points,
+    starts_store,
+    unit_of,
+)
+from fits.optimise.polish import EQUIVALENT_COST, Optimum, polish
 from fits.optimise.refinement import Accuracy, refined
 from fits.optimise.resolution import resolutions
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
@@ -76,8 +85,8 @@ def fit(
             "bounded" (L-BFGS-B throughout).
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with shared errors (`again`); one of another
-            problem is replaced.
+            done. It stays, as does one beside it for what is fitted again with model discrepancy (`again`); one of
+            another problem is replaced.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
@@ -127,7 +136,7 @@ def fit_problem(
     found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
     if not datasets_with_discrepancy(found):
         return found
-    return fit_again(
+    return fit_with_discrepancy(
         problem,
         found,
         starts=starts,
@@ -139,7 +148,7 @@ def fit_problem(
     )
 
 
-def fit_again(
+def fit_with_discrepancy(
     problem: FittingProblem,
     found: Fit,
     *,
@@ -150,7 +159,7 @@ def fit_again(
     checkpoint: str | Path | None = None,
     refine: bool = True,
 ) -> Fit:
-    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
+    """The fit of a problem with model discrepancy, after one without; arguments as of `fit_problem`."""
     without = datasets_with_discrepancy(found) or {
         name: without_discrepancy(found.part(name)) for name in problem.problems
     }
@@ -159,7 +168,7 @@ def fit_again(
     progress = progress or silent
 
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        progress(f"{stage} with shared errors", done, total, info)
+        progress(f"{stage} with model discrepancy", done, total, info)
 
     places = start_points_with_discrepancy(shared, found, starts, seed)
     return _found(shared, places, solver, report, checkpoint, settings, without, refine)
@@ -167,13 +176,13 @@ def fit_again(
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
-    ends = [rough_end(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
-    best = optimum(problem, ends, "least_squares", check=False, promise=ROUGHLY)
+    ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
+    best = polish(problem, ends, "least_squares", check=False, tolerance=ROUGH_TOLERANCE)
     return _fit_of(best, None, {"starts": len(ends)}, {})
 
 
 def again(checkpoint: str | Path) -> Path:
-    """Where a fit that is made again, with shared errors, keeps its starts."""
+    """Where a fit that is made again, with model discrepancy, keeps its starts."""
     return Path(f"{checkpoint}-shared")
 
 
@@ -194,8 +203,8 @@ def _found(
     problem = problem.with_problems(coarse)
     problem = problem.with_problems({name: apertures.for_starts(problem.problems[name]) for name in open_rays})
     racing = not refine and solver == "least_squares"
-    ends = race(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
-    best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
+    ends = screened_starts(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
+    best, accuracy = polish(problem, ends, solver, tolerance=COST_TOLERANCE if refine else ROUGH_TOLERANCE), None
     if refine and (known or any(map(apertures.has_rays, problem.problems.values()))):
         best, accuracy = refined(best, known, open_rays, solver, progress)
     return _fit_of(best, accuracy, settings, without)
@@ -208,7 +217,7 @@ def _fit_of(
     problem, lowest, found = at.problem, at.lowest, at.found
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
-    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * at.excess)
+    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUIVALENT_COST * at.excess)
     result = Fit(
         problem=cast(Problem, problem),  # or a `Joint`, of whose measurements `Fit.part` tells
         vector=lowest.vector,
@@ -241,16 +250,16 @@ def _fit_of(
 
 def _ends(
     problem: FittingProblem, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
-) -> list[End]:
+) -> list[StartOutcome]:
     """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
     if checkpoint is None:
-        return run_starts(problem, points, solver, progress)
+        return multi_start(problem, points, solver, progress)
     with starts_store(checkpoint, problem, points, solver) as store:
-        return run_starts(problem, points, solver, progress, store)
+        return multi_start(problem, points, solver, progress, store)
 
 
 def _minima(
-    problem: FittingProblem, ends: list[End], best: int, found: Uncertainty, same_cost: float
+    problem: FittingProblem, ends: list[StartOutcome], best: int, found: Uncertainty, same_cost: float
 ) -> tuple[tuple[Minimum, ...], dict[str, int]]:
     """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
     cost = np.array([end.cost for end in ends])
@@ -258,7 +267,7 @@ def _minima(
     width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
     spread = np.nan_to_num(found.standard_errors / width, nan=0.0, posinf=np.inf)
     same = SAME_BOX + SAME_ERRORS * np.minimum(spread, SAME_AT_MOST)
-    open_ = (spread > OPEN_BEYOND) | np.isin(problem.names, found.insensitive)
+    open_ = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, found.insensitive)
     alike = np.where(open_, np.inf, same)
     leaders: list[int] = []
     counts: list[int] = []
@@ -283,7 +292,7 @@ def _minima(
             counts[place] += 1
             outcomes["local minima" if place else "best minimum"] += 1
         else:
-            outcomes["maximum steps reached" if ends[index].unfinished else "failed"] += 1
+            outcomes["maximum steps reached" if ends[index].max_steps_reached else "failed"] += 1
     minima = tuple(
         Minimum(
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),

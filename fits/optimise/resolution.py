@@ -22,7 +22,7 @@ from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
-ENOUGH = 0.1
+SUFFICIENT = 0.1
 """Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
 
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
@@ -175,8 +175,8 @@ class Values:
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and errors of the model
-    where readings share them; for a named objective the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy
+    with model discrepancy; for a named objective the scatter of its residuals, one number."""
     if problem.objective == "likelihood":
         sigma = np.asarray(problem.call(Density.sigma_at, vector, predicted), float)
         shared = problem.build(vector).correlation

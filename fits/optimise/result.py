@@ -36,7 +36,7 @@ class Minimum:
 
 @dataclass(frozen=True)
 class WithoutDiscrepancy:
-    """The same stack fitted with noise that readings do not share: values and standard errors by name, how well.
+    """The same stack fitted with independent noise: values and standard errors by name, how well.
 
     residual_autocorrelation: of neighbours along the scans. pairs: of them.
     """
@@ -113,7 +113,7 @@ class Fit:
         values = ", ".join(
             f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
         )
-        return f"<Fit to {self.problem.count} readings: {values}; {self.status}>"
+        return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
         return str(shown_by("fits.reports.notebook:fit_fragment", self))

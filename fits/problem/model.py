@@ -258,7 +258,7 @@ class Model(Density):
         if self.process is None:
             return self.standardised_at(vector, predicted)
         scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return -self.process.independent(*scaled, self._correlation(vector))
+        return -self.process.whitened_residuals(*scaled, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
         """See `Density`."""
@@ -280,7 +280,7 @@ class Model(Density):
         at = self._correlation(vector)
         assert self.process is not None
         z, relative = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return self.process.elsewhere(self.process.whitened(z, relative, at), relative, places, at)
+        return self.process.predict(self.process.whitened(z, relative, at), relative, places, at)
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
@@ -326,7 +326,7 @@ class Model(Density):
             return log_density(z, sigma, self.tails, self.degrees_of_freedom)
         z, relative = self._logarithmic(predicted, sigma)
         at = self._correlation(vector)
-        own, precision = self.process.given_others(self.process.whitened(z, relative, at), relative, at)
+        own, precision = self.process.leave_one_out(self.process.whitened(z, relative, at), relative, at)
         width = sigma / jnp.sqrt(precision)
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 

@@ -177,7 +177,7 @@ class Problem(FittingProblem):
         noise: how a datum scatters about the model.
         scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".
-        instrument: by which the readings were taken; None: exact directions, one scale.
+        instrument: by which the measurements were taken; None: exact directions, one scale.
 
     Raises:
         ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
@@ -364,7 +364,7 @@ def _require_noise(levels: Levels) -> None:
 
 
 def _refuse_angular_only(problem: Problem) -> None:
-    """What is said of readings along directions, and means nothing of totals."""
+    """What is said of measurements along directions, and means nothing of totals."""
     for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
         if given:
             raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
@@ -413,7 +413,7 @@ def _model(
 
 
 def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
-    """What a model holds of readings along these directions, (N, 3) each."""
+    """What a model holds of measurements along these directions, (N, 3) each."""
     follow, given, optics = _uses_known(problem.transport), problem.instrument, None
     if isinstance(problem.data, Totals):
         follow = False  # light leaves along all directions

@@ -13,7 +13,7 @@ from fits.optimise.fit import fit
 from fits.optimise.multi_start import Floats
 from fits.optimise.result import Fit
 from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.kernel import log_sizes
+from fits.problem.discrepancy.kernel import log_scales
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -75,7 +75,7 @@ def test_simulated_readings_share_errors(wrong: Fit) -> None:
     simulated = posterior.inference_data.posterior_predictive["value"].to_numpy().reshape(-1, *wrong.predicted.shape)
     found = simulated / wrong.predicted
     at = wrong.problem.build(wrong.vector).correlation
-    shared = at.amplitude * np.exp(at.grazing_exponent * np.asarray(log_sizes(places(GEOMETRY.wi, GEOMETRY.wo))))
+    shared = at.amplitude * np.exp(at.grazing_exponent * np.asarray(log_scales(places(GEOMETRY.wi, GEOMETRY.wo))))
     # of 2048 draws, and a regression on nodes between them
     np.testing.assert_allclose(np.log(found).std(axis=0)[:, 0], np.hypot(shared, 0.02), rtol=0.1)
 

@@ -43,7 +43,7 @@ def simulated(seed: int, factor: float = 1.0) -> Problem:
     model = assumed(exact).model
     process, at = model.process, model.build(TRUTH).correlation
     assert process is not None
-    lack = np.asarray(process.drawn(generator.standard_normal((1, len(process.where))), at))
+    lack = np.asarray(process.sample(generator.standard_normal((1, len(process.where))), at))
     return assumed(factor * exact * np.exp(lack) * (1.0 + 0.02 * generator.standard_normal(exact.shape)))
 
 
