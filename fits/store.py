@@ -198,6 +198,13 @@ class Store:
         return self._connection.execute(statement, values).fetchall()
 
 
+def holds_other_files(directory: Path, store: str) -> bool:
+    """Whether there is no store of this name in a directory, but something that is not of one."""
+    if not directory.is_dir() or (directory / store).is_file():
+        return False
+    return any(not one.name.startswith(store) for one in directory.iterdir())
+
+
 def fingerprint(**parts: Any) -> dict[str, str]:
     """What tells the work of one problem from that of others, part by part.
 

@@ -39,7 +39,7 @@ from fits.reports.directories import FIT
 from fits.reports.pages import document, section, sentences
 from fits.reports.results import REPORT
 from fits.reports.verdicts import listed
-from fits.store import Store, another, differences, fingerprint
+from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search.report import write_report as write_search
 from fits.structure_search.search import search as run_search
 
@@ -148,7 +148,7 @@ def fit_files(
         raise ValueError(f"{out}: there is no directory {out.parent}")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file, must be a directory")
-    if out.exists() and any(out.iterdir()) and not (out / STORE).is_file():
+    if holds_other_files(out, STORE):
         raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
@@ -202,7 +202,7 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
             files.append(place)
             continue
         every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))
-        some = [one for one in every if format is not None or _holds_measurements(one)]
+        some = [one for one in every if format or one.suffix.lower() in MEASURED or _has_known_content(one)]
         if not some:
             raise ValueError(f"{place}: holds no measurement file")
         files += some
@@ -212,9 +212,7 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
     return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(beside)
 
 
-def _holds_measurements(path: Path) -> bool:
-    if path.suffix.lower() in MEASURED:
-        return True
+def _has_known_content(path: Path) -> bool:
     try:
         sniff(path)
     except (ValueError, OSError):
@@ -291,22 +289,21 @@ def _planned(job: Job, files: list[Path], out: Path, done: Store | None) -> tupl
     rows: dict[str, Row] = {}
     tasks: list[Task] = []
     for path in files:
-        every, why = [Task(path, "", stack) for stack in job.names], NOT_YET
+        why, content = NOT_YET, ""
         try:
             content = _lines(path)
-            every = [task._replace(content=content) for task in every]
         except OSError as error:
             why = one_line(error)
-        rows |= {task.key: task.failed(why) for task in every}
-        if why == NOT_YET:
-            rows |= {task.key: row for task in every if (row := _done_before(job, task, out, done)) is not None}
-        left = [task for task in every if rows[task.key]["status"] == NOT_YET]
+        every = [Task(path, content, stack) for stack in job.names]
+        known = {task.key: _done_before(job, task, out, done) if content else None for task in every}
+        left = [task for task in every if known[task.key] is None]
         try:
-            if left:
+            if left and content:
                 job.reading.parts(path)  # before any is fitted
-            tasks += left
+                tasks += left
         except (ValueError, OSError) as error:
-            rows |= {task.key: task.failed(one_line(error)) for task in left}
+            why = one_line(error)
+        rows |= {task.key: known[task.key] or task.failed(why) for task in every}
     return rows, sorted(tasks, key=lambda task: job.names.index(task.stack))
 
 

@@ -4,7 +4,6 @@ import html
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 
 from fits._files import write_together
@@ -103,37 +102,29 @@ def _others(search: Search) -> str:
 
 
 def search_picture(search: Search) -> Figure:
-    """Predictive score and BIC against the number of parameters, and probabilities."""
-    close = [(one, one.model_score) for one in search.candidates if one.model_score is not None]
+    """Predictive score and BIC against the number of parameters."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.8), layout="constrained")
-        left, middle, right = figure.subplots(1, 3, width_ratios=[3.0, 3.0, 2.0])
-        middle.plot(
-            [_of_stack(one) for one in search.candidates], [one.bic for one in search.candidates], "o", color=GREY
-        )
-        for number, (one, seen) in enumerate(close):
-            colour = CYCLE[number % len(CYCLE)] if number < NAMED else GREY
-            of_score = {"fmt": "o", "color": colour, "markersize": 5, "label": one.name}
-            left.errorbar(_of_stack(one), max(seen.elpd_diff, 0.0), yerr=seen.dse, **of_score)
-            middle.plot(_of_stack(one), one.bic, "o", color=colour)
-        for number, (_, seen) in enumerate(close[:NAMED]):
-            right.barh(number, seen.model_probability, color=CYCLE[number % len(CYCLE)])
+        figure = Figure(figsize=(8.0, 3.8), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for number, one in enumerate(search.candidates):
+            seen, close = one.model_score, one.model_score is not None and number < NAMED
+            colour, label = (CYCLE[number % len(CYCLE)], one.name) if close else (GREY, None)
+            if seen is not None:
+                score = max(seen.elpd_diff, 0.0)
+                left.errorbar(_of_stack(one), score, yerr=seen.dse, fmt="o", color=colour, label=label)
+            right.plot(_of_stack(one), one.bic, "o", color=colour)
         left.set(ylabel="score behind the best", title="Held-out data")
-        middle.set(ylabel="BIC above the lowest", title="Fit with independent noise")
-        for axes in (left, middle):
+        right.set(ylabel="BIC above the lowest", title="Fit with independent noise")
+        for axes in (left, right):
             axes.set_yscale("symlog", linthresh=10.0)
             axes.invert_yaxis()
             axes.set_xlabel("parameters of the stack")
             axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(integer=True))
-        right.set(xlabel="probability", title="Posterior", xlim=(0.0, 1.0))
-        right.set_yticks(np.arange(0))
-        right.invert_yaxis()
         figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
 _CAPTION = (
     "Left: how far the log predictive density of held-out incidences is behind that of the best structure, with its "
-    "standard error. Middle: the Bayesian information criterion of fits with independent noise. Right: probability "
-    "among the cross-validated structures, all as probable beforehand."
+    "standard error. Right: the Bayesian information criterion of fits with independent noise."
 )

@@ -36,7 +36,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.progress import Progress, silent
 from fits.reports.results import load_fit, save_fit
-from fits.store import Store, fingerprint
+from fits.store import Store, fingerprint, holds_other_files
 from fits.structure_search.library import Library, Structure, default_library
 from layerjax._checks import in_short, require_kind
 
@@ -69,16 +69,15 @@ class SearchOptions:
     budget: float | None = None
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.layers, int) and 0 <= self.layers <= 6):
-            raise ValueError(f"layers is {in_short(self.layers)}; it must be in [0, 6]")
-        for name in ("starts", "beam", "cross_validated"):
+        most = {"layers": (0, 6), "starts": (1, math.inf), "beam": (1, math.inf), "cross_validated": (1, math.inf)}
+        for name, (low, high) in most.items():
             number = getattr(self, name)
-            if not (isinstance(number, int) and number >= 1):
-                raise ValueError(f"{name} is {in_short(number)}; it must be a whole number >= 1")
-        if not self.bic_gain >= 0.0:
-            raise ValueError(f"bic_gain is {in_short(self.bic_gain)}; it must be at least 0")
-        if self.budget is not None and not (math.isfinite(self.budget) and self.budget >= 0.0):
-            raise ValueError(f"budget is {self.budget}; it must be a number of minutes of at least 0")
+            if not (isinstance(number, int) and low <= number <= high):
+                raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
+        for name in ("bic_gain", "budget"):
+            number = getattr(self, name)
+            if number is not None and not 0.0 <= number < math.inf:
+                raise ValueError(f"{name} is {in_short(number)}; it must be a finite number of at least 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +187,7 @@ def search(
             used, directory = data.used(), Path(directory)
             numbers = [used.wi, used.wo, used.values, used.sigma]
             whose = fingerprint(data=numbers, library=library, **settings, starts=options.starts, seed=seed)
-            if not (directory / STORE).is_file() and directory.exists() and any(directory.iterdir()):
+            if holds_other_files(directory, STORE):
                 raise ValueError(f"{directory}: is not empty, and holds no search")
             with errors_named(directory):
                 directory.mkdir(parents=True, exist_ok=True)
