@@ -34,9 +34,9 @@ class Descent(NamedTuple):
     """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX or of numpy.
 
     vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all. converged,
-    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit box,
-    (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN with
-    an infinite cost.
+    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit
+    box, (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN
+    with an infinite cost.
     """
 
     vector: Any

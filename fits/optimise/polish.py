@@ -18,10 +18,6 @@ from fits.optimise.uncertainty import Uncertainty, uncertainty
 from fits.problem.model import Density
 from fits.problem.problem import FittingProblem
 
-EQUIVALENT_COST = 2.0
-"""Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
-where that is above 1."""
-
 Floats = NDArray[np.float64]
 
 
@@ -29,7 +25,7 @@ class Optimum(NamedTuple):
     """The ends of all starts, the place of the lowest among them, and what is known there.
 
     improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
-    differences in cost count in, see `EQUIVALENT_COST`.
+    differences in cost count in, see `FitOptions`.
     """
 
     problem: FittingProblem

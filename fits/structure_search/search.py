@@ -251,7 +251,7 @@ class _Run:
         def fitted() -> Fit:
             problem = self._problem(structure)
             problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed, refine=False)
+            return fit_problem(problem, starts=self.options.starts, seed=self.seed, screen=True)
 
         return self._kept(structure, "", fitted)
 
