@@ -66,7 +66,7 @@ class Store:
     def open(
         cls, path: str | Path, fingerprint: Mapping[str, str], *, replace: bool = False, fresh: bool = False
     ) -> Iterator[Self]:
-        """Write a store, as the only process that does, and go on with the records that it holds.
+        """Write a store, as the only process that does, and resume from the records that it holds.
 
         Args:
             path: of the file, which is made if it is not there.

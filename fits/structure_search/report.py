@@ -50,11 +50,11 @@ def search_table(search: Search, most: int | None = SHOWN) -> tables.Table:
 
 
 def _row(one: Candidate) -> tuple[str, ...]:
-    seen, without = one.model_score, one.fit.without_discrepancy
+    score, without = one.model_score, one.fit.without_discrepancy
     cells = ("", "", "", "")
-    if seen is not None:
-        behind = f"{seen.elpd_diff:.1f} ± {seen.dse:.1f}"
-        cells = (f"{seen.elpd:.1f}", behind, f"{seen.weight:.2f}", f"{seen.model_probability:.2g}")
+    if score is not None:
+        behind = f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
+        cells = (f"{score.elpd:.1f}", behind, f"{score.weight:.2f}", f"{score.model_probability:.2g}")
     ratio = without.chi_square / max(without.degrees_of_freedom, 1) if without else one.fit.reduced_chi_square
     return (one.name, str(_of_stack(one)), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
 
@@ -82,7 +82,7 @@ def search_sentences(search: Search) -> list[str]:
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
     if search.stopped:
-        words.append("The time budget ended the search before all models were tried. The same command goes on with it.")
+        words.append("The time budget ended the search before all models were tried. The same command resumes it.")
     return [*words, *noise_notes(best.fit.problem)]
 
 
@@ -107,11 +107,11 @@ def search_picture(search: Search) -> Figure:
         figure = Figure(figsize=(8.0, 3.8), layout="constrained")
         left, right = figure.subplots(1, 2)
         for number, one in enumerate(search.candidates):
-            seen, close = one.model_score, one.model_score is not None and number < NAMED
+            score, close = one.model_score, one.model_score is not None and number < NAMED
             colour, label = (CYCLE[number % len(CYCLE)], one.name) if close else (GREY, None)
-            if seen is not None:
-                score = max(seen.elpd_diff, 0.0)
-                left.errorbar(_of_stack(one), score, yerr=seen.dse, fmt="o", color=colour, label=label)
+            if score is not None:
+                behind = max(score.elpd_diff, 0.0)
+                left.errorbar(_of_stack(one), behind, yerr=score.dse, fmt="o", color=colour, label=label)
             right.plot(_of_stack(one), one.bic, "o", color=colour)
         left.set(ylabel="score behind the best", title="Held-out data")
         right.set(ylabel="BIC above the lowest", title="Fit with independent noise")

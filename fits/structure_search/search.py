@@ -56,7 +56,7 @@ class SearchOptions:
         starts: of each fit, see `fits.fit`.
         beam: so many stacks of the lowest BIC grow and shrink, and the one that predicts best.
         cross_validated: so many of a level, those of its lowest BIC, are cross-validated.
-        bic_gain: a level that does not predict better is gone on from if it lowers the BIC by more than this.
+        bic_gain: a level that does not predict better is followed by another if it lowers the BIC by more than this.
         budget: minutes after which no stack is begun any more, but those that a result needs; what was begun is
             finished. None: without end.
     """
@@ -163,7 +163,7 @@ def search(
         seed: of the starts, see `fit`.
         options: how far the search goes.
         directory: keeps every fit and every held-out incidence as it is finished: a search that was killed, or whose
-            budget ended it, goes on there. The fits are result directories.
+            budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
@@ -272,13 +272,13 @@ class _Run:
         name = named(structure)
         stored = self.store.get(name)
         if stored is None:
-            left, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
-            self.store.put(name, {"left": vars(left), "evidence": vars(evidence)})
+            checked, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
+            self.store.put(name, {"cross-validation": vars(checked), "evidence": vars(evidence)})
         else:
-            kept = stored["left"]
-            left = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
+            kept = stored["cross-validation"]
+            checked = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
             evidence = Evidence(**stored["evidence"])
-        return fit, left, evidence
+        return fit, checked, evidence
 
     def _problem(self, structure: Structure) -> Problem:
         return Problem(self.library.stack(structure), self.data, **self.settings)
@@ -343,7 +343,8 @@ class _Run:
         """Scores side by side, best first."""
         close = {named(one): self.full[one] for one in self.ranked()}
         return rank_models(
-            {name: left for name, (_, left, _) in close.items()}, {name: found for name, (*_, found) in close.items()}
+            {name: checked for name, (_, checked, _) in close.items()},
+            {name: found for name, (*_, found) in close.items()},
         )
 
     def result(self) -> Search:
@@ -356,5 +357,5 @@ class _Run:
             bic = self.bic(one) - lowest
             candidates.append(Candidate(one, len(fit.vector), bic, fit, model_scores.get(named(one))))
         best = candidates[0].name
-        near = tuple(name for name, seen in model_scores.items() if name != best and seen.clear_diff <= 0.0)
+        near = tuple(name for name, one in model_scores.items() if name != best and one.clear_diff <= 0.0)
         return Search(tuple(candidates), near, self.options)

@@ -132,7 +132,7 @@ class Dimmed:
 def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path, monkeypatch):
     transports = made(), made()  # both at once, so that they differ in place
     fit(LINE, line_data(), transport=transports[0], starts=2, checkpoint=tmp_path / "starts")
-    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
     fit(LINE, line_data(), transport=transports[1], starts=2, checkpoint=tmp_path / "starts")
 
 

@@ -104,7 +104,7 @@ def test_the_finest_resolution_is_told(sharp, monkeypatch):
 
 def test_a_fit_goes_on_with_the_starts_that_are_done(refined, sharp, monkeypatch):
     found, kept = refined
-    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
     again = fit(STACK, sharp, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(again.vector, found.vector)
     assert again.problem.transport == found.problem.transport
