@@ -91,4 +91,4 @@ def fit_many(arguments: Namespace) -> int:
 
 
 def _goes_on(directory: Path) -> str:
-    return f"{directory} keeps what was fitted; the same command again goes on with it"
+    return f"{directory} keeps what was fitted; the same command again resumes it"

@@ -197,12 +197,12 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
     parser.add_argument(
         "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
     )
-    parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to go on with")
+    parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to resume")
     parser.add_argument(
         "--budget",
         type=level,
         metavar="MINUTES",
-        help="begin no stack after this time, and report what was found; the same command goes on (default: none)",
+        help="begin no stack after this time, and report what was found; the same command resumes (default: none)",
     )
     add_searching(parser)
     parser.add_argument("--starts", type=count, default=8, metavar="N", help="of each fit (default: %(default)s)")

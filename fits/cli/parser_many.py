@@ -26,7 +26,7 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("data", nargs="+", metavar="FOLDER|FILE", help="measurements, see docs/formats.md")
     parser.add_argument("--stacks", nargs="+", default=(), metavar="TOML", help="stacks, with their free parameters")
     parser.add_argument(
-        "--out", required=True, metavar="DIR", help="directory to write, or to go on with: DIR/FILE/STACK is a result"
+        "--out", required=True, metavar="DIR", help="directory to write, or to resume: DIR/FILE/STACK is a result"
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")

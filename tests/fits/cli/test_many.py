@@ -107,5 +107,5 @@ def test_an_interrupt_says_how_to_go_on(
 
     monkeypatch.setattr("fits.batch.fit_files.fit_one", interrupted)
     assert main(MANY) == 130
-    assert "out keeps what was fitted; the same command again goes on with it" in capsys.readouterr().err
+    assert "out keeps what was fitted; the same command again resumes it" in capsys.readouterr().err
     assert (folder / "out" / "table.csv").is_file()
