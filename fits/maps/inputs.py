@@ -215,7 +215,7 @@ def _chosen(given: Any, wanted: str) -> tuple[Array, dict[str, Array]]:
     """The array that was given, or that of the wanted name, or the only one; and all that lie beside it."""
     arrays, name, where = _group(given, wanted)
     if name is None and wanted not in arrays and len(arrays) != 1:
-        there = f"there are {', '.join([*arrays][:9])}" if arrays else "there is none"
+        there = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
         raise ValueError(f"{where}: no array {wanted!r}, {there}; PATH:/NAME chooses another")
     return arrays[name if name is not None else wanted if wanted in arrays else next(iter(arrays))], arrays
 
