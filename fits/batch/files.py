@@ -20,14 +20,13 @@ from fits.batch.rows import Row, best_of
 from fits.batch.searching import Searching
 from fits.batch.table import KIND, table_csv, table_json
 from fits.batch.work import Job, Task, fit_one
-from fits.data.reading import Reading
+from fits.data.reading import ReadOptions
 from fits.engines import Failure, run
 from fits.engines.failures import one_line
 from fits.names import Objective, Strata
 from fits.optimise.multi_start import Solver
 from fits.progress import Progress
-from fits.reports.directories import FIT
-from fits.reports.results import REPORT
+from fits.reports.results import FIT, REPORT
 
 LOCK = "fit-many.lock"
 NOT_YET = "not done yet"
@@ -72,12 +71,12 @@ def fit_files(
     quantity: str | None = None,
     bins: int | Literal["all"] | None = None,
     strata: Strata | None = None,
-    mask_retro: float | None = None,
-    mask_grazing: float | None = None,
-    only: Sequence[str] = (),
-    hold_out: Sequence[str] = (),
     wavelengths: tuple[float, float] | None = None,
     corrected: bool | None = None,
+    min_retro_angle: float | None = None,
+    max_polar_angle: float | None = None,
+    select: Sequence[str] = (),
+    hold_out: Sequence[str] = (),
     objective: Objective | None = None,
     starts: int = 32,
     seed: int = 0,
@@ -98,7 +97,7 @@ def fit_files(
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a `Searching` says how.
-        format to corrected: of all files, see `fits.data.reading.Reading`.
+        format to hold_out: of all files, see `fits.data.reading.ReadOptions`.
         objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
@@ -109,8 +108,10 @@ def fit_files(
         ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
-    held = tuple(only), tuple(hold_out)
-    reading = Reading(format, quantity, bins, strata, mask_retro, mask_grazing, *held, wavelengths, corrected)
+    parts = tuple(select), tuple(hold_out)
+    reading = ReadOptions(
+        format, quantity, bins, strata, wavelengths, corrected, min_retro_angle, max_polar_angle, *parts
+    )
     found, left_out = measurement_files(_several(files), format)
     given = stack_files(_several(stacks))
     for problem in given.values():
@@ -220,7 +221,7 @@ class _Plan:
                 self.rows[name, stack] = row
         if left:
             try:
-                job.reading.parts(path)
+                job.reading.split(path)
             except (ValueError, OSError) as error:
                 self._fail(name, [task.stack for task in left], one_line(error))
                 return

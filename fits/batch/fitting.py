@@ -15,19 +15,17 @@ from fits.optimise.result import Fit
 from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress
 from fits.reports import results
-from fits.reports.directories import replacing, reserved
-from fits.reports.html import Foretold, foretell
-from fits.reports.report_files import write_report
-from fits.reports.stored import HELD_OUT
+from fits.reports.html import HeldOut, predict_held_out, write_report
+from fits.reports.results import HELD_OUT, replacing, reserved
 
 DRAWING = "pictures and report"
 
 
 class Fitted(NamedTuple):
-    """A fit, and what it foretold of readings that were held out; None without any."""
+    """A fit, and its prediction of held-out data; None without any."""
 
     fit: Fit
-    foretold: Foretold | None
+    held_out: HeldOut | None
 
 
 Beside = Callable[[Fitted], Mapping[str, Mapping[str, Any]]]
@@ -38,7 +36,7 @@ def fit_into(
     directory: str | Path,
     given: ProblemFile,
     data: Measurements,
-    unseen: Measurements | None = None,
+    held_out: Measurements | None = None,
     *,
     objective: Objective | None = None,
     starts: int = 32,
@@ -54,7 +52,7 @@ def fit_into(
     Args:
         directory: as of `save_fit`.
         given: the stack file.
-        data, unseen: what is fitted, and readings held out whose prediction is scored.
+        data, held_out: what is fitted, and held-out data whose prediction is scored.
         objective: in place of that of the stack file.
         starts, seed, solver, progress: see `fit`; starts are kept beside the directory until it is there.
         force: replace an earlier result.
@@ -62,10 +60,10 @@ def fit_into(
         beside: files that the directory holds as well.
 
     Raises:
-        ValueError: as `fit` and `save_fit`; readings are held out of an objective that says nothing of readings.
+        ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
     """
     directory = Path(directory)
-    objective = require_posterior(objective or given.objective, "--hold-out" if unseen is not None else None)
+    objective = require_posterior(objective or given.objective, "--hold-out" if held_out is not None else None)
     done = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     with reserved(directory, force):
         found = run_fit(
@@ -83,7 +81,7 @@ def fit_into(
             checkpoint=done,
         )
         text = given.text if objective == given.objective else None
-        fitted = _written(directory, found, unseen, text, force, report, progress, beside)
+        fitted = _written(directory, found, held_out, text, force, report, progress, beside)
         for kept in (done, again(done)):
             kept.unlink(missing_ok=True)
     return fitted
@@ -105,7 +103,7 @@ def write_into(
 def require_posterior(objective: Objective, option: str | None) -> Objective:
     """The objective. ValueError where an option of the command line needs a likelihood, and it is none."""
     if option is not None and objective != "likelihood":
-        what = "has no posterior" if option == "--sample" else "says nothing of readings"
+        what = "has no posterior" if option == "--sample" else "has no predictive score"
         raise ValueError(f"{option} needs the objective 'likelihood': {objective!r} {what}")
     return objective
 
@@ -113,7 +111,7 @@ def require_posterior(objective: Objective, option: str | None) -> Objective:
 def _written(
     directory: Path,
     found: Fit,
-    unseen: Measurements | None,
+    held_out: Measurements | None,
     text: str | None,
     force: bool,
     report: bool,
@@ -124,13 +122,13 @@ def _written(
         progress(DRAWING, 0, 1)
     with replacing(directory, force) as folder:
         results.write_fit(found, folder, text)
-        if unseen is not None:
-            write_csv(unseen, folder / HELD_OUT)
+        if held_out is not None:
+            write_csv(held_out, folder / HELD_OUT)
         if report:
-            foretold = write_report(folder, directory.resolve().name, found)
+            predicted = write_report(folder, directory.resolve().name, found)
         else:
-            foretold = None if unseen is None else foretell(found, None, unseen)
-        fitted = Fitted(found, foretold)
+            predicted = None if held_out is None else predict_held_out(found, None, held_out)
+        fitted = Fitted(found, predicted)
         for name, content in (beside(fitted) if beside is not None else {}).items():
             write_json(folder / name, content)
     if progress is not None:

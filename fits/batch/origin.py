@@ -8,7 +8,7 @@ from typing import Any
 
 from fits._files import read_json
 from fits.batch.rows import Row, stored_row
-from fits.reports.directories import FIT
+from fits.reports.results import FIT
 
 ORIGIN = "origin.json"
 

@@ -86,7 +86,7 @@ class Row:
 def row_of(fitted: "Fitted", *, file: str, stack: str, directory: str, structure: str, seconds: float) -> Row:
     """The row of a fit."""
     fit, alone = fitted.fit, fitted.fit.without_discrepancy
-    seen = None if fitted.foretold is None else fitted.foretold.prediction.scores
+    seen = None if fitted.held_out is None else fitted.held_out.prediction.scores
     return Row(
         file=file,
         stack=stack,

@@ -26,13 +26,13 @@ class Searching:
     Args:
         library, layers, instrument, starts, seed: see `fits.search`.
         noise: relative, beside the file's sigma; None: 0.05 without one.
-        calibration: relative standard deviation of a common factor; 0: it is exact.
+        scale_sd: relative standard deviation of the global scale; 0: it is exact.
     """
 
     library: Library | None = None
     layers: int = 3
     noise: float | None = None
-    calibration: float = 0.0
+    scale_sd: float = 0.0
     instrument: Instrument | None = None
     starts: int = STARTS
     seed: int = 0
@@ -49,7 +49,7 @@ def search_into(
 
     budget: minutes, see `fits.search`.
     """
-    sd = given.calibration
+    sd = given.scale_sd
     # far enough for four standard deviations
     scale = Free(1.0, float(np.exp(-4.0 * sd)), float(np.exp(4.0 * sd)), LogNormal(1.0, sd)) if sd > 0.0 else None
     found = search(

@@ -14,7 +14,7 @@ from fits.batch.inputs import SEARCH, STACKS
 from fits.batch.origin import ORIGIN, Origin, fingerprint
 from fits.batch.rows import Row, row_of
 from fits.batch.searching import Searching, search_into
-from fits.data.reading import Reading
+from fits.data.reading import ReadOptions
 from fits.data.totals import Totals
 from fits.names import Objective
 from fits.problem.compilation import make_room
@@ -32,7 +32,7 @@ class Job:
     out: Path
     stacks: Mapping[str, ProblemFile]
     searching: Searching | None
-    reading: Reading
+    reading: ReadOptions
     objective: Objective | None
     starts: int
     seed: int
@@ -88,7 +88,7 @@ def _fitted(job: Job, task: Task) -> Row:
     began, directory = time.monotonic(), task.directory(job.out)
     if fingerprint(task.path.read_bytes()) != task.file:
         raise ValueError(f"{task.path}: was changed while others were fitted")
-    data, unseen = job.reading.parts(task.path)
+    data, held_out = job.reading.split(task.path)
     with named(directory.parent):
         directory.parent.mkdir(exist_ok=True)
     origin, structure = job.origin(task.file, task.stack), ""
@@ -121,7 +121,7 @@ def _fitted(job: Job, task: Task) -> Row:
             directory,
             job.stacks[task.stack],
             data,
-            unseen,
+            held_out,
             objective=job.objective,
             starts=job.starts,
             seed=job.seed,

@@ -5,8 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 
 from fits.cli.interrupts import hint
-from fits.cli.options import refuse_alone
-from fits.cli.reading import reading
+from fits.cli.options import read_options, refuse_alone
 from fits.cli.searches import searching
 from fits.cli.setting import use_jax
 from fits.progress import show_progress
@@ -22,10 +21,9 @@ def fit_many(arguments: Namespace) -> int:
     from fits.batch.page import SHOWN, overview, told
     from fits.problem.compilation import cores
     from fits.reports.tables import print_table
-    from fits.structure_search.searching import STARTS
 
     if not arguments.search:
-        only_searches = ("library", "layers", "instrument", "noise", "calibration")
+        only_searches = ("library", "noise", "scale_sd")
         refuse_alone(arguments, only_searches, "search: a stack file says it itself")
     out = Path(arguments.out)
     again = f"{out} keeps what was fitted; the same command again goes on with it"
@@ -36,13 +34,9 @@ def fit_many(arguments: Namespace) -> int:
             out,
             processes=cores() if arguments.processes is None else arguments.processes,
             client=arguments.scheduler,
-            search=searching(arguments, STARTS) if arguments.search else False,
-            **vars(reading(arguments)),
-            objective=arguments.objective,
+            search=searching(arguments) if arguments.search else False,
+            **vars(read_options(arguments)),
             starts=arguments.starts,
-            seed=arguments.seed,
-            solver=arguments.solver,
-            reports=not arguments.no_reports,
             force=arguments.force,
             progress=progress,
         )

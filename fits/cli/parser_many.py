@@ -5,12 +5,12 @@ from typing import Any
 
 from fits.cli.numbers import count
 from fits.cli.options import (
-    add_fitting,
     add_force,
     add_hold_out,
-    add_only,
     add_reading,
     add_searching,
+    add_select,
+    add_starts,
     command,
 )
 
@@ -35,12 +35,9 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
         metavar="ADDRESS",
         help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",
     )
-    parser.add_argument(
-        "--no-reports", action="store_true", help="leave out the report of each fit, `layerjax report DIR` writes it"
-    )
-    add_fitting(parser)
+    add_starts(parser)
     add_reading(parser)
-    add_only(parser, "fit")
+    add_select(parser, "fit")
     add_hold_out(parser)
     group = parser.add_argument_group("looking for stacks")
     group.add_argument("--search", action="store_true", help="look for the stack behind each file as well")

@@ -3,10 +3,9 @@
 import sys
 from argparse import Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fits.cli.interrupts import hint
-from fits.cli.options import LAYERS
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.progress import show_progress
@@ -25,7 +24,7 @@ def search(data: Measurements, arguments: Namespace) -> int:
     from fits.structure_search import telling
 
     directory = Path(arguments.out)
-    given = searching(arguments, arguments.starts)
+    given = searching(arguments)
     again = f"{directory} keeps what was fitted; the same command again goes on with it"
     with show_progress() as progress, hint(again):
         found = search_into(directory, data, given, progress, arguments.budget)
@@ -36,18 +35,18 @@ def search(data: Measurements, arguments: Namespace) -> int:
     return DONE
 
 
-def searching(arguments: Namespace, starts: int) -> "Searching":
+def searching(arguments: Namespace) -> "Searching":
     """What the options of a search say."""
     from fits.batch.searching import Searching
     from fits.problem.stack_file import read_instrument
     from fits.structure_search.library import read_library
 
+    more: dict[str, Any] = {"layers": arguments.layers} if arguments.command == "search" else {}
+    if getattr(arguments, "instrument", None) is not None:
+        more["instrument"] = read_instrument(arguments.instrument)
     return Searching(
         library=None if arguments.library is None else read_library(arguments.library),
-        layers=LAYERS if arguments.layers is None else arguments.layers,
         noise=arguments.noise,
-        calibration=arguments.calibration or 0.0,
-        instrument=None if arguments.instrument is None else read_instrument(arguments.instrument),
-        starts=starts,
-        seed=arguments.seed,
+        scale_sd=arguments.scale_sd or 0.0,
+        **more,
     )

@@ -66,7 +66,7 @@ class Comparison:
     notes: tuple[str, ...]
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reports.notebook:comparison_fragment", self))
+        return str(shown_by("fits.reports.html:comparison_fragment", self))
 
 
 def compare(

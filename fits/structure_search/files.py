@@ -21,7 +21,6 @@ from fits.optimise.result import Fit
 from fits.prediction.cross_validation import CrossValidation
 from fits.prediction.evidence import Evidence
 from fits.reports.results import load_fit, save_fit
-from fits.reports.stored import stored_array, stored_number
 from fits.structure_search.library import Structure
 
 Floats = NDArray[np.float64]
@@ -41,7 +40,9 @@ class Groups(dict[str, tuple[Floats, bool]]):
         content = read_json(path) if path.is_file() else {}
         if content.get("of") == self._of:
             for name, one in content["groups"].items():
-                super().__setitem__(name, (stored_array(one["log_density"], *one["shape"]), bool(one["converged"])))
+                super().__setitem__(
+                    name, (np.array(one["log_density"], float).reshape(one["shape"]), bool(one["converged"]))
+                )
 
     def __setitem__(self, name: str, found: tuple[Floats, bool]) -> None:
         super().__setitem__(name, found)
@@ -106,10 +107,10 @@ class Kept:
             left = CrossValidation(
                 groups=tuple(groups),
                 rows=tuple(np.array(rows, np.int64) for rows in groups.values()),
-                log_density=stored_array(content["log_density"], *content["shape"]),
+                log_density=np.array(content["log_density"], float).reshape(content["shape"]),
                 converged=bool(content["converged"]),
             )
-            return left, Evidence(*(stored_number(content["evidence"][part]) for part in ("log", "error", "shape")))
+            return left, Evidence(*(float(content["evidence"][part]) for part in ("log", "error", "shape")))
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: damaged: {error!r}") from None
 

@@ -140,7 +140,7 @@ def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: li
         assert contents(folder / "out") == before
 
     refused(r"out/paint.csv/coat: holds a fit of other settings \(starts 2, not 3\) \(--force", starts=3)
-    refused(r"other settings \(mask_grazing default, not 60.0\)", mask_grazing=60.0)
+    refused(r"other settings \(max_polar_angle default, not 60.0\)", max_polar_angle=60.0)
     (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
     refused("out/paint.csv/bare: holds a fit of another stack of this name")
     del counted[:]
@@ -169,13 +169,13 @@ def test_a_damaged_result_costs_itself_alone(folder: Path, counted: list[str]) -
 
 @pytest.mark.slow
 def test_readings_that_are_held_out_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fits.reports.html import foretell
-    from fits.reports.stored import held_out_of
+    from fits.reports.html import predict_held_out
+    from fits.reports.results import load_held_out
 
     def report(folder: Path, name: str, fit: fits.Fit) -> object:
-        unseen = held_out_of(folder)
+        unseen = load_held_out(folder)
         assert unseen is not None
-        return foretell(fit, None, unseen)
+        return predict_held_out(fit, None, unseen)
 
     monkeypatch.setattr("fits.batch.fitting.write_report", report)
     found = fits.fit_files(["scans/coated.csv"], STACKS, "out", hold_out=["incidence=50"], **FEW)

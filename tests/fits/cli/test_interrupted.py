@@ -21,9 +21,8 @@ from fits.optimise.result import Fit
 from fits.optimise.starts_file import StartsFile
 from fits.problem.noise import Noise
 from fits.problem.problem import Problem
-from fits.reports.directories import reserved
 from fits.reports.plots.data import data_picture
-from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior
+from fits.reports.results import load_fit, load_posterior, reserved, save_fit, save_posterior
 from fits.sampling.chain import FileChain
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import identity_of, load, sample
@@ -32,7 +31,7 @@ from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT
 
 MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
-BOUNDED = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "12", "--solver", "bounded"]
+BOUNDED = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "12"]
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

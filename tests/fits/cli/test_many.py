@@ -22,12 +22,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "scans" / "coated.csv").unlink()
-    assert main([*MANY, "--mask-grazing", "80"]) == 1  # one file is broken
+    assert main([*MANY, "--max-polar-angle", "80"]) == 1  # one file is broken
     output = capsys.readouterr()
     for words in ("broken.csv", "FAILED", "paint.csv", "1 of 2 fits are there", "out/table.csv", "out/report.html"):
         assert words in output.out
     assert "layerjax: fits 2/2" in output.err
-    fit = ["fit", "scans/paint.csv", "--stack", "bare.toml", "--out", "alone", "--starts", "2", "--mask-grazing", "80"]
+    fit = [
+        "fit",
+        "scans/paint.csv",
+        "--stack",
+        "bare.toml",
+        "--out",
+        "alone",
+        "--starts",
+        "2",
+        "--max-polar-angle",
+        "80",
+    ]
     assert main(fit) == 0
     own = {path.name for path in (folder / "out" / "paint.csv" / "bare").iterdir()}
     assert own == {path.name for path in (folder / "alone").iterdir()} | {"origin.json"}
@@ -39,12 +50,12 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
 
     (folder / "scans" / "broken.csv").unlink()
     capsys.readouterr()
-    assert main([*MANY, "--mask-grazing", "80"]) == 0  # nothing is left to do
+    assert main([*MANY, "--max-polar-angle", "80"]) == 0  # nothing is left to do
     assert "1 of 1 fits are there, 1 of them converged" in capsys.readouterr().out
     with open("out/table.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["base.albedo"]) == pytest.approx(load_fit("alone").values["base.albedo"])
-    assert "starts 2, not 3" in refused([*MANY, "--mask-grazing", "80", "--starts", "3"], capsys, folder)
+    assert "starts 2, not 3" in refused([*MANY, "--max-polar-angle", "80", "--starts", "3"], capsys, folder)
 
 
 @pytest.mark.parametrize(
@@ -53,16 +64,12 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
         (["nowhere", "--stacks", "bare.toml"], "nowhere: no such file or folder"),
         (["scans", "--stacks", "nowhere.toml"], "nowhere.toml: no such file"),
         (["scans"], "no stack is given, nor a search asked for"),
-        (["scans", "--search", "--objective", "cube_root"], "objective is 'cube_root' and no stack is given"),
-        (["scans", "--search", "--solver", "bounded"], "solver is 'bounded' and no stack is given"),
         (["scans/broken.csv", "--stacks", "bare.toml"], "'twenty'"),
         (["scans", "scans", "--stacks", "bare.toml"], "results go by the file's name"),
-        (["scans", "--stacks", "bare.toml", "--only", "everything"], "'everything' is no selection"),
-        (["scans", "--stacks", "bare.toml", "--strata", "flux"], "--strata is given without --bins"),
+        (["scans", "--stacks", "bare.toml", "--select", "everything"], "'everything' is no selection"),
+        (["scans", "--stacks", "bare.toml", "--read", "strata=flux"], "strata is given without a number of bins"),
         (["scans", "--stacks", "bare.toml", "--noise", "0.1"], "--noise is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--calibration", "0"], "--calibration is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--layers", "2"], "--layers is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--objective", "cube_root", "--hold-out", "incidence=50"], "--hold-out"),
+        (["scans", "--stacks", "bare.toml", "--scale-sd", "0"], "--scale-sd is given without --search"),
     ],
 )
 def test_bad_input_is_one_line(

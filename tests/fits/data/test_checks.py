@@ -9,7 +9,7 @@ import pytest
 import fits
 from fits.data.checks import energies, peaks, reciprocity, repeats, sides, symmetry
 from fits.data.measurements import Measurements
-from fits.reports.data_statements import data_statements
+from fits.reports.data_summary import data_statements
 
 SHIPPED = Path(__file__).parents[3] / "examples" / "arizona_black_coatings"
 ANGLES = [10.0, 30.0, 50.0, 70.0]
