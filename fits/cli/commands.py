@@ -14,6 +14,7 @@ import numpy as np
 from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
+from fits.cli.many import search as search
 from fits.cli.map_reports import report_map
 from fits.cli.maps import fit_map as fit_map
 from fits.cli.materials import export as export
@@ -42,7 +43,7 @@ DONE, DOUBTFUL = 0, 1
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     use_jax()
-    from fits.batch.fitting import fit_into
+    from fits.batch.fit_file import fit_into
     from fits.problem.stack_file import read_problem
     from fits.reports import results, tables, verdicts
 
@@ -240,16 +241,6 @@ def _result(directory: Path) -> "Fit | Posterior":
 
     posterior = results.load_posterior(directory)
     return posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
-
-
-def search(arguments: Namespace) -> int:
-    """Search for the stack behind the data among those of a library."""
-    from fits.cli.searches import search as run_search
-
-    data = read_options(arguments).masked(arguments.data)
-    if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
-        raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
-    return run_search(data, arguments)
 
 
 def info(arguments: Namespace) -> int:

@@ -208,7 +208,7 @@ class _Run:
     def _start(self, number: Array, at: Array) -> tuple[_Place, Known]:
         unit = self.units[self.which[at]]
         own = model_of(self.model, self._row(at))
-        sigma = own.near_sigma(self.model.box.from_unit(unit))
+        sigma = own.initial_sigma(self.model.box.from_unit(unit))
         rough = self.fresh if self.levels else jnp.asarray(False)
         like = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
         nothing = Known(like[0], like)

@@ -17,7 +17,7 @@ from fits.problem.problem import Problem
 from fits.progress import Progress
 
 ENOUGH_OF_PEAK = 1e-3
-"""Numerical error of readings, in units of the largest, that no fit needs to fall below."""
+"""Numerical error of measurements, in units of the largest, that no fit needs to fall below."""
 
 NO_BETTER = 0.3
 """Of an error: a ring more that leaves as much of it is not worth its rays; of a lobe it leaves a fifth or less."""
@@ -36,7 +36,7 @@ class Needed(NamedTuple):
 
 
 def has_rays(problem: Problem) -> bool:
-    """Whether readings are means over cones."""
+    """Whether measurements are means over cones."""
     return problem.model.optics is not None and problem.model.optics.row is not None
 
 

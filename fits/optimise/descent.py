@@ -14,8 +14,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.optimise.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
-from fits.problem.base import Posed
 from fits.problem.model import Model
+from fits.problem.problem import FittingProblem
 
 PROMISE = 1e-8
 """A likelihood fit has converged when a full step promises less than this in the log-posterior: 1e-4 standard
@@ -94,7 +94,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
             jnp.arange(2.0),
         )
     if likelihood and model.varying:
-        held = model.near_sigma(model.box.from_unit(start))
+        held = model.initial_sigma(model.box.from_unit(start))
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
     _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
@@ -108,12 +108,12 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
     )
 
 
-def descent(problem: Posed, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
+def descent(problem: FittingProblem, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
     found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(promise))
     return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
 
 
-def here(problem: Posed, unit: Floats) -> Descent:
+def here(problem: FittingProblem, unit: Floats) -> Descent:
     """What is known at a point (P,) of the unit box; its vector is this point."""
     return descent(problem, unit, False, 1)

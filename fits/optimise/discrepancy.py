@@ -1,7 +1,7 @@
-"""Whether a fit counts errors of the model that neighbouring readings share, where that is left to the residuals.
+"""Whether a fit needs a model discrepancy, where that is left to the residuals.
 
-The rule: the stack is fitted with noise that readings do not share; where residuals of neighbours along the scans are
-correlated by more than `LEAST`, and by more than `CLEAR` standard errors, it is fitted again with errors that they do.
+The rule: the stack is fitted with independent noise; where residuals of neighbours along the scans are correlated by
+more than `LEAST`, and by more than `CLEAR` standard errors, it is fitted again with errors that they do.
 """
 
 import math
@@ -14,8 +14,7 @@ from fits.data.neighbours import alike, neighbours
 from fits.data.totals import Totals
 from fits.optimise.multi_start import start_points, unit_of
 from fits.optimise.result import Fit, WithoutDiscrepancy
-from fits.problem.base import Posed
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 
 LEAST, CLEAR = 0.2, 3.0
 
@@ -51,18 +50,18 @@ def needs_discrepancy(found: WithoutDiscrepancy) -> bool:
 
 
 def datasets_with_discrepancy(fit: Fit) -> dict[str, WithoutDiscrepancy]:
-    """The measurements of which errors are to be counted that readings share, by the rule, as fitted without."""
+    """The data sets that need a model discrepancy by the rule above, as fitted without."""
     problems = fit.problem.problems.items()
     found = {name: without_discrepancy(fit.part(name)) for name, problem in problems if undecided(problem)}
     return {name: one for name, one in found.items() if needs_discrepancy(one)}
 
 
 def with_discrepancy(problem: Problem) -> Problem:
-    """The problem with errors that readings share."""
+    """The problem with model discrepancy."""
     return replace(problem, noise=replace(problem.noise, discrepancy=True))
 
 
-def start_points_with_discrepancy(problem: Posed, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
+def start_points_with_discrepancy(problem: FittingProblem, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
     """Where to start from, (K, P) in the unit box of a problem with shared errors, after a fit without: its minima, and
     some of as many starts as it had.
     """

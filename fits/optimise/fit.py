@@ -22,19 +22,18 @@ from fits.optimise.discrepancy import (
     without_discrepancy,
 )
 from fits.optimise.identifiability import OPEN_BEYOND
-from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, unit_of
+from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, starts_store, unit_of
 from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
 from fits.optimise.refinement import Accuracy, refined
 from fits.optimise.resolution import resolutions
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
 from fits.optimise.uncertainty import Uncertainty
-from fits.problem.base import Posed
 from fits.problem.instrument import Instrument
 from fits.problem.joint import Joint
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, silent
 
 Floats = NDArray[np.float64]
@@ -90,7 +89,7 @@ def fit(
         for name, given in beside.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
-        problem: Posed = stack
+        problem: FittingProblem = stack
     elif data is None:
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
@@ -99,7 +98,7 @@ def fit(
 
 
 def fit_problem(
-    problem: Posed,
+    problem: FittingProblem,
     *,
     starts: int = 32,
     seed: int = 0,
@@ -141,7 +140,7 @@ def fit_problem(
 
 
 def fit_again(
-    problem: Posed,
+    problem: FittingProblem,
     found: Fit,
     *,
     starts: int = 32,
@@ -151,7 +150,7 @@ def fit_again(
     checkpoint: str | Path | None = None,
     refine: bool = True,
 ) -> Fit:
-    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
+    """The fit of a problem with model discrepancy, after one without; arguments as of `fit_problem`."""
     without = datasets_with_discrepancy(found) or {
         name: without_discrepancy(found.part(name)) for name in problem.problems
     }
@@ -179,7 +178,7 @@ def again(checkpoint: str | Path) -> Path:
 
 
 def _found(
-    problem: Posed,
+    problem: FittingProblem,
     places: Floats,
     solver: Solver,
     progress: Progress,
@@ -241,19 +240,17 @@ def _fit_of(
 
 
 def _ends(
-    problem: Posed, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
+    problem: FittingProblem, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
 ) -> list[End]:
     """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
     if checkpoint is None:
         return run_starts(problem, points, solver, progress)
-    from fits.optimise.starts_file import StartsFile
-
-    with StartsFile(checkpoint, problem, points, solver) as kept:
-        return run_starts(problem, points, solver, progress, kept)
+    with starts_store(checkpoint, problem, points, solver) as store:
+        return run_starts(problem, points, solver, progress, store)
 
 
 def _minima(
-    problem: Posed, ends: list[End], best: int, found: Uncertainty, same_cost: float
+    problem: FittingProblem, ends: list[End], best: int, found: Uncertainty, same_cost: float
 ) -> tuple[tuple[Minimum, ...], dict[str, int]]:
     """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
     cost = np.array([end.cost for end in ends])

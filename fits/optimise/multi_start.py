@@ -5,17 +5,26 @@ how good its end is.
 """
 
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import qmc
 
+import layerjax
 from fits.optimise.bounded import TOLERANCE, cost_and_gradient, minimise_in_box
 from fits.optimise.descent import PROMISE, ROUGHLY, descent, here
-from fits.optimise.starts_file import End, Floats, Solver, StartsFile
-from fits.problem.base import Posed
 from fits.problem.compilation import cores
+from fits.problem.problem import FittingProblem
 from fits.progress import Progress
+from fits.store import Store, fingerprint
+
+Solver = Literal["least_squares", "bounded"]
+Floats = NDArray[np.float64]
 
 MOST_STEPS = 200
 MOST_ROUNDS = 20
@@ -29,7 +38,17 @@ WORTH_OF_COST = 1e-6
 """With a named objective such a start goes on while a round gains this share of the cost."""
 
 
-def start_points(problem: Posed, starts: int, seed: int) -> Floats:
+class End(NamedTuple):
+    """Where one start ended: physical vector (P,), cost, steps, whether it converged, whether it ran out of steps."""
+
+    vector: Floats
+    cost: float
+    steps: int
+    converged: bool
+    unfinished: bool
+
+
+def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
     """The problem's own start and `starts - 1` scrambled Sobol points, (starts, P), in the unit box."""
     own = np.asarray(problem.model.box.to_unit(jnp.asarray(problem.start)), float)[None]
     sequence = qmc.Sobol(own.shape[1], scramble=True, rng=np.random.default_rng(seed))
@@ -37,21 +56,21 @@ def start_points(problem: Posed, starts: int, seed: int) -> Floats:
 
 
 def run_starts(
-    problem: Posed, points: Floats, solver: Solver, progress: Progress, kept: StartsFile | None = None
+    problem: FittingProblem, points: Floats, solver: Solver, progress: Progress, store: Store | None = None
 ) -> list[End]:
-    """Where each of the points (starts, P) in the unit box ends, roughly; what a file has `kept` is not run again."""
+    """Where each of the points (starts, P) in the unit box ends, roughly; those that are in the store are not run."""
     solve = rough_end if solver == "least_squares" else bounded_end
     ends: dict[int, End] = {}
 
     def ended(index: int, end: End, new: bool = True) -> None:
         ends[index] = end
-        if kept is not None and new:
-            kept.add(index, end)
+        if store is not None and new:
+            store.put(f"start {index}", end._asdict())
         progress("fit", len(ends), len(points), f"best cost {min(end.cost for end in ends.values()):.6g}")
 
     for index in range(len(points)):
-        if kept is not None and index in kept.ends:
-            ended(index, kept.ends[index], new=False)
+        if store is not None and (stored := store.get(f"start {index}")) is not None:
+            ended(index, End(**stored), new=False)
     left = [index for index in range(len(points)) if index not in ends]
     for index in left[:1]:  # alone: it compiles the program, which keeps one core busy
         ended(index, solve(problem, points[index]))
@@ -65,7 +84,25 @@ def run_starts(
     return [ends[index] for index in range(len(points))]
 
 
-def race(problem: Posed, points: Floats) -> list[End]:
+def starts_store(
+    checkpoint: str | Path, problem: FittingProblem, points: Floats, solver: Solver
+) -> AbstractContextManager[Store]:
+    """The store of the starts of a fit; starts of another fit that are there are thrown away."""
+    arrays, static = problem.split_model
+    whose = fingerprint(
+        version=layerjax.__version__,
+        solver=solver,
+        starts=points,
+        parameters=problem.names,
+        model=static.tree,
+        data=jax.tree.leaves(arrays),
+        # a transport of the user's own may have changed its body under the same name
+        predicted=here(problem, points[0]).predicted,
+    )
+    return Store.open(checkpoint, whose, replace=True)
+
+
+def race(problem: FittingProblem, points: Floats) -> list[End]:
     """Where the points (starts, P) in the unit box end if only those go on that are lowest after a few steps."""
 
     def early(point: Floats) -> End:
@@ -87,7 +124,7 @@ def race(problem: Posed, points: Floats) -> list[End]:
     return ends
 
 
-def least_squares_end(problem: Posed, point: Floats, fresh: bool = True, promise: float = PROMISE) -> End:
+def least_squares_end(problem: FittingProblem, point: Floats, fresh: bool = True, promise: float = PROMISE) -> End:
     """Levenberg-Marquardt from a point (P,) in the unit box. Not `fresh`: near a minimum, with sigma free at once."""
     steps = 0
     end = End(point, np.inf, 0, False, True)
@@ -103,24 +140,24 @@ def least_squares_end(problem: Posed, point: Floats, fresh: bool = True, promise
     return end
 
 
-def rough_end(problem: Posed, point: Floats, fresh: bool = True) -> End:
+def rough_end(problem: FittingProblem, point: Floats, fresh: bool = True) -> End:
     """As `least_squares_end`, so near a minimum that it can be told from others."""
     return least_squares_end(problem, point, fresh, ROUGHLY)
 
 
-def unit_of(problem: Posed, vector: Floats) -> Floats:
+def unit_of(problem: FittingProblem, vector: Floats) -> Floats:
     """The point of the unit box, (P,), where a physical vector (P,) lies."""
     return np.asarray(problem.model.box.to_unit(jnp.asarray(vector)), float)
 
 
-def bounded_end(problem: Posed, point: Floats, fresh: bool = True) -> End:
+def bounded_end(problem: FittingProblem, point: Floats, fresh: bool = True) -> End:
     """L-BFGS-B from a point (P,) in the unit box."""
     unit, cost, steps, converged = minimise_in_box(lambda s: problem.call(cost_and_gradient, s), point)
     vector = np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
     return End(vector, cost if np.isfinite(cost) else np.inf, steps, converged, False)
 
 
-def polished(problem: Posed, end: End) -> tuple[End, bool]:
+def polished(problem: FittingProblem, end: End) -> tuple[End, bool]:
     """The end, or what L-BFGS-B and then Levenberg-Marquardt make of it if that is lower; and whether it is.
 
     A check on what lies on a bound or has not converged: the two share nothing but the objective. An end that neither

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from fits.optimise.descent import PROMISE, ROUGHLY, here
 from fits.optimise.multi_start import WORTH_OF_COST, End, Solver, least_squares_end, polished, unit_of
 from fits.optimise.uncertainty import Uncertainty, uncertainty
-from fits.problem.base import Posed
+from fits.problem.model import Density
+from fits.problem.problem import FittingProblem
 
 EQUALLY_WELL = 2.0
 """Minima explain the data equally well if their log-posteriors differ by less than this, times the reduced chi-square
@@ -24,7 +25,7 @@ class Optimum(NamedTuple):
     differences in cost count in, see `EQUALLY_WELL`.
     """
 
-    problem: Posed
+    problem: FittingProblem
     ends: list[End]
     best: int
     found: Uncertainty
@@ -39,7 +40,7 @@ class Optimum(NamedTuple):
 
 
 def optimum(
-    problem: Posed, ends: list[End], solver: Solver, *, check: bool = True, promise: float = PROMISE
+    problem: FittingProblem, ends: list[End], solver: Solver, *, check: bool = True, promise: float = PROMISE
 ) -> Optimum:
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
@@ -64,13 +65,13 @@ def optimum(
     return Optimum(problem, ends, best, found, improved, predicted, _excess(problem, lowest, predicted))
 
 
-def _followed(problem: Posed, end: End, promise: float) -> End:
+def _followed(problem: FittingProblem, end: End, promise: float) -> End:
     """The end, closer to its minimum."""
     closer = least_squares_end(problem, unit_of(problem, end.vector), False, promise)
     return closer._replace(steps=end.steps + closer.steps) if closer.cost <= end.cost else end
 
 
-def _off_the_plateau(problem: Posed, end: End, found: Uncertainty, promise: float) -> tuple[End, bool]:
+def _off_the_plateau(problem: FittingProblem, end: End, found: Uncertainty, promise: float) -> tuple[End, bool]:
     """The end, or where it goes on to if what has no influence there, or is at a bound, begins anew; and whether it is.
 
     No step leads off a plateau: every start may end on one though another minimum is far lower.
@@ -82,16 +83,16 @@ def _off_the_plateau(problem: Posed, end: End, found: Uncertainty, promise: floa
     return (other._replace(steps=end.steps + other.steps) if lower else end), lower
 
 
-def _on_bounds(problem: Posed, vector: Floats, held: NDArray[np.bool_]) -> Floats:
+def _on_bounds(problem: FittingProblem, vector: Floats, held: NDArray[np.bool_]) -> Floats:
     """Exact bounds where the solver ended on them."""
     nearest = np.where(vector - problem.low < problem.high - vector, problem.low, problem.high)
     return np.where(held, nearest, np.clip(vector, problem.low, problem.high))
 
 
-def _excess(problem: Posed, lowest: End, predicted: Floats) -> float:
+def _excess(problem: FittingProblem, lowest: End, predicted: Floats) -> float:
     """The reduced chi-square where it is above 1; of a named objective, the residual variance."""
     freedom = problem.count - len(lowest.vector)
     if problem.objective != "likelihood":
         return 2.0 * lowest.cost / max(freedom, 1)
-    chi_square = float(problem.call("chi_square_at", lowest.vector, predicted))
+    chi_square = float(problem.call(Density.chi_square_at, lowest.vector, predicted))
     return max(1.0, chi_square / freedom if freedom > 0 else 1.0)

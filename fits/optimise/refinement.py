@@ -15,8 +15,8 @@ from fits.optimise import apertures
 from fits.optimise.multi_start import End, Solver, bounded_end, rough_end, unit_of
 from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
 from fits.optimise.resolution import ENOUGH, Resolutions, Values
-from fits.problem.base import Posed
-from fits.problem.problem import Problem
+from fits.problem.model import Density
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
 
 ALIKE = 0.01
@@ -139,7 +139,7 @@ def _of_both(parts: Sequence[Accuracy]) -> Accuracy:
     return Accuracy(resolution, error, f"numerical error of the model: {words}")
 
 
-def _fitted_again(at: Optimum, problem: Posed, solver: Solver, words: str, progress: Progress) -> list[End]:
+def _fitted_again(at: Optimum, problem: FittingProblem, solver: Solver, words: str, progress: Progress) -> list[End]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
     solve = rough_end if solver == "least_squares" else bounded_end
     groups = _alike(at)
@@ -183,7 +183,7 @@ def _alike(at: Optimum) -> list[list[int]]:
     return groups
 
 
-def _cost(problem: Posed, end: End) -> float:
+def _cost(problem: FittingProblem, end: End) -> float:
     """What the end of another resolution costs at the problem's own; infinite where that is not finite."""
-    cost = float(problem.call("cost_at", end.vector, problem.predict(end.vector)))
+    cost = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
     return cost if np.isfinite(cost) else np.inf

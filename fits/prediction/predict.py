@@ -160,7 +160,7 @@ def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats
         return values
     _, floor = (np.asarray(part, float) for part in fit.problem.call(_levels, fit.vector[None]))
     softness = _softness(fit, np.hypot(_own_sigma(fit, values[None], None), floor))
-    lack = np.asarray(fit.problem.call("lack_at", fit.vector, fit.predicted, places(wi, wo))[0])
+    lack = np.asarray(fit.problem.call(Model.discrepancy_at, fit.vector, fit.predicted, places(wi, wo))[0])
     return softness * np.sinh(np.asarray(logarithm(values, softness)) + lack)
 
 
@@ -206,4 +206,4 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
 
 
 def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
-    return jax.lax.map(lambda vector: model.lack_at(vector, model.predict(vector), where), vectors)
+    return jax.lax.map(lambda vector: model.discrepancy_at(vector, model.predict(vector), where), vectors)

@@ -38,7 +38,7 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     assert process is not None
     assert at is not None
     white = generator.standard_normal((1, len(process.where)))
-    lack = np.asarray(process.drawn(white, at))
+    lack = np.asarray(process.sample(white, at))
     values = exact * (np.exp(lack) + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
 

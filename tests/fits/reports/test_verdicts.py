@@ -16,6 +16,7 @@ from fits.data.scans import signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit
+from fits.problem.model import Density
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -46,7 +47,7 @@ def simulated(seed: int) -> Problem:
     model = problem_of(exact).model
     process, at = model.process, model.build(TRUTH).correlation
     assert process is not None
-    discrepancy = np.asarray(process.drawn(generator.standard_normal((1, len(process.where))), at))
+    discrepancy = np.asarray(process.sample(generator.standard_normal((1, len(process.where))), at))
     return problem_of(exact * np.exp(discrepancy) * (1.0 + 0.02 * generator.standard_normal(exact.shape)))
 
 
@@ -185,7 +186,9 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert match is not None
     assert float(match[1]) == pytest.approx(100.0 * np.median(off.predicted / values - 1.0), abs=1.0)
     assert float(match[2]) == pytest.approx(2.0)
-    without = np.sum(np.square(off.problem.call("offsets_at", off.vector, off.predicted))) / off.degrees_of_freedom
+    without = (
+        np.sum(np.square(off.problem.call(Density.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
+    )
     assert f"with the discrepancy term, {without:.4g} without" in verdicts.summary(off)[-1]
     assert not assess(replace(fitted, problem=simulated(0), vector=TRUTH)).described  # 10 % beside a noise of 2 %
     right = replace(fitted, problem=replace(fitted.problem, noise=WIDE), unidentified=())
