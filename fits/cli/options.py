@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 DATA = "measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
 MATERIAL = "result directory of `layerjax fit`, a stack (free parameters at their start), or a material of the gallery"
-SELECTIONS = "incidence=10,50  plane=0  angle=-60:60  share=0.2  channel=red"
+SELECTIONS = "incidence=10,50; plane=0; angle=-60:60; share=0.2; channel=red"
 
 
 def command(commands: "argparse._SubParsersAction[Any]", name: str, what: str, example: str) -> argparse.ArgumentParser:
@@ -27,8 +27,8 @@ def add_read(parser: "argparse._ActionsContainer") -> None:
         nargs="+",
         default=(),
         metavar="OPTION",
-        help="how the file is read (default: as it says): format=merl  quantity=brdf, brdf_cos or reflectance_factor  "
-        "bins=5000 or all, strata=flux of a MERL or RGL table  wavelengths=600,620 (nm), corrected=yes of an .rxt file",
+        help="options of the reader: format=merl; quantity=brdf, brdf_cos or reflectance_factor; bins=5000 or all, "
+        "strata=flux (MERL, RGL); wavelengths=600,620 in nm, corrected=yes or no (.rxt); default: as the file says",
     )
 
 

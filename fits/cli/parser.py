@@ -122,7 +122,7 @@ def _sample(commands: Commands) -> None:
     parser = command(
         commands,
         "sample",
-        "sample the posterior of a fit; resumes its chain when it is run again",
+        "sample the posterior of a fit; run again, it resumes the chain",
         "layerjax sample result --ess 2000",
     )
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
@@ -130,10 +130,12 @@ def _sample(commands: Commands) -> None:
         "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
     )
     parser.add_argument(
-        "--walkers", type=count, metavar="N", help="even (default: the chain's, or 32; 4 chains of nuts)"
+        "--walkers", type=count, metavar="N", help="even number (default: the chain's, or 32; 4 chains of nuts)"
     )
-    parser.add_argument("--ess", type=count, metavar="N", help="effective sample size of every parameter")
-    parser.add_argument("--max-steps", type=count, default=20_000, metavar="N", help="(default: %(default)s)")
+    parser.add_argument("--ess", type=count, metavar="N", help="least effective sample size of all parameters")
+    parser.add_argument(
+        "--max-steps", type=count, default=20_000, metavar="N", help="most steps (default: %(default)s)"
+    )
     parser.add_argument(
         "--allow-unconverged", action="store_true", help="report estimates from a chain that has not converged, too"
     )
@@ -277,7 +279,11 @@ def _export(commands: Commands) -> None:
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     parser.add_argument(
-        "--wavelengths", type=length, nargs="+", metavar="NM", help="of the channels, for a spectral rgl file"
+        "--wavelengths",
+        type=length,
+        nargs="+",
+        metavar="NM",
+        help="wavelengths of the channels, for a spectral rgl file",
     )
     add_force(parser)
 

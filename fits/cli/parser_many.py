@@ -1,4 +1,4 @@
-"""What may be asked of many files at once."""
+"""Options of the command for many files."""
 
 import argparse
 from typing import Any
@@ -26,20 +26,20 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
     parser.add_argument("data", nargs="+", metavar="FOLDER|FILE", help="measurements, see docs/formats.md")
     parser.add_argument("--stacks", nargs="+", default=(), metavar="TOML", help="stacks, with their free parameters")
     parser.add_argument(
-        "--out", required=True, metavar="DIR", help="directory to write, or to go on with: DIR/FILE/STACK is a result"
+        "--out", required=True, metavar="DIR", help="directory to write, or to resume: DIR/FILE/STACK is a result"
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")
+    where.add_argument("--processes", type=count, metavar="N", help="worker processes (default: one a core)")
     where.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",
+        help="dask.distributed cluster that sees the files, such as tcp://...:8786",
     )
     add_starts(parser)
     add_reading(parser)
     add_select(parser, "fit")
     add_hold_out(parser)
-    group = parser.add_argument_group("looking for stacks")
-    group.add_argument("--search", action="store_true", help="look for the stack behind each file as well")
+    group = parser.add_argument_group("searching for stacks")
+    group.add_argument("--search", action="store_true", help="search for the stack behind each file as well")
     add_searching(group)
-    add_force(parser, "fit again what is there of another stack, other settings or another content of the file")
+    add_force(parser, "fit again where stack, settings or the content of the file have changed")
