@@ -4,15 +4,7 @@ import argparse
 from typing import Any
 
 from fits.cli.numbers import count
-from fits.cli.options import (
-    add_force,
-    add_hold_out,
-    add_reading,
-    add_searching,
-    add_select,
-    add_starts,
-    command,
-)
+from fits.cli.options import add_force, add_hold_out, add_reading, add_searching, add_select, add_starts, command
 
 
 def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
@@ -31,9 +23,7 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--processes", type=count, metavar="N", help="worker processes (default: one a core)")
     where.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="dask.distributed cluster that sees the files, such as tcp://...:8786",
+        "--scheduler", metavar="ADDRESS", help="dask.distributed cluster that sees the files, such as tcp://...:8786"
     )
     add_starts(parser)
     add_reading(parser)

@@ -290,12 +290,7 @@ def incidence_table(structure: ResidualStructure) -> Table:
     )
 
 
-_ORDERS = {
-    "left_out": "cross-validated elpd",
-    "loo": "leave-one-out",
-    "aic": "AIC",
-    "chi_square": "chi-square",
-}
+_ORDERS = {"left_out": "cross-validated elpd", "loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}
 
 
 def comparison_table(comparison: "Comparison") -> Table:

@@ -66,8 +66,8 @@ class Assessment:
         excess: chi-square above its expectation, in its own standard deviations.
         likelihood: whether the objective is one.
         noise_assumed: whether no noise was stated.
-        described: whether the stack alone comes as near to the data as the stated noise and `ReportOptions.misfit` ask.
-        misfit: factors within which half and 95 % of the data are of the stack alone; None if no value is above zero.
+        described: whether the stack without discrepancy is as near to the data as noise and options allow.
+        misfit: factors within which half and 95 % of the data are of that stack; None if no value is above zero.
         noise: median of the stated noise as a share of the value; NaN if none is above zero.
         discrepancy: fitted parameters of the model discrepancy, and the share of the residual sum of squares that it
             absorbs; None without one.
@@ -133,8 +133,12 @@ class Assessment:
 
     @property
     def identified(self) -> bool:
-        """Whether the data identify every parameter."""
-        return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.words.values())
+        """Whether the data identify every parameter of stack and scale; those of the noise are nuisance parameters."""
+        return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical(self.words).values())
+
+    def physical(self, words: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of parameters by name that are not of the noise."""
+        return {name: word for name, word in words.items() if not name.startswith("noise.")}
 
     @property
     def resolved(self) -> bool:
@@ -287,11 +291,13 @@ def errors(f: Assessment) -> Statement:
         return _say("The errors are scaled by the remaining scatter and are only indicative.", errors="indicative")
     if not f.described:
         words = "Values and standard errors hold only within this model, which does not describe the data."
-        return _say(words, errors="invalid", description="no")
+        if f.discrepancy is not None:
+            words = "The standard errors include the model discrepancy, and hold only if it accounts for the misfit."
+        return _say(words, errors="conditional", description="no")
     if f.alternatives:
         others = "Another local minimum" if f.alternatives == 1 else f"{f.alternatives} other local minima"
         words = f"{others} of the same model {'fits' if f.alternatives == 1 else 'fit'} equally well"
-        return _say(f"{words}: the standard errors are those of the best one alone, sampling covers all.", errors="one")
+        return _say(f"{words}: the standard errors are those of the best one only, sampling covers all.", errors="one")
     if f.error_factor != 1.0:
         parts = [f"{f.size:.2g} for the size of the {_residuals(f)}"] if f.size != 1.0 else []
         if f.correlated:
@@ -313,17 +319,20 @@ def errors(f: Assessment) -> Statement:
 
 def parameters(f: Assessment) -> Statement:
     """Third sentence of the verdict: which parameters the data do not identify, and why."""
+    words = f.physical(f.words)
     if f.identified:
-        return _say("The data identify every parameter.", parameters="all")
-    parts = [f"{not_identified(one)}{' (and more)' if f.unidentified[1:] else ''}" for one in f.unidentified[:1]]
+        every = "every parameter" if len(words) == len(f.words) else "every parameter of the stack"
+        return _say(f"The data identify {every}.", parameters="all")
+    directions = [one for one in f.unidentified if any(_weak(one, name) for name in words)]
+    parts = [f"{not_identified(one)}{' (and more)' if directions[1:] else ''}" for one in directions[:1]]
     for begins, what in (
         ("insensitive", "without effect on the data"),
         ("at a bound", "at a bound"),
         ("limited", "limited by the instrument"),
         ("prior-dominated", "prior-dominated"),
-        *(() if f.unidentified else (("unidentified", "unidentified"),)),
+        *(() if directions else (("unidentified", "unidentified"), ("weakly", "weakly identified"))),
     ):
-        names = [name for name, word in f.words.items() if word.startswith(begins)]
+        names = [name for name, word in words.items() if word.startswith(begins)]
         if names:
             parts.append(f"{listed(names)} {'is' if len(names) == 1 else 'are'} {what}")
     return _say(f"{'; '.join(parts)}.", parameters="not all")
@@ -331,11 +340,14 @@ def parameters(f: Assessment) -> Statement:
 
 def not_identified(direction: Direction) -> str:
     """What is not identified along a direction: the parameters with a large error along it."""
-    error = {name: direction.error_of(name) for name in direction.weights}
-    names = [name for name in error if error[name] > UNIDENTIFIED_BEYOND] or [max(error, key=lambda name: error[name])]
+    names = [name for name in direction.weights if _weak(direction, name)] or [next(iter(direction.weights))]
     if len(names) > 1:
         return f"{listed(names)} are not identified separately"
     return f"{names[0]} is {'unidentified' if direction.unconstrained else 'weakly identified'}"
+
+
+def _weak(direction: Direction, name: str) -> bool:
+    return direction.error_of(name) > UNIDENTIFIED_BEYOND
 
 
 def remarks(f: Assessment) -> list[Statement]:
@@ -415,7 +427,7 @@ def identification(f: Assessment) -> list[Statement]:
     limit, found = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range", []
     if f.insensitive:
         words = f"Insensitive: {', '.join(f.insensitive)}. The data do not depend on them."
-        found.append(_say(words, parameters="not all"))
+        found.append(_say(words))
     if f.unidentified:
         words = f"{len(f.unidentified)} of {len(f.words)} principal directions of parameter space have a standard error"
         found.append(_say(f"{words} above {limit}; there, priors dominate.", directions="not all"))
@@ -426,8 +438,7 @@ def identification(f: Assessment) -> list[Statement]:
         found.append(
             _say(
                 f"At a bound: {', '.join(f.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
-                "standard error; the other errors are conditional on them.",
-                parameters="not all",
+                "standard error; the other errors are conditional on them."
             )
         )
     return found

@@ -2,7 +2,7 @@
 
 In-plane data is drawn against the signed polar angle of the viewer, positive on the forward (mirror) side; out of
 plane, as a map of the viewer's hemisphere with forward to the right. Colours are those of Okabe and Ito, which most
-readers with a colour deficiency can tell apart.
+readers with a colour deficiency can distinguish.
 """
 
 import io
@@ -284,9 +284,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
         axes.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
         axes.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
         axes.set(
-            xlabel=label,
-            ylabel="density",
-            title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}",
+            xlabel=label, ylabel="density", title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}"
         )
         axes.legend(loc="upper right")
 

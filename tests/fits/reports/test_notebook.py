@@ -90,7 +90,7 @@ def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -
         == f"<Measurements: {len(coat_data)} readings, 10 of them masked, of value, from simulated data>"
     )
     assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"
-    assert repr(result).startswith(f"<Fit to 100 readings: ['a'] {result.vector[0]:.4g} ± ")
+    assert repr(result).startswith(f"<Fit to 100 measurements: ['a'] {result.vector[0]:.4g} ± ")
     assert repr(chain(result, True)) == "<Posterior of ['a'], ['b']: 500 steps of 8 walkers, converged>"
     for shown in (result, chain(result, False), coat_data):
         assert "\n" not in repr(shown)

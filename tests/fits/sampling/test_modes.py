@@ -118,7 +118,7 @@ def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
     assert len(fitted.alternatives) == 1
     lines, _, sound = verdicts.verdict(fitted)
     assert not sound
-    assert "standard errors are those of the best one alone" in lines[1]
+    assert "standard errors are those of the best one only" in lines[1]
     assert parameter_table(fitted).note == "Errors are those of the best minimum only."
     assert "the errors are of this minimum alone" in fitted.status
 
