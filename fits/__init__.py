@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from fits.maps.smoothing import Smoothness as Smoothness
     from fits.optimise.fit import fit as fit
     from fits.optimise.identifiability import Direction as Direction
+    from fits.optimise.options import FitOptions as FitOptions
     from fits.optimise.result import Fit as Fit
     from fits.prediction.average import Average as Average
     from fits.prediction.average import average as average
@@ -83,6 +84,7 @@ _HOMES = {
     "ExportReport": "exports.export",
     "export": "exports.export",
     "Fit": "optimise.result",
+    "FitOptions": "optimise.options",
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",

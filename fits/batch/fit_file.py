@@ -6,7 +6,7 @@ from typing import NamedTuple
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
 from fits.names import Objective
-from fits.optimise.fit import again
+from fits.optimise.fit import discrepancy_checkpoint
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.multi_start import Solver
 from fits.optimise.result import Fit
@@ -74,7 +74,7 @@ def fit_into(
         )
         text = given.text if objective == given.objective else None
         fitted = _written(directory, found, held_out, text, force, report, progress or silent)
-        for one in (kept, again(kept)):
+        for one in (kept, discrepancy_checkpoint(kept)):
             one.unlink(missing_ok=True)
     return fitted
 

@@ -22,9 +22,6 @@ from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
-ENOUGH = 0.1
-"""Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
-
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
 """The finest resolution of starts: what is finer costs more than it tells far away from the data."""
 

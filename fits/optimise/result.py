@@ -72,7 +72,7 @@ class Fit:
             `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
             that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
-        settings: starts, seed and solver.
+        settings: starts, seed, solver, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
@@ -100,7 +100,7 @@ class Fit:
     minima: tuple[Minimum, ...]
     alternatives: tuple[Minimum, ...]
     insensitive: tuple[str, ...] = ()
-    settings: Mapping[str, int | str] = field(default_factory=dict)
+    settings: Mapping[str, int | float | str] = field(default_factory=dict)
     start_outcomes: Mapping[str, int] = field(default_factory=dict)
     numerical_error: float | None = None
     resolution: str | None = None

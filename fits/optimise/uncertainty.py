@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.optimise.descent import here
+from fits.optimise.descent import evaluate_at
 from fits.optimise.identifiability import (
     UNKNOWN_BEYOND,
     Direction,
@@ -22,7 +22,7 @@ from fits.optimise.identifiability import (
 from fits.problem.problem import FittingProblem
 
 ON_BOUND = 1e-6  # of the box
-LEAST_PULL = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
+LEAST_GRADIENT = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     """
     box, count = problem.model.box, len(vector)
     unit = np.asarray(box.to_unit(jnp.asarray(vector)), float)
-    found = here(problem, unit)
+    found = evaluate_at(problem, unit)
     data_root, gradient = found.root, found.gradient
     if not (np.isfinite(found.cost) and np.all(np.isfinite(data_root))):
         nowhere = np.zeros(count, bool)
@@ -65,7 +65,7 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     scatter = 1.0  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
-    data_root, pull = data_root / np.sqrt(scatter), LEAST_PULL * scatter
+    data_root, pull = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
     idle = insensitive(data_root, problem.names)
     at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
     at_bound &= ~np.isin(problem.names, idle)
@@ -87,7 +87,7 @@ def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Fl
 
     And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
     """
-    found = here(problem, unit)
+    found = evaluate_at(problem, unit)
     return np.vstack([found.root, _prior_root(problem)]), found.gradient, float(found.cost)
 
 

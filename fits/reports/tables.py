@@ -186,7 +186,7 @@ def starts_in_words(fit: "Fit") -> str:
     """How many starts there were, and how they ended, in one line."""
     if not fit.start_outcomes:
         return "not recorded"
-    run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
+    run = ", ".join(f"{name} {fit.settings[name]}" for name in ("seed", "solver") if name in fit.settings)
     ended = ", ".join(f"{fit.start_outcomes[key]} {word}" for key, word in OUTCOMES.items() if fit.start_outcomes[key])
     count = sum(fit.start_outcomes.values())
     if fit.without_discrepancy is None:

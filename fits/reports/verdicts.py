@@ -15,9 +15,9 @@ import numpy as np
 
 from fits.data.checks import repeats
 from fits.data.totals import Totals
-from fits.optimise.identifiability import OPEN_BEYOND, UNIDENTIFIED_BEYOND, Direction
+from fits.optimise.identifiability import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
-from fits.optimise.resolution import ENOUGH
+from fits.optimise.options import FitOptions
 from fits.problem.model import Density
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.problem.parameters import is_free
@@ -75,6 +75,7 @@ class Assessment:
         limited: other parameters that these limit, with the roughness and the shift in standard errors.
         words: of each parameter, what the data say of it.
         numerical_error: of the model, in standard deviations of the data; None where there is no resolution.
+        numerical_limit: of it, see `FitOptions`.
     """
 
     options: ReportOptions
@@ -99,6 +100,7 @@ class Assessment:
     words: Mapping[str, str]
     alternatives: int
     numerical_error: float | None
+    numerical_limit: float
 
     @property
     def size(self) -> float:
@@ -143,7 +145,7 @@ class Assessment:
     @property
     def resolved(self) -> bool:
         """Whether the numerical error of the model is small beside that of the data."""
-        return self.numerical_error is None or self.numerical_error <= ENOUGH
+        return self.numerical_error is None or self.numerical_error <= self.numerical_limit
 
 
 def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
@@ -186,6 +188,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
         words=identifiability(fit, options),
         alternatives=len(fit.alternatives),
         numerical_error=fit.numerical_error,
+        numerical_limit=float(fit.settings.get("numerical_error", FitOptions().numerical_error)),
     )
 
 
@@ -229,7 +232,7 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
         elif name in limited:
             words[name] = f"limited by the instrument: correlated with {limited[name][0]}"
         elif math.hypot(*along) > UNIDENTIFIED_BEYOND:
-            kind = "unidentified" if math.hypot(*along) > OPEN_BEYOND else "weakly identified"
+            kind = "unidentified" if math.hypot(*along) > UNCONSTRAINED_BEYOND else "weakly identified"
             words[name] = f"{kind}: see direction {int(np.argmax(along)) + 1}"
         elif not math.isfinite(error):
             words[name] = "unidentified"

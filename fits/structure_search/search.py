@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
 from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
-from fits.optimise.fit import fit_again, fit_problem
+from fits.optimise.fit import fit_problem, fit_with_discrepancy
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import CrossValidation
 from fits.prediction.evidence import Evidence
@@ -252,7 +252,7 @@ class _Run:
         def fitted() -> Fit:
             problem = self._problem(structure)
             problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed, refine=False)
+            return fit_problem(problem, starts=self.options.starts, seed=self.seed, screen=True)
 
         return self._kept(structure, "", fitted)
 
@@ -262,7 +262,7 @@ class _Run:
         def fitted() -> Fit:
             problem, coarse = self._problem(structure), self.coarse[structure]
             if undecided(problem) and needs_discrepancy(without_discrepancy(coarse)):
-                return fit_again(problem, coarse, starts=self.options.starts, seed=self.seed)
+                return fit_with_discrepancy(problem, coarse, starts=self.options.starts, seed=self.seed)
             if undecided(problem):
                 problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
             return fit_problem(problem, starts=self.options.starts, seed=self.seed)

@@ -13,7 +13,7 @@ from fits.data.geometry import slices
 from fits.optimise import multi_start as starts_module
 from fits.optimise.bounded import cost_and_gradient
 from fits.optimise.fit import fit
-from fits.optimise.multi_start import WORTH, run_starts, start_points, starts_store
+from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store
 from fits.optimise.result import OUTCOMES
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -76,7 +76,7 @@ def test_a_stack_never_ends_above_what_it_contains(pair, name, degrees, count):
     for old, new in renamed.items():
         values = {parameter.replace(old, new): value for parameter, value in values.items()}
     # to what a start that goes on is worth
-    assert whole.minima[0].cost <= cost_at(whole.problem, values) + WORTH
+    assert whole.minima[0].cost <= cost_at(whole.problem, values) + LEAST_GAIN
 
 
 @pytest.mark.parametrize("name", [STEEL, "aeroglaze_650nm_inplane.csv"])
@@ -87,9 +87,9 @@ def test_a_race_ends_where_all_starts_do(name, monkeypatch):
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
-    ends, every = starts_module.race(problem, points), run_starts(problem, points, "least_squares", lambda *told: None)
-    assert min(end.cost for end in ends) <= min(end.cost for end in every) + WORTH
-    left = [end for end in ends if end.unfinished]
+    ends, every = starts_module.race(problem, points), multi_start(problem, points, "least_squares", lambda *told: None)
+    assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
+    left = [end for end in ends if end.max_steps_reached]
     assert 1 <= len(left) <= len(points) - starts_module.FRONT
     assert {end.steps for end in left} == {20}  # with sigma held, and free
     assert sum(end.steps for end in ends) < sum(end.steps for end in every)
@@ -118,7 +118,7 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     monkeypatch.undo()
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
-    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)
+    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=LEAST_GAIN)
 
 
 class Dimmed:

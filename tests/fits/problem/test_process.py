@@ -8,7 +8,7 @@ from scipy import stats
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
-from fits.optimise.descent import here
+from fits.optimise.descent import evaluate_at
 from fits.problem.discrepancy.inducing_points import places
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.discrepancy.process import make_process
@@ -311,7 +311,7 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
 def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
     of = problem("two incidences", 2)
     unit = np.asarray(of.model.box.to_unit(jnp.asarray(of.start)))
-    found = here(of, unit)
+    found = evaluate_at(of, unit)
 
     def cost(model: Model, s: jax.Array) -> jax.Array:
         return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(s)))
