@@ -182,9 +182,9 @@ def _sampling(found: list[Peak]) -> str:
         )
     worst = min((one for one in found if one.stands_out), key=lambda one: one.readings)
     words = (
-        f"Sampling: the peak about the mirror direction has at least {worst.readings} measurements above half its "
-        f"height (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
+        f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.readings} or "
+        f"more (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
     )
     if worst.readings < PEAK_POINTS:
-        return f"{words}: it may be narrower than the steps, which then limit a fitted roughness."
+        return f"{words}: the peak may be narrower than the steps, which then limit a fitted roughness."
     return f"{words}: its width is sampled."
