@@ -23,9 +23,7 @@ from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, incidences
 from fits.data.totals import Totals
 from fits.reports.tables import Table, degrees, quantity_in_words, shortened
-
-PEAK_POINTS = 3
-"""Measurements above half of a peak's height from which its width is sampled."""
+from fits.reports.verdicts import DEFAULT, ReportOptions
 
 RADIANS = 1.6
 """A little more than a right angle in radians: angles that are all below this may be in radians."""
@@ -91,7 +89,7 @@ def _totals_table(totals: Totals) -> Table:
     return Table("Shares of the incident flux", names, tuple(shortened(rows, MOST_ROWS)), keys=1)
 
 
-def data_statements(data: Measurements) -> list[str]:
+def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> list[str]:
     """Sentences on angles that look wrong, reciprocity, energy, symmetry, sampling and repeats of the used data; of
     totals on angles only."""
     angles = data.theta_i if isinstance(data, Totals) else np.concatenate([data.theta_i, data.theta_o])
@@ -107,7 +105,7 @@ def data_statements(data: Measurements) -> list[str]:
         _reciprocity(reciprocity(data)),
         _energy(energies(data)),
         _symmetry(symmetry(data)),
-        _sampling(peaks(data)),
+        _sampling(peaks(data), options),
         _repeats(repeats(data)),
     ]
 
@@ -172,7 +170,7 @@ def _energy(found: list[Energy]) -> str:
     return words
 
 
-def _sampling(found: list[Peak]) -> str:
+def _sampling(found: list[Peak], options: ReportOptions) -> str:
     if not found:
         return "Sampling: no scan crosses the mirror direction of its light, the peak was not measured."
     if not any(one.stands_out for one in found):
@@ -185,6 +183,6 @@ def _sampling(found: list[Peak]) -> str:
         f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.readings} or "
         f"more (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
     )
-    if worst.readings < PEAK_POINTS:
+    if worst.readings < options.peak_points:
         return f"{words}: the peak may be narrower than the steps, which then limit a fitted roughness."
     return f"{words}: its width is sampled."

@@ -52,6 +52,9 @@ class ReportOptions:
     r_hat: float = 1.01
     """R-hat above which the shares of the modes of a posterior are called uncertain."""
 
+    peak_points: int = 3
+    """Measurements above half the height of a peak from which its width is called sampled."""
+
 
 DEFAULT = ReportOptions()
 

@@ -244,7 +244,7 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
 
 def _intervals(axes: Axes, angle: np.ndarray, prediction: "Prediction", rows: np.ndarray, channel: int) -> None:
     low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
-    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % of new measurements")
+    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % prediction interval")
     axes.fill_between(angle, quarter, three, color=CYCLE[0], alpha=0.35, linewidth=0, label="50 %")
     axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
     latent = prediction.latent.quantiles[2, rows, channel]
