@@ -23,7 +23,7 @@ def directory_of(package: str, homes: Mapping[str, str]) -> Callable[[], list[st
 
 
 def shown_by(function: str, of: Any) -> Any:
-    """`function` of what is above, such as ``"fits.reports.notebook:fit_fragment"``, of this result.
+    """`function` of what is above, such as ``"fits.reports.html:fit_fragment"``, of this result.
 
     Results know only by name what shows them: packages import downward, and a result that is not shown costs nothing.
     """

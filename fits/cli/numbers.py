@@ -1,4 +1,4 @@
-"""Numbers on the command line, and what they may be."""
+"""Numbers on the command line, and their ranges."""
 
 import argparse
 
@@ -42,14 +42,6 @@ def scale(word: str) -> tuple[str, float]:
 def length(word: str) -> float:
     """A wavelength, in nanometres."""
     return _number(word, float, 1.0, None)
-
-
-def interval(words: str) -> tuple[float, float]:
-    """The lowest and the highest wavelength, in nanometres."""
-    ends = [length(word) for word in words.split(",")]
-    if len(ends) != 2 or ends[0] > ends[1]:
-        raise argparse.ArgumentTypeError(f"{words!r} given, must be the lowest and the highest, as in 600,620")
-    return ends[0], ends[1]
 
 
 def _number(word: str, kind: type[int] | type[float], low: float, high: float | None) -> float:

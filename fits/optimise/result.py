@@ -116,7 +116,7 @@ class Fit:
         return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reports.notebook:fit_fragment", self))
+        return str(shown_by("fits.reports.html:fit_fragment", self))
 
     def part(self, name: str = "") -> "Fit":
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.

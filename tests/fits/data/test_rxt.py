@@ -174,17 +174,16 @@ def test_the_command_line_chooses_rows_and_spheres(tmp_path, capsys):
     words = ["info", str(path), "--out", str(tmp_path / "a.png"), "--force"]
     assert main(words) == 2
     assert "restrict the wavelengths" in capsys.readouterr().err
-    assert main([*words, "--wavelengths", "600,620"]) == 0
+    assert main([*words, "--read", "wavelengths=600,620"]) == 0
     told = capsys.readouterr().out
     assert "600 nm, 620 nm" in told
-    assert "as an integrating sphere read them" in told
-    assert main([*words, "--wavelengths", "600,620", "--corrected"]) == 0
+    assert "as measured with an integrating sphere" in told
+    assert main([*words, "--read", "wavelengths=600,620", "corrected=yes"]) == 0
     assert "integrating sphere" not in capsys.readouterr().out
-    assert main(["convert", str(path), str(tmp_path / "a.csv"), "--wavelengths", "600,620", "--corrected"]) == 0
+    assert main(["convert", str(path), str(tmp_path / "a.csv"), "--read", "wavelengths=600,620", "corrected=yes"]) == 0
     np.testing.assert_allclose(read(tmp_path / "a.csv").values, [[0.3, 0.25]])
     capsys.readouterr()
-    assert main(["info", str(tmp_path / "a.csv"), "--corrected"]) == 2
+    assert main(["info", str(tmp_path / "a.csv"), "--read", "corrected=yes"]) == 2
     assert "wavelengths and corrected apply to rxt files only" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main([*words, "--wavelengths", "600,610,620"])
-    assert "must be the lowest and the highest, as in 600,620" in capsys.readouterr().err
+    assert main([*words, "--read", "wavelengths=600,610,620"]) == 2
+    assert "it must be the lowest and the highest in nm, as in 600,620" in capsys.readouterr().err
