@@ -9,9 +9,8 @@ from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.any_report import report as report
-    from fits.batch.files import FittedFiles as FittedFiles
-    from fits.batch.files import fit_files as fit_files
-    from fits.batch.searching import Searching as Searching
+    from fits.batch.fit_files import FittedFiles as FittedFiles
+    from fits.batch.fit_files import fit_files as fit_files
     from fits.data.formats import read as read
     from fits.data.formats.csv import write_csv as write_csv
     from fits.data.formats.rxt import Slab as Slab
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from fits.maps.smoothing import Smoothness as Smoothness
     from fits.optimise.fit import fit as fit
     from fits.optimise.identifiability import Direction as Direction
+    from fits.optimise.options import FitOptions as FitOptions
     from fits.optimise.result import Fit as Fit
     from fits.prediction.average import Average as Average
     from fits.prediction.average import average as average
@@ -68,8 +68,10 @@ if TYPE_CHECKING:
     from fits.structure_search.library import Library as Library
     from fits.structure_search.library import default_library as default_library
     from fits.structure_search.library import read_library as read_library
-    from fits.structure_search.searching import Search as Search
-    from fits.structure_search.searching import search as search
+    from fits.structure_search.search import Candidate as Candidate
+    from fits.structure_search.search import Search as Search
+    from fits.structure_search.search import SearchOptions as SearchOptions
+    from fits.structure_search.search import search as search
 
 _HOMES = {
     "Average": "prediction.average",
@@ -82,6 +84,7 @@ _HOMES = {
     "ExportReport": "exports.export",
     "export": "exports.export",
     "Fit": "optimise.result",
+    "FitOptions": "optimise.options",
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
@@ -116,15 +119,16 @@ _HOMES = {
     "scores": "prediction.predict",
     "predict": "prediction.predict",
     "sample": "sampling.sample",
-    "Search": "structure_search.searching",
-    "search": "structure_search.searching",
+    "Candidate": "structure_search.search",
+    "Search": "structure_search.search",
+    "SearchOptions": "structure_search.search",
+    "search": "structure_search.search",
     "Library": "structure_search.library",
     "default_library": "structure_search.library",
     "read_library": "structure_search.library",
     "cross_validate": "prediction.cross_validation",
-    "fit_files": "batch.files",
-    "FittedFiles": "batch.files",
-    "Searching": "batch.searching",
+    "fit_files": "batch.fit_files",
+    "FittedFiles": "batch.fit_files",
     "Problem": "problem.problem",
     "render": "reports.render",
     "report": "any_report",

@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from fits.optimise.descent import PROMISE, descend
+from fits.optimise.descent import COST_TOLERANCE, descend
 from fits.optimise.multi_start import MOST_STEPS, start_points
 from fits.optimise.resolution import at_start
 from fits.problem.compilation import cores, in_shares
@@ -62,8 +62,8 @@ def _solve_repeats(model: Model, starts: Array, values: Array) -> tuple[Array, A
 
     def one(row: Array) -> tuple[Array, Array, Array, Array]:
         repeat = eqx.tree_at(lambda m: m.values, model, row)
-        most, promise = jnp.asarray(MOST_STEPS), jnp.asarray(PROMISE)
-        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, promise), starts)
+        most, tolerance = jnp.asarray(MOST_STEPS), jnp.asarray(COST_TOLERANCE)
+        ends = jax.lax.map(lambda start: descend(repeat, start, jnp.asarray(True), most, tolerance), starts)
         end = jax.tree.map(lambda part: part[jnp.argmin(ends.cost)], ends)
         width = model.box.slope(end.vector)
         slopes = model.box.prior_slopes()

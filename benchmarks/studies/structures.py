@@ -18,7 +18,7 @@ from fits.data.measurements import Measurements
 from fits.engines import Failure, run
 from fits.problem.compilation import cores
 from fits.structure_search.library import Library, Structure, default_library
-from fits.structure_search.searching import named
+from fits.structure_search.search import named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4
@@ -165,9 +165,10 @@ def run_repeat(index: int) -> Repeat:
     began = time.perf_counter()
     structure, data = material(index)
     noise = fits.Noise(relative=NOISE, floor=1e-6)
-    found = fits.search(data, LIBRARY, layers=3, transport=TRANSPORT, noise=noise, starts=STARTS, seed=index)
-    places = [place for place, one in enumerate(found.found) if one.structure == structure and one.model_score]
-    seen = found.found[places[0]].model_score if places else None
+    options = fits.SearchOptions(layers=3, starts=STARTS)
+    found = fits.search(data, LIBRARY, transport=TRANSPORT, noise=noise, seed=index, options=options)
+    places = [place for place, one in enumerate(found.candidates) if one.structure == structure and one.model_score]
+    seen = found.candidates[places[0]].model_score if places else None
     return Repeat(
         repeat=index,
         truth=named(structure),
@@ -175,7 +176,7 @@ def run_repeat(index: int) -> Repeat:
         best=found.best.name,
         behind=None if seen is None else seen.elpd_diff,
         clear_diff=None if seen is None else seen.clear_diff,
-        fitted=len(found.found),
+        fitted=len(found.candidates),
         seconds=time.perf_counter() - began,
     )
 

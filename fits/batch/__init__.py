@@ -1,4 +1,1 @@
-"""Fits of files: one into a result directory, or all of a folder by several stacks, with one table over them.
-
-Files and stack files go in; result directories, a table and a page come out.
-"""
+"""Fits of files: one into a result directory, or all of a folder by several stacks, with one table over them."""

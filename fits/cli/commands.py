@@ -14,6 +14,7 @@ import numpy as np
 from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
+from fits.cli.many import search as search
 from fits.cli.map_reports import report_map
 from fits.cli.maps import fit_map as fit_map
 from fits.cli.materials import export as export
@@ -46,7 +47,7 @@ def fit(arguments: Namespace) -> int:
     if not arguments.sample:
         refuse_alone(arguments, SAMPLING, "sample")
     use_jax()
-    from fits.batch.fitting import fit_into, require_posterior
+    from fits.batch.fit_file import fit_into, require_posterior
     from fits.problem.stack_file import read_problem
     from fits.reports import results, tables, verdicts
     from fits.reports.diagnostics import residual_structure, standardised
@@ -211,13 +212,6 @@ def compare(arguments: Namespace) -> int:
         write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
     return DONE
-
-
-def search(arguments: Namespace) -> int:
-    """Look for the stack behind the data among those that a library makes."""
-    from fits.cli.searches import search as run_search
-
-    return run_search(measurements(arguments), arguments)
 
 
 def info(arguments: Namespace) -> int:

@@ -18,7 +18,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 
 from fits.maps.texels import Texels, model_of
-from fits.optimise.descent import NEARBY, PROMISE
+from fits.optimise.descent import COST_TOLERANCE, NEARBY
 from fits.optimise.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
 from fits.optimise.multi_start import MOST_STEPS
 from fits.problem.model import Model
@@ -180,7 +180,7 @@ class _Run:
         self.known = known
         self.options: dict[str, Any] = {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY), "most_steps": MOST_STEPS}
         if model.objective == "likelihood":
-            self.options["promise"] = PROMISE
+            self.options["tolerance"] = COST_TOLERANCE
         if self.levels:
             self.options["logarithmic"] = model.logarithmic
 
@@ -208,7 +208,7 @@ class _Run:
     def _start(self, number: Array, at: Array) -> tuple[_Place, Known]:
         unit = self.units[self.which[at]]
         own = model_of(self.model, self._row(at))
-        sigma = own.near_sigma(self.model.box.from_unit(unit))
+        sigma = own.initial_sigma(self.model.box.from_unit(unit))
         rough = self.fresh if self.levels else jnp.asarray(False)
         like = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
         nothing = Known(like[0], like)
@@ -241,9 +241,9 @@ class _Run:
     def _is_last(self, before: Any, state: Any) -> Array:
         """Whether the next step ends a descent: it is a full one, and another will promise too little if promises go on
         to fall as they did (after Hairer and Wanner 1996, IV.8)."""
-        followed = state.promise**2 <= LAST * PROMISE * before.promise
-        full = state.promise - state.predicted <= LAST * PROMISE
-        return followed & full & jnp.isfinite(before.promise) & (self.model.objective == "likelihood")
+        followed = state.full_decrease**2 <= LAST * COST_TOLERANCE * before.full_decrease
+        full = state.full_decrease - state.predicted <= LAST * COST_TOLERANCE
+        return followed & full & jnp.isfinite(before.full_decrease) & (self.model.objective == "likelihood")
 
     def _stepped_last(self, unit: Array, state: Any) -> tuple[Array, Any]:
         """After a step so short that all is linear on the way."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from fits.maps.sources import UNREADABLE
 from fits.problem.parameters import is_free
-from fits.problem.values import portable_repr
+from fits.store import portable_repr
 
 
 def digest(tree: Any) -> str:

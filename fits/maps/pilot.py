@@ -14,8 +14,9 @@ from fits.maps.texels import Texels
 from fits.optimise import apertures
 from fits.optimise.fit import fit_problem
 from fits.optimise.multi_start import start_points
+from fits.optimise.options import DEFAULT
 from fits.optimise.refinement import resolution_in_words
-from fits.optimise.resolution import ENOUGH, Resolutions, resolutions
+from fits.optimise.resolution import Resolutions, resolutions
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -91,7 +92,7 @@ def fly(
             else 0.0
         )
         pilot = replace(pilot, numerical_error=error + rays, resolution=resolution_in_words(problem, known))
-        if not (known is not None and known.open and fine is not None and error > ENOUGH):
+        if not (known is not None and known.open and fine is not None and error > DEFAULT.numerical_error):
             return pilot
         problem = fine
 

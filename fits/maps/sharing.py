@@ -19,7 +19,7 @@ from fits.maps.searching import search, starts_at
 from fits.maps.shared import hold, shared_names
 from fits.maps.solving import solve
 from fits.maps.texels import Texels, model_of
-from fits.optimise.descent import PROMISE, descend
+from fits.optimise.descent import COST_TOLERANCE, descend
 from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.optimise.multi_start import start_points
 from fits.optimise.uncertainty import ON_BOUND
@@ -191,7 +191,7 @@ def _informed(model: Model, vectors: Array, sample: Texels) -> tuple[Any, ...]:
 
     def one(row: tuple[Array, Texels]) -> tuple[Any, ...]:
         own, unit = model_of(model, row[1]), model.box.to_unit(row[0])
-        found = descend(own, unit, jnp.asarray(False), jnp.asarray(1), jnp.asarray(PROMISE))
+        found = descend(own, unit, jnp.asarray(False), jnp.asarray(1), jnp.asarray(COST_TOLERANCE))
         return found.cost, found.gradient, found.root, unit
 
     return jax.lax.map(one, (vectors, sample))

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from fits.maps.descending import BESIDE, End, Known, descents, first_mapped, linear
 from fits.maps.texels import Texels, chi_square, model_of
-from fits.optimise.descent import PROMISE
+from fits.optimise.descent import COST_TOLERANCE
 from fits.optimise.identifiability import LARGEST_ERROR, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
-from fits.optimise.uncertainty import LEAST_PULL, ON_BOUND
+from fits.optimise.uncertainty import LEAST_GRADIENT, ON_BOUND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -46,7 +46,7 @@ class Found(NamedTuple):
 
     def better(self, other: "Found", rows: Any) -> NDArray[np.bool_]:
         """Where another one, of these rows, is lower by more than is left to gain, (len(rows),) bool."""
-        return np.asarray(other.cost < self.cost[rows] - 10.0 * PROMISE)
+        return np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
 
     def put(self, rows: Any, other: "Found") -> None:
         """Take over another one at these rows."""
@@ -207,7 +207,7 @@ def _found(model: Model, end: End, texel: Texels) -> Found:
 def _errors(model: Model, end: End, root: Array, scatter: Array) -> tuple[Array, Array, Array]:
     """As `fits.optimise.uncertainty`, for a compiled program."""
     box, unit, count = model.box, end.unit, end.unit.size
-    root, pull = root / jnp.sqrt(scatter), LEAST_PULL * scatter
+    root, pull = root / jnp.sqrt(scatter), LEAST_GRADIENT * scatter
     known = jnp.isfinite(end.cost) & jnp.all(jnp.isfinite(root))
     root = jnp.where(known, root, 0.0)
     idle = jnp.linalg.norm(root, axis=0) * UNKNOWN_BEYOND < 1.0

@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.optimise.resolution import ENOUGH, spread
+from fits.optimise.resolution import spread
 from fits.problem.aperture_rays import most_rings
 from fits.problem.instrument import rings_for
 from fits.problem.problem import Problem
 from fits.progress import Progress
 
 ENOUGH_OF_PEAK = 1e-3
-"""Numerical error of readings, in units of the largest, that no fit needs to fall below."""
+"""Numerical error of measurements, in units of the largest, that no fit needs to fall below."""
 
 NO_BETTER = 0.3
 """Of an error: a ring more that leaves as much of it is not worth its rays; of a lobe it leaves a fifth or less."""
@@ -36,7 +36,7 @@ class Needed(NamedTuple):
 
 
 def has_rays(problem: Problem) -> bool:
-    """Whether readings are means over cones."""
+    """Whether measurements are means over cones."""
     return problem.model.optics is not None and problem.model.optics.row is not None
 
 
@@ -64,10 +64,13 @@ def for_starts(problem: Problem) -> Problem:
     return with_rings(problem, min(_of_lobes(problem, problem.start), FAR_RINGS))
 
 
-def needed(problem: Problem, vector: Floats, predicted: Floats, is_open: bool, progress: Progress) -> Needed:
+def needed(
+    problem: Problem, vector: Floats, predicted: Floats, is_open: bool, allowed: float, progress: Progress
+) -> Needed:
     """Rings from those on that the problem has: so many that more of them, with these parameters, change too little.
 
-    predicted: by the problem, (N, C). is_open: False: those that it has, with their error.
+    predicted: by the problem, (N, C). is_open: False: those that it has, with their error. allowed: numerical error, in
+    standard deviations of the data.
     """
     assert problem.instrument is not None
     rings, values = rings_of(problem), predicted
@@ -85,7 +88,7 @@ def needed(problem: Problem, vector: Floats, predicted: Floats, is_open: bool, p
         progress("numerical error", rings, None, f"{error:.2g} sigma at {in_words(rings)}")
         if error > NO_BETTER * before:  # not of the lobe, but of cones that the horizon cuts, say
             return Needed(rings - 1, before)
-        if not is_open or rings == most or (error <= ENOUGH and np.max(apart) <= ENOUGH_OF_PEAK * peak):
+        if not is_open or rings == most or (error <= allowed and np.max(apart) <= ENOUGH_OF_PEAK * peak):
             return Needed(rings, error)
         rings, before = rings + 1, error
         values = np.asarray(with_rings(problem, rings).predict(vector), float)

@@ -14,18 +14,18 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.optimise.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
-from fits.problem.base import Posed
 from fits.problem.model import Model
+from fits.problem.problem import FittingProblem
 
-PROMISE = 1e-8
-"""A likelihood fit has converged when a full step promises less than this in the log-posterior: 1e-4 standard
-errors."""
+COST_TOLERANCE = 1e-8
+"""A likelihood fit has converged when a full step is predicted to gain less than this in the log-posterior: 1e-4
+standard errors."""
 
 NEARBY = 1e-4
 """Damping near a minimum: a step is all but a full one."""
 
-ROUGHLY = 1e-4
-"""A hundredth of a standard error: tells minima apart, after about a third of the steps where these gain least."""
+ROUGH_TOLERANCE = 1e-4
+"""A hundredth of a standard error: distinguishes minima, after about a third of the steps where these gain least."""
 
 Floats = NDArray[np.float64]
 
@@ -34,28 +34,32 @@ class Descent(NamedTuple):
     """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX or of numpy.
 
     vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all. converged,
-    unfinished: whether it did, and whether it ran out of steps. gradient: of the cost in the unit box, (P,). root:
-    (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN with an
-    infinite cost.
+    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit
+    box, (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN
+    with an infinite cost.
     """
 
     vector: Any
     cost: Any
     steps: Any
     converged: Any
-    unfinished: Any
+    max_steps_reached: Any
     gradient: Any
     root: Any
     predicted: Any
 
 
-def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise: Array) -> Descent:
-    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step promises less than `promise` in the
-    log-posterior. Not `fresh`: near a minimum, all levels free."""
+def descend(model: Model, start: Array, fresh: Array, most_steps: Array, tolerance: Array) -> Descent:
+    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step is predicted to gain less than
+    `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
     likelihood = model.objective == "likelihood"
     varying = likelihood and bool(model.logarithmic)
     solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
-    options = {"watch": lambda beside: beside[1], "damping": damping, **({"promise": promise} if likelihood else {})}
+    options = {
+        "watch": lambda beside: beside[1],
+        "damping": damping,
+        **({"tolerance": tolerance} if likelihood else {}),
+    }
     options |= {"logarithmic": model.logarithmic} if varying else {}
 
     def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
@@ -78,7 +82,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
             cost=solution.stats["cost"],
             steps=solution.stats["num_steps"],
             converged=jnp.asarray(solution.result == optx.RESULTS.successful),
-            unfinished=jnp.asarray(solution.result == optx.RESULTS.nonlinear_max_steps_reached),
+            max_steps_reached=jnp.asarray(solution.result == optx.RESULTS.nonlinear_max_steps_reached),
             gradient=solution.stats["gradient"],
             # R of the QR decomposition has A's singular values without squaring its condition number
             root=jnp.linalg.qr(solution.stats["watched"].T, mode="r"),
@@ -94,7 +98,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
             jnp.arange(2.0),
         )
     if likelihood and model.varying:
-        held = model.near_sigma(model.box.from_unit(start))
+        held = model.initial_sigma(model.box.from_unit(start))
         sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
     _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
     last = jax.tree.map(lambda part: part[-1], stages)
@@ -103,17 +107,19 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, promise
         cost=jnp.where(finite, last.cost, jnp.inf),
         steps=jnp.sum(stages.steps),
         converged=last.converged & finite,
-        unfinished=last.unfinished & finite,
+        max_steps_reached=last.max_steps_reached & finite,
         predicted=jnp.where(finite, last.predicted, jnp.nan),
     )
 
 
-def descent(problem: Posed, start: Floats, fresh: bool, most_steps: int, promise: float = PROMISE) -> Descent:
+def descent(
+    problem: FittingProblem, start: Floats, fresh: bool, most_steps: int, tolerance: float = COST_TOLERANCE
+) -> Descent:
     """`descend`, compiled once for all problems of this structure; numbers in double precision."""
-    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(promise))
+    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(tolerance))
     return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
 
 
-def here(problem: Posed, unit: Floats) -> Descent:
+def evaluate_at(problem: FittingProblem, unit: Floats) -> Descent:
     """What is known at a point (P,) of the unit box; its vector is this point."""
     return descent(problem, unit, False, 1)

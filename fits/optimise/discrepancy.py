@@ -1,7 +1,7 @@
-"""Whether a fit counts errors of the model that neighbouring readings share, where that is left to the residuals.
+"""Whether a fit needs a model discrepancy, where that is left to the residuals.
 
-The rule: the stack is fitted with noise that readings do not share; where residuals of neighbours along the scans are
-correlated by more than `LEAST`, and by more than `CLEAR` standard errors, it is fitted again with errors that they do.
+The rule: the stack is fitted with independent noise; where residuals of neighbours along the scans are correlated by
+more than `FitOptions` allow, it is fitted again with a discrepancy.
 """
 
 import math
@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from fits.data.neighbours import correlation, neighbours
 from fits.data.totals import Totals
 from fits.optimise.multi_start import start_points, unit_of
+from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit, WithoutDiscrepancy
-from fits.problem.base import Posed
-from fits.problem.problem import Problem
-
-LEAST, CLEAR = 0.2, 3.0
+from fits.problem.problem import FittingProblem, Problem
 
 MOST_STARTS = 8
 """Minima of the fit without that the fit with them starts from; of its other starts half as many."""
@@ -32,7 +30,7 @@ def undecided(problem: Problem) -> bool:
 
 
 def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
-    """What is to be said of a fit without shared errors."""
+    """What is to be said of a fit without model discrepancy."""
     pairs = neighbours(fit.problem.data.used(), fit.residuals)
     return WithoutDiscrepancy(
         values=fit.values,
@@ -45,26 +43,28 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     )
 
 
-def needs_discrepancy(found: WithoutDiscrepancy) -> bool:
-    """Whether residuals of neighbours are alike, by the rule above."""
-    return found.residual_autocorrelation > LEAST and found.residual_autocorrelation * math.sqrt(found.pairs) > CLEAR
+def needs_discrepancy(found: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
+    """Whether residuals of neighbours are correlated, by the rule above."""
+    correlation = found.residual_autocorrelation
+    clear = correlation * math.sqrt(found.pairs) > options.autocorrelation_errors
+    return clear and correlation > options.autocorrelation
 
 
-def datasets_with_discrepancy(fit: Fit) -> dict[str, WithoutDiscrepancy]:
-    """The measurements of which errors are to be counted that readings share, by the rule, as fitted without."""
+def datasets_with_discrepancy(fit: Fit, options: FitOptions = DEFAULT) -> dict[str, WithoutDiscrepancy]:
+    """The data sets that need a model discrepancy by the rule above, as fitted without."""
     problems = fit.problem.problems.items()
     found = {name: without_discrepancy(fit.part(name)) for name, problem in problems if undecided(problem)}
-    return {name: one for name, one in found.items() if needs_discrepancy(one)}
+    return {name: one for name, one in found.items() if needs_discrepancy(one, options)}
 
 
 def with_discrepancy(problem: Problem) -> Problem:
-    """The problem with errors that readings share."""
+    """The problem with model discrepancy."""
     return replace(problem, noise=replace(problem.noise, discrepancy=True))
 
 
-def start_points_with_discrepancy(problem: Posed, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
-    """Where to start from, (K, P) in the unit box of a problem with shared errors, after a fit without: its minima, and
-    some of as many starts as it had.
+def start_points_with_discrepancy(problem: FittingProblem, fit: Fit, starts: int, seed: int) -> NDArray[np.float64]:
+    """Where to start from, (K, P) in the unit box of a problem with model discrepancy, after a fit without: its minima,
+    and some of as many starts as it had.
     """
     found = []
     for minimum in fit.minima[:MOST_STARTS]:

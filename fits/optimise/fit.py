@@ -1,10 +1,10 @@
-"""Fitting: many starts through one compiled program, then what the best minimum is worth."""
+"""A fit in four steps: multi-start, polish with uncertainties, resolution, result."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -14,37 +14,42 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.optimise import apertures
-from fits.optimise.descent import PROMISE, ROUGHLY
+from fits.optimise.descent import COST_TOLERANCE, ROUGH_TOLERANCE
 from fits.optimise.discrepancy import (
     datasets_with_discrepancy,
     start_points_with_discrepancy,
     with_discrepancy,
     without_discrepancy,
 )
-from fits.optimise.identifiability import OPEN_BEYOND
-from fits.optimise.multi_start import End, Solver, race, rough_end, run_starts, start_points, unit_of
-from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
+from fits.optimise.identifiability import UNCONSTRAINED_BEYOND
+from fits.optimise.multi_start import (
+    Solver,
+    StartOutcome,
+    multi_start,
+    rough_descent,
+    screened_starts,
+    start_points,
+    starts_store,
+    unit_of,
+)
+from fits.optimise.options import DEFAULT, FitOptions
+from fits.optimise.polish import Optimum, polish
 from fits.optimise.refinement import Accuracy, refined
 from fits.optimise.resolution import resolutions
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
-from fits.optimise.uncertainty import Uncertainty
-from fits.problem.base import Posed
 from fits.problem.instrument import Instrument
 from fits.problem.joint import Joint
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, silent
+from layerjax._checks import require_kind
 
 Floats = NDArray[np.float64]
 
-SAME_BOX, SAME_ERRORS, SAME_AT_MOST = 1e-3, 0.5, 0.05
-"""Ends of two starts are one minimum if no parameter differs by more than a thousandth of its box plus half its
-standard error, the error counted up to a twentieth of the box. Of one that the data leave open any value will do, if
-the costs agree."""
-SAME_COST = 1e-3
-"""Costs agree within this, in the log-posterior, times the reduced chi-square where that is above 1."""
+SAME_AT_MOST = 0.05
+"""Share of its box up to which a standard error counts where minima are compared."""
 
 
 def fit(
@@ -59,6 +64,7 @@ def fit(
     starts: int = 32,
     seed: int = 0,
     solver: Solver = "least_squares",
+    options: FitOptions = DEFAULT,
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
 ) -> Fit:
@@ -75,10 +81,11 @@ def fit(
             parameters with a `LogNormal` or `LogUniform` prior), drawn with `seed`. The lowest end of all is the fit.
         solver: "least_squares" (Levenberg-Marquardt, checked with L-BFGS-B where a parameter ends on a bound), or
             "bounded" (L-BFGS-B throughout).
+        options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with shared errors (`again`); one of another
-            problem is replaced.
+            done. It stays, as does one beside it for what is fitted again with model discrepancy (`again`); one of
+            another problem is replaced.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
@@ -90,128 +97,129 @@ def fit(
         for name, given in beside.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
-        problem: Posed = stack
+        problem: FittingProblem = stack
     elif data is None:
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
         problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
-    return fit_problem(problem, starts=starts, seed=seed, solver=solver, progress=progress, checkpoint=checkpoint)
+    run = _Run(starts, seed, solver, options, progress or silent, checkpoint)
+    return _fitted(problem, run)
 
 
 def fit_problem(
-    problem: Posed,
+    problem: FittingProblem,
     *,
     starts: int = 32,
     seed: int = 0,
     solver: Solver = "least_squares",
+    options: FitOptions = DEFAULT,
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
-    refine: bool = True,
+    screen: bool = False,
 ) -> Fit:
     """Find the best parameters of a problem that is already put together, as `fit` does.
 
     Args:
-        problem: what is fitted to what: a `Problem`, or a `Joint` of several.
-        starts, seed, solver, progress, checkpoint: see `fit`.
-        refine: False: stay at the resolution of the starts, do not ask for its error, follow only those that are
-            lowest after a few steps, and find the minimum roughly.
+        problem: a `Problem`, or a `Joint` of several.
+        starts, seed, solver, options, progress, checkpoint: see `fit`.
+        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
+            lowest after a few steps, and stop near the minimum.
 
     Raises:
         ValueError: starts < 1; an unknown solver.
     """
-    if starts < 1:
-        raise ValueError(f"starts is {starts}; it must be at least 1")
-    if solver not in get_args(Solver):
-        raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
-    progress = progress or silent
-    found = _found(problem, start_points(problem, starts, seed), solver, progress, checkpoint, settings, refine=refine)
-    if not datasets_with_discrepancy(found):
-        return found
-    return fit_again(
-        problem,
-        found,
-        starts=starts,
-        seed=seed,
-        solver=solver,
-        progress=progress,
-        checkpoint=None if checkpoint is None else again(checkpoint),
-        refine=refine,
-    )
+    return _fitted(problem, _Run(starts, seed, solver, options, progress or silent, checkpoint, screen))
 
 
-def fit_again(
-    problem: Posed,
-    found: Fit,
-    *,
-    starts: int = 32,
-    seed: int = 0,
-    solver: Solver = "least_squares",
-    progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-    refine: bool = True,
-) -> Fit:
-    """The fit of a problem with errors that readings share, after one without them; arguments as of `fit_problem`."""
-    without = datasets_with_discrepancy(found) or {
-        name: without_discrepancy(found.part(name)) for name in problem.problems
-    }
-    shared = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in without})
-    settings: dict[str, int | str] = {"starts": starts, "seed": seed, "solver": solver}
-    progress = progress or silent
-
-    def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        progress(f"{stage} with shared errors", done, total, info)
-
-    places = start_points_with_discrepancy(shared, found, starts, seed)
-    return _found(shared, places, solver, report, checkpoint, settings, without, refine)
+def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
+    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit_problem`."""
+    return _with_discrepancy(problem, independent, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
-    ends = [rough_end(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
-    best = optimum(problem, ends, "least_squares", check=False, promise=ROUGHLY)
-    return _fit_of(best, None, {"starts": len(ends)}, {})
+    ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
+    best = polish(problem, ends, "least_squares", check=False, tolerance=ROUGH_TOLERANCE)
+    return _result(best, None, _Run(len(ends), 0, "least_squares", DEFAULT, silent, None), {})
 
 
-def again(checkpoint: str | Path) -> Path:
-    """Where a fit that is made again, with shared errors, keeps its starts."""
-    return Path(f"{checkpoint}-shared")
+def discrepancy_checkpoint(checkpoint: str | Path) -> Path:
+    """The checkpoint of the second fit, with model discrepancy, beside that of the first."""
+    return Path(f"{checkpoint}-discrepancy")
 
 
-def _found(
-    problem: Posed,
-    places: Floats,
-    solver: Solver,
-    progress: Progress,
-    checkpoint: str | Path | None,
-    settings: dict[str, int | str],
+class _Run(NamedTuple):
+    """How a problem is fitted."""
+
+    starts: int
+    seed: int
+    solver: Solver
+    options: FitOptions
+    progress: Progress
+    checkpoint: str | Path | None
+    screen: bool = False
+
+
+def _fitted(problem: FittingProblem, run: _Run) -> Fit:
+    """The fit with independent noise, and where its residuals ask for it that with model discrepancy."""
+    if run.starts < 1:
+        raise ValueError(f"starts is {run.starts}; it must be at least 1")
+    if run.solver not in get_args(Solver):
+        raise ValueError(f"solver is {run.solver!r}; it must be one of {', '.join(get_args(Solver))}")
+    require_kind("options", run.options, FitOptions)
+    result = _fit_from(problem, start_points(problem, run.starts, run.seed), run)
+    if not datasets_with_discrepancy(result, run.options):
+        return result
+    return _with_discrepancy(problem, result, run)
+
+
+def _with_discrepancy(problem: FittingProblem, independent: Fit, run: _Run) -> Fit:
+    """The fit with model discrepancy of the data sets that need it, or of all where none does by the rule."""
+    before = datasets_with_discrepancy(independent, run.options)
+    before = before or {name: without_discrepancy(independent.part(name)) for name in problem.problems}
+    whole = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in before})
+
+    def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
+        run.progress(f"{stage} with model discrepancy", done, total, info)
+
+    checkpoint = None if run.checkpoint is None else discrepancy_checkpoint(run.checkpoint)
+    points = start_points_with_discrepancy(whole, independent, run.starts, run.seed)
+    return _fit_from(whole, points, run._replace(progress=progress, checkpoint=checkpoint), before)
+
+
+def _fit_from(
+    problem: FittingProblem,
+    points: Floats,
+    run: _Run,
     without: Mapping[str, WithoutDiscrepancy] = MappingProxyType({}),
-    refine: bool = True,
 ) -> Fit:
-    """The fit from these places (starts, P) in the unit box, at the resolution that it needs."""
+    """The fit from these points (starts, P) of the unit box, in four steps."""
+    # 1. all starts, at a coarse resolution where that is open
     known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
     open_rays = {name for name, one in problem.problems.items() if apertures.leaves_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
     problem = problem.with_problems({name: apertures.for_starts(problem.problems[name]) for name in open_rays})
-    racing = not refine and solver == "least_squares"
-    ends = race(problem, places) if racing else _ends(problem, places, solver, progress, checkpoint)
-    best, accuracy = optimum(problem, ends, solver, promise=PROMISE if refine else ROUGHLY), None
-    if refine and (known or any(map(apertures.has_rays, problem.problems.values()))):
-        best, accuracy = refined(best, known, open_rays, solver, progress)
-    return _fit_of(best, accuracy, settings, without)
+    screen = run.screen and run.solver == "least_squares"
+    ends = screened_starts(problem, points) if screen else _ends(problem, points, run)
+    # 2. the lowest of them, to its very minimum, with the uncertainties there
+    at = polish(problem, ends, run.solver, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
+    # 3. at the resolution that the noise of the data asks for
+    accuracy = None
+    if not run.screen and (known or any(map(apertures.has_rays, problem.problems.values()))):
+        at, accuracy = refined(at, known, open_rays, run.solver, run.options, run.progress)
+    # 4. what follows from it
+    return _result(at, accuracy, run, without)
 
 
-def _fit_of(
-    at: Optimum, accuracy: Accuracy | None, settings: dict[str, int | str], without: Mapping[str, WithoutDiscrepancy]
-) -> Fit:
-    """The fit of an optimum, with what is to be said of it."""
-    problem, lowest, found = at.problem, at.lowest, at.found
+def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
+    """The fit of an optimum: values, errors, minima, and its status in words."""
+    problem, lowest, found, options = at.problem, at.lowest, at.found, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
-    minima, outcomes = _minima(problem, at.ends, at.best, found, SAME_COST * at.excess)
-    as_good = tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < EQUALLY_WELL * at.excess)
+    minima, outcomes = _minima(problem, at, options)
+    equivalent = options.equivalent_cost * at.excess
     result = Fit(
-        problem=cast(Problem, problem),  # or a `Joint`, of whose measurements `Fit.part` tells
+        problem=cast(Problem, problem),  # or a `Joint`, of whose data sets `Fit.part` says more
         vector=lowest.vector,
         errors=found.standard_errors,
         covariance=found.covariance,
@@ -224,8 +232,8 @@ def _fit_of(
         unidentified=found.unidentified,
         insensitive=found.insensitive,
         minima=minima,
-        alternatives=as_good,
-        settings=settings,
+        alternatives=tuple(minimum for minimum in minima[1:] if minimum.cost - lowest.cost < equivalent),
+        settings={"starts": run.starts, "seed": run.seed, "solver": run.solver, **asdict(options)},
         start_outcomes=outcomes,
         numerical_error=None if accuracy is None else accuracy.error,
         resolution=None if accuracy is None else accuracy.resolution,
@@ -240,53 +248,47 @@ def _fit_of(
     return result
 
 
-def _ends(
-    problem: Posed, points: Floats, solver: Solver, progress: Progress, checkpoint: str | Path | None
-) -> list[End]:
-    """Where the starts (starts, P) in the unit box end, each kept in the checkpoint as it does."""
-    if checkpoint is None:
-        return run_starts(problem, points, solver, progress)
-    from fits.optimise.starts_file import StartsFile
-
-    with StartsFile(checkpoint, problem, points, solver) as kept:
-        return run_starts(problem, points, solver, progress, kept)
+def _ends(problem: FittingProblem, points: Floats, run: _Run) -> list[StartOutcome]:
+    """Outcomes of the starts (starts, P) in the unit box, each kept in the checkpoint as it ends."""
+    if run.checkpoint is None:
+        return multi_start(problem, points, run.solver, run.progress)
+    with starts_store(run.checkpoint, problem, points, run.solver) as store:
+        return multi_start(problem, points, run.solver, run.progress, store)
 
 
-def _minima(
-    problem: Posed, ends: list[End], best: int, found: Uncertainty, same_cost: float
-) -> tuple[tuple[Minimum, ...], dict[str, int]]:
-    """The lowest end and the distinct ones that converged, best first; and how many starts ended where."""
+def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[tuple[Minimum, ...], dict[str, int]]:
+    """The lowest end and the distinct ones that converged, best first; and how many starts had which outcome.
+
+    Of a parameter that is not identified any value will do, if the costs agree.
+    """
+    ends, best = at.ends, at.best
     cost = np.array([end.cost for end in ends])
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(np.stack([end.vector for end in ends]))))
     width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
-    spread = np.nan_to_num(found.standard_errors / width, nan=0.0, posinf=np.inf)
-    same = SAME_BOX + SAME_ERRORS * np.minimum(spread, SAME_AT_MOST)
-    open_ = (spread > OPEN_BEYOND) | np.isin(problem.names, found.insensitive)
-    alike = np.where(open_, np.inf, same)
+    spread = np.nan_to_num(at.found.standard_errors / width, nan=0.0, posinf=np.inf)
+    same = options.same_values + options.same_errors * np.minimum(spread, SAME_AT_MOST)
+    free = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, at.found.insensitive)
+    same_at_equal_cost = np.where(free, np.inf, same)
+
+    def are_one(index: int, other: int) -> bool:
+        equal_cost = abs(cost[index] - cost[other]) <= options.same_cost * at.excess
+        return bool(np.all(np.abs(units[index] - units[other]) <= (same_at_equal_cost if equal_cost else same)))
+
     leaders: list[int] = []
     counts: list[int] = []
     outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
+        place = next((place for place, leader in enumerate(leaders) if are_one(index, leader)), len(leaders))
         if not np.isfinite(cost[index]) and index != best:
             outcomes["failed"] += 1
-            continue
-        near = [
-            place
-            for place, other in enumerate(leaders)
-            if np.all(
-                np.abs(units[index] - units[other]) <= (alike if abs(cost[index] - cost[other]) <= same_cost else same)
-            )
-        ]
-        leads = not near and (index == best or ends[index].converged)
-        if leads:
-            leaders.append(index)
-            counts.append(0)
-        if near or leads:
-            place = near[0] if near else len(leaders) - 1
+        elif place < len(leaders) or index == best or ends[index].converged:
+            if place == len(leaders):
+                leaders.append(index)
+                counts.append(0)
             counts[place] += 1
             outcomes["local minima" if place else "best minimum"] += 1
         else:
-            outcomes["maximum steps reached" if ends[index].unfinished else "failed"] += 1
+            outcomes["maximum steps reached" if ends[index].max_steps_reached else "failed"] += 1
     minima = tuple(
         Minimum(
             values=dict(zip(problem.names, map(float, ends[leader].vector), strict=True)),
@@ -302,7 +304,7 @@ def _minima(
 def _status(fit: Fit) -> list[str]:
     total, reached = sum(fit.start_outcomes.values()), fit.start_outcomes["best minimum"]
     words = [
-        f"converged; {reached} of {total} starts reached this minimum"
+        f"converged; {reached} of {total} starts converged to this minimum"
         if fit.converged
         else f"not converged: the lowest of {total} starts did not; these are the best values seen"
     ]

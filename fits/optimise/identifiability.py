@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNIDENTIFIED_BEYOND = 0.1  # boxes: a direction with a larger standard error is not resolved
-OPEN_BEYOND = 1.0  # boxes: nor is this one held within its bounds
+UNCONSTRAINED_BEYOND = 1.0  # boxes: nor is this one held within its bounds
 UNKNOWN_BEYOND = 1e3  # boxes: a larger error is reported as infinite
 LARGEST_ERROR = 1e9  # boxes: stands for all larger ones, so that squares of it can be formed
 CERTAIN_MEMBER = 0.05  # weight from which a parameter belongs to a direction
@@ -52,7 +52,7 @@ class Direction:
     @property
     def unconstrained(self) -> bool:
         """Whether one standard error along it crosses the whole box: only bounds and priors decide there."""
-        return self.error > OPEN_BEYOND
+        return self.error > UNCONSTRAINED_BEYOND
 
 
 def unidentified_directions(root: Floats, names: tuple[str, ...], width: Floats) -> tuple[Direction, ...]:

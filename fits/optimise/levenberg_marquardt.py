@@ -34,7 +34,7 @@ class _State(eqx.Module):
     gradient: Array
     normal: Array
     predicted: Array
-    promise: Array
+    full_decrease: Array
     damping: Array
     growth: Array
     beside: Any
@@ -50,9 +50,9 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     logarithms L of noise levels as half their squares: dL'dL takes the place of their J'J, which makes the sum the
     Fisher information (J'J alone would overshoot up to twofold at every step).
 
-    It stops when a full Gauss-Newton step promises less than `options["promise"]` (default: `atol + rtol cost`), when
-    rounding ends all progress, or after `options["most_steps"]`; it begins with `options["damping"]`. All of these may
-    be traced. A start whose residuals are not finite, or a stall away from a minimum, gives
+    It stops when a full Gauss-Newton step is predicted to gain less than `options["tolerance"]` (default: `atol + rtol
+    cost`), when rounding ends all progress, or after `options["most_steps"]`; it begins with `options["damping"]`. All
+    of these may be traced. A start whose residuals are not finite, or a stall away from a minimum, gives
     `optx.RESULTS.nonlinear_divergence`.
 
     The solution has the auxiliary output at the solution, and statistics have the "cost" and its "gradient" there; as
@@ -75,7 +75,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient=jnp.zeros_like(y),
             normal=jnp.eye(y.size, dtype=y.dtype),
             predicted=zero,
-            promise=zero + jnp.inf,
+            full_decrease=zero + jnp.inf,
             damping=zero + options.get("damping", FIRST_DAMPING),
             growth=zero + FIRST_GROWTH,
             beside=beside,
@@ -107,12 +107,12 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         beside, watched = jax.tree.map(
             lambda new, old: jnp.where(accept, new, old), (beside, watched), (state.beside, state.watched)
         )
-        trial, predicted, promise = _projected_step(y, gradient, normal, damping, least)
+        trial, predicted, full_decrease = _projected_step(y, gradient, normal, damping, least)
 
-        enough = options.get("promise", self.atol + self.rtol * cost)
-        converged = promise <= jnp.maximum(enough, 4 * epsilon * cost)
+        enough = options.get("tolerance", self.atol + self.rtol * cost)
+        converged = full_decrease <= jnp.maximum(enough, 4 * epsilon * cost)
         lost = ~accept & (predicted > 0) & (predicted <= 4 * epsilon * cost)  # too small a decrease to be seen
-        stalled = lost & (promise > jnp.sqrt(epsilon) * cost)
+        stalled = lost & (full_decrease > jnp.sqrt(epsilon) * cost)
         hopeless = stalled | (damping > LARGEST_DAMPING) | (first & ~finite)
         new_state = _State(
             steps=state.steps + 1,
@@ -121,7 +121,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             gradient=gradient,
             normal=normal,
             predicted=predicted,
-            promise=promise,
+            full_decrease=full_decrease,
             damping=damping,
             growth=growth,
             beside=beside,
@@ -177,7 +177,8 @@ def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array
 def _projected_step(
     y: Array, gradient: Array, normal: Array, damping: Array, least: Array
 ) -> tuple[Array, Array, Array]:
-    """The next trial in the box, the decrease that the quadratic model promises there, and the most it could promise.
+    """The next trial in the box, the decrease that the quadratic model predicted decrease there, and the most it could
+    predicted decrease.
 
     The last belongs to the undamped step of all parameters that are not held, as if there were no box, but no more than
     the slope gives on the way to the faces of the box: it bounds what is left to gain.
@@ -192,16 +193,16 @@ def _projected_step(
     held = ((y <= 0) & (gradient >= 0)) | ((y >= 1) & (gradient <= 0))
     none = jnp.zeros_like(y)
     weak = held | short
-    promise = -0.5 * jnp.vdot(jnp.where(weak, 0.0, slope), _damped_solve(matrix, slope, none, weak, least))
+    full_decrease = -0.5 * jnp.vdot(jnp.where(weak, 0.0, slope), _damped_solve(matrix, slope, none, weak, least))
     slack = jnp.where(held, 0.0, jnp.abs(gradient) * jnp.where(gradient > 0, y, 1.0 - y))
-    promise = jnp.minimum(promise + jnp.sum(jnp.where(short, slack, 0.0)), jnp.sum(slack))
+    full_decrease = jnp.minimum(full_decrease + jnp.sum(jnp.where(short, slack, 0.0)), jnp.sum(slack))
     stopped, inside = held, none
     for _ in range(PASSES):  # what leaves the box stops at its face; the others are solved for again with that known
         step = _damped_solve(matrix, slope, inside / scale, stopped, damping) * scale
         inside = jnp.clip(y + step, 0.0, 1.0) - y
         stopped = stopped | (inside != step)
     step = jnp.clip(y + step, 0.0, 1.0) - y
-    return y + step, -(jnp.vdot(gradient, step) + 0.5 * step @ normal @ step), promise
+    return y + step, -(jnp.vdot(gradient, step) + 0.5 * step @ normal @ step), full_decrease
 
 
 def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, damping: Array) -> Array:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
 """Tangent of the half vector, over alpha, at which facets are half as many as along the normal."""
 
-READINGS = 2.0
+STEPS = 2.0
 """That a lobe has to hold within its full width at half maximum."""
 
 NEAR = 10.0
@@ -34,7 +34,7 @@ def instrument_limits(fit: "Fit") -> dict[str, float]:
     """
     instrument = fit.problem.instrument
     aperture = 0.0 if instrument is None else math.hypot(instrument.source_aperture, instrument.detector_aperture)
-    resolved = max(aperture, READINGS * finest_step(fit.problem.data.used()))
+    resolved = max(aperture, STEPS * finest_step(fit.problem.data.used()))
     if not (resolved > 0.0 and isinstance(fit.problem.stack, lj.Stack | lj.Mixture)):
         return {}
     found = {}

@@ -12,18 +12,19 @@ import numpy as np
 
 import layerjax as lj
 from fits.optimise import apertures
-from fits.optimise.multi_start import End, Solver, bounded_end, rough_end, unit_of
-from fits.optimise.polish import EQUALLY_WELL, Optimum, optimum
-from fits.optimise.resolution import ENOUGH, Resolutions, Values
-from fits.problem.base import Posed
-from fits.problem.problem import Problem
+from fits.optimise.multi_start import Solver, StartOutcome, bounded_descent, rough_descent, unit_of
+from fits.optimise.options import FitOptions
+from fits.optimise.polish import Optimum, polish
+from fits.optimise.resolution import Resolutions, Values
+from fits.problem.model import Density
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress
 
-ALIKE = 0.01
+SAME_OUTCOME = 0.01
 """Of the box: ends that are closer in every parameter are fitted again as one."""
 
-SLIGHT = 0.5 * ENOUGH
-"""An error of nodes or of modes that is left where the other is what has to be finer."""
+MINOR_SHARE = 0.5
+"""Of the numerical error that is allowed: left to nodes or modes where the other is what has to be finer."""
 
 MOST_MINIMA = 8
 """Minima that are fitted again, at most, other than those that turn out to be the best."""
@@ -38,7 +39,12 @@ class Accuracy(NamedTuple):
 
 
 def refined(
-    at: Optimum, known: Mapping[str, Resolutions], open_rays: Set[str], solver: Solver, progress: Progress
+    at: Optimum,
+    known: Mapping[str, Resolutions],
+    open_rays: Set[str],
+    solver: Solver,
+    options: FitOptions,
+    progress: Progress,
 ) -> tuple[Optimum, Accuracy]:
     """The optimum at the resolution that the noise of each measurement asks for; at the given one where one is given.
 
@@ -54,12 +60,14 @@ def refined(
             if name in known:
                 one = known[name]
                 values = Values(problem, own[name], vector, shares[name])
-                needed[name], error, finest = _needed(one, own[name], values, progress)
+                needed[name], error, finest = _needed(one, own[name], values, options.numerical_error, progress)
                 parts.append(_accuracy(one.in_words(own[name]), error, finest, one.open))
                 if needed[name] != own[name] and one.open:
                     changed[name] = replace(problem, transport=needed[name])
             if apertures.has_rays(problem):
-                rays = apertures.needed(problem, vector, shares[name], name in open_rays, progress)
+                rays = apertures.needed(
+                    problem, vector, shares[name], name in open_rays, options.numerical_error, progress
+                )
                 parts.append(_accuracy(apertures.in_words(rays.rings), rays.error, False, name in open_rays))
                 if rays.rings != apertures.rings_of(problem):
                     changed[name] = apertures.with_rings(changed.get(name, problem), rays.rings)
@@ -70,8 +78,8 @@ def refined(
         own = needed
         problem = at.problem.with_problems(changed)
         words = _listed({name: resolution_in_words(problem.problems[name], known.get(name)) for name in found})
-        ends = _fitted_again(at, problem, solver, words, progress)
-        again = optimum(problem, ends, solver, check=at.improved)
+        ends = _fitted_again(at, problem, solver, words, options.equivalent_cost, progress)
+        again = polish(problem, ends, solver, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
 
 
@@ -99,7 +107,7 @@ def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
 
 
 def _needed(
-    known: Resolutions, own: lj.AddingDoubling, values: Values, progress: Progress
+    known: Resolutions, own: lj.AddingDoubling, values: Values, allowed: float, progress: Progress
 ) -> tuple[lj.AddingDoubling, float, bool]:
     """The coarsest resolution from its own on that is fine enough, its error, and whether it is the finest there is."""
 
@@ -112,9 +120,9 @@ def _needed(
     if finer is None:
         return own, error(known.coarser(own), own), True
     found = error(own, finer)
-    while known.open and found > ENOUGH:
+    while known.open and found > allowed:
         parts = known.partly_finer(own, finer)
-        own = next((part for part in parts if error(part, finer) <= SLIGHT), finer)
+        own = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
         finer = known.finer(own)
         if finer is None:
             return own, found, True
@@ -139,15 +147,17 @@ def _of_both(parts: Sequence[Accuracy]) -> Accuracy:
     return Accuracy(resolution, error, f"numerical error of the model: {words}")
 
 
-def _fitted_again(at: Optimum, problem: Posed, solver: Solver, words: str, progress: Progress) -> list[End]:
+def _fitted_again(
+    at: Optimum, problem: FittingProblem, solver: Solver, words: str, equivalent: float, progress: Progress
+) -> list[StartOutcome]:
     """The ends at another resolution: those that matter fitted again, the cost of the others there."""
-    solve = rough_end if solver == "least_squares" else bounded_end
-    groups = _alike(at)
+    solve = rough_descent if solver == "least_squares" else bounded_descent
+    groups = _grouped(at)
     before = [at.ends[group[0]] for group in groups]
     ends = [end._replace(cost=_cost(problem, end)) for end in before]
     moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
     behind = np.array([end.cost - before[0].cost for end in before])
-    matter = np.flatnonzero(~(behind > EQUALLY_WELL * at.excess + np.fmax(moved, moved[0])))
+    matter = np.flatnonzero(~(behind > equivalent * at.excess + np.fmax(moved, moved[0])))
     wanted, done = [int(index) for index in matter[:MOST_MINIMA]], 0
     fitted: set[int] = set()
     while wanted:
@@ -166,7 +176,7 @@ def _fitted_again(at: Optimum, problem: Posed, solver: Solver, words: str, progr
     return result
 
 
-def _alike(at: Optimum) -> list[list[int]]:
+def _grouped(at: Optimum) -> list[list[int]]:
     """Places of the ends with a finite cost, in groups of ends that lie close together, lowest first."""
     groups: list[list[int]] = []
     units = [unit_of(at.problem, end.vector) for end in at.ends]
@@ -175,7 +185,7 @@ def _alike(at: Optimum) -> list[list[int]]:
         if not np.isfinite(at.ends[index].cost):
             continue
         for group in groups:
-            if np.max(np.abs(units[index] - units[group[0]])) < ALIKE:
+            if np.max(np.abs(units[index] - units[group[0]])) < SAME_OUTCOME:
                 group.append(index)
                 break
         else:
@@ -183,7 +193,7 @@ def _alike(at: Optimum) -> list[list[int]]:
     return groups
 
 
-def _cost(problem: Posed, end: End) -> float:
+def _cost(problem: FittingProblem, end: StartOutcome) -> float:
     """What the end of another resolution costs at the problem's own; infinite where that is not finite."""
-    cost = float(problem.call("cost_at", end.vector, problem.predict(end.vector)))
+    cost = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
     return cost if np.isfinite(cost) else np.inf

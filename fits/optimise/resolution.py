@@ -16,13 +16,11 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.problem.model import Density, Model
 from fits.problem.problem import Problem
 from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
-
-ENOUGH = 0.1
-"""Numerical error of the model, in standard deviations of the data, that no fit needs to fall below."""
 
 FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
 """The finest resolution of starts: what is finer costs more than it tells far away from the data."""
@@ -170,17 +168,17 @@ class Values:
         predicted = self._known[transport]
         if self.problem.objective == "likelihood":
             return predicted
-        return np.asarray(self.problem.call("standardised_at", self.vector, predicted), float)
+        return np.asarray(self.problem.call(Model.standardised_at, self.vector, predicted), float)
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and errors of the model
-    where readings share them; for a named objective the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy
+    with model discrepancy; for a named objective the scatter of its residuals, one number."""
     if problem.objective == "likelihood":
-        sigma = np.asarray(problem.call("sigma_at", vector, predicted), float)
+        sigma = np.asarray(problem.call(Density.sigma_at, vector, predicted), float)
         shared = problem.build(vector).correlation
         return sigma if shared is None else np.hypot(sigma, float(shared.amplitude) * predicted)
-    residuals = np.asarray(problem.call("standardised_at", vector, predicted), float)
-    data = np.asarray(problem.call("standardised_at", vector, np.zeros_like(predicted)), float)
+    residuals = np.asarray(problem.call(Model.standardised_at, vector, predicted), float)
+    data = np.asarray(problem.call(Model.standardised_at, vector, np.zeros_like(predicted)), float)
     scatter = np.sqrt(np.sum(residuals**2) / max(problem.count - len(vector), 1))
     return np.maximum(scatter, LEAST_SCATTER * np.sqrt(np.mean(data**2)))

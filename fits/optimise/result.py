@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fits._lazy import shown_by
 from fits.optimise.identifiability import Direction
+from fits.problem.model import Density
 from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,7 @@ class Minimum:
 
 @dataclass(frozen=True)
 class WithoutDiscrepancy:
-    """The same stack fitted with noise that readings do not share: values and standard errors by name, how well.
+    """The same stack fitted with independent noise: values and standard errors by name, how well.
 
     residual_autocorrelation: of neighbours along the scans. pairs: of them.
     """
@@ -71,7 +72,7 @@ class Fit:
             `errors` and `covariance` are of the best alone; `fits.sample`, `fits.predict` and `fits.evidence` count all
             that hold a share of the posterior.
         insensitive: names of the parameters that the data say nothing about.
-        settings: starts, seed and solver.
+        settings: starts, seed, solver, and the numbers of `FitOptions`.
         start_outcomes: how many starts ended where: "best minimum", "local minima", "maximum steps reached", "failed".
         numerical_error: of the model at the best values, in standard deviations of the data (for a named objective, of
             the residuals): the largest, as the difference from a finer resolution tells, or where that is out of reach
@@ -99,7 +100,7 @@ class Fit:
     minima: tuple[Minimum, ...]
     alternatives: tuple[Minimum, ...]
     insensitive: tuple[str, ...] = ()
-    settings: Mapping[str, int | str] = field(default_factory=dict)
+    settings: Mapping[str, int | float | str] = field(default_factory=dict)
     start_outcomes: Mapping[str, int] = field(default_factory=dict)
     numerical_error: float | None = None
     resolution: str | None = None
@@ -112,7 +113,7 @@ class Fit:
         values = ", ".join(
             f"{name} {value:.4g} ± {self.standard_errors[name]:.2g}" for name, value in self.values.items()
         )
-        return f"<Fit to {self.problem.count} readings: {values}; {self.status}>"
+        return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
         return str(shown_by("fits.reports.notebook:fit_fragment", self))
@@ -219,12 +220,12 @@ class Fit:
         With correlated noise these are whitened: K^-1/2 times the differences, with K their covariance. Under the
         assumed model they are independent standard normal; `chi_square` is the sum of their squares.
         """
-        return np.asarray(self.problem.call("independent_at", self.vector, self.predicted), float)
+        return np.asarray(self.problem.call(Density.whitened_residuals_at, self.vector, self.predicted), float)
 
     @cached_property
     def chi_square(self) -> float:
         """Sum of squared `residuals`, with correlated noise by its covariance; a named objective's has no scale."""
-        return float(self.problem.call("chi_square_at", self.vector, self.predicted))
+        return float(self.problem.call(Density.chi_square_at, self.vector, self.predicted))
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -241,7 +242,7 @@ class Fit:
         """Normalised log-likelihood of the best values; NaN for a named objective."""
         if not self.is_posterior:
             return float("nan")
-        return float(self.problem.call("log_likelihood_at", self.vector, self.predicted))
+        return float(self.problem.call(Density.log_likelihood_at, self.vector, self.predicted))
 
     @property
     def correlation(self) -> Floats:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.optimise.descent import here
+from fits.optimise.descent import evaluate_at
 from fits.optimise.identifiability import (
     UNKNOWN_BEYOND,
     Direction,
@@ -19,10 +19,10 @@ from fits.optimise.identifiability import (
     square,
     unidentified_directions,
 )
-from fits.problem.base import Posed
+from fits.problem.problem import FittingProblem
 
 ON_BOUND = 1e-6  # of the box
-LEAST_PULL = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
+LEAST_GRADIENT = 1e-6  # of the log-posterior, over the whole box: what pushes less against a bound does not push
 
 Floats = NDArray[np.float64]
 
@@ -31,9 +31,9 @@ Floats = NDArray[np.float64]
 class Uncertainty:
     """Errors at an optimum with P parameters, in physical units.
 
-    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (one without influence
-    lies where it happens to). Errors, covariance and
-    condition number are conditional on these values; their own errors are NaN and their rows of the covariance 0.
+    at_bound: (P,) bool: the value lies on a bound and the fit would go on improving beyond it (an insensitive one lies
+    where it happens to). Errors, covariance and condition number are conditional on these values; their own errors are
+    NaN and their rows of the covariance 0.
     standard_errors: (P,), infinite where nothing holds a parameter.
     unidentified: the combinations that the data do not resolve, of all parameters, also those at a bound.
     insensitive: names of those that the data say nothing about at all.
@@ -49,14 +49,14 @@ class Uncertainty:
     predicted: Floats
 
 
-def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
+def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncertainty:
     """Errors at the optimum `vector` (P,) with this `cost`; a named objective's are scaled by its residual variance.
 
     Where the model is not finite nothing is known: all errors are infinite.
     """
     box, count = problem.model.box, len(vector)
     unit = np.asarray(box.to_unit(jnp.asarray(vector)), float)
-    found = here(problem, unit)
+    found = evaluate_at(problem, unit)
     data_root, gradient = found.root, found.gradient
     if not (np.isfinite(found.cost) and np.all(np.isfinite(data_root))):
         nowhere = np.zeros(count, bool)
@@ -65,7 +65,7 @@ def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
     scatter = 1.0  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
-    data_root, pull = data_root / np.sqrt(scatter), LEAST_PULL * scatter
+    data_root, pull = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
     idle = insensitive(data_root, problem.names)
     at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
     at_bound &= ~np.isin(problem.names, idle)
@@ -82,12 +82,12 @@ def uncertainty(problem: Posed, vector: Floats, cost: float) -> Uncertainty:
     return Uncertainty(at_bound, errors, covariance, condition_number(data_root), unidentified, idle, found.predicted)
 
 
-def local_information(problem: Posed, unit: Floats) -> tuple[Floats, Floats, float]:
+def local_information(problem: FittingProblem, unit: Floats) -> tuple[Floats, Floats, float]:
     """Rows of A, of the data and the prior, (rows, P), anywhere in the unit box: A'A is the information in boxes^-2.
 
     And the gradient of the negative log-posterior there, (P,), in boxes^-1, and this itself up to a constant.
     """
-    found = here(problem, unit)
+    found = evaluate_at(problem, unit)
     return np.vstack([found.root, _prior_root(problem)]), found.gradient, float(found.cost)
 
 
@@ -102,7 +102,7 @@ def condition_number(root: Floats) -> float:
     return float(values[0] / values[-1]) if values[-1] > 0 else float("inf")
 
 
-def _prior_root(problem: Posed) -> Floats:
+def _prior_root(problem: FittingProblem) -> Floats:
     """Rows (P + Q, P) of the prior's information, in boxes^-1."""
     return np.asarray(problem.model.box.prior_slopes(), float)
 

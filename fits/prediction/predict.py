@@ -409,7 +409,7 @@ def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats
         return values
     _, floor = (np.asarray(part, float) for part in fit.problem.call(_noise_levels, fit.vector[None]))
     softness = _softness(fit, np.hypot(_stated_sigma(fit, values[None], None), floor))
-    discrepancy = np.asarray(fit.problem.call("discrepancy_at", fit.vector, fit.predicted, places(wi, wo))[0])
+    discrepancy = np.asarray(fit.problem.call(Model.discrepancy_at, fit.vector, fit.predicted, places(wi, wo))[0])
     return softness * np.sinh(np.asarray(logarithm(values, softness)) + discrepancy)
 
 

@@ -18,7 +18,7 @@ MOST_RINGS = 8
 """Of a cone."""
 
 MOST_PAIRS = 1500
-"""Of rays that stand for a reading: more rings are not taken for two cones."""
+"""Of rays that stand for a measurement: more rings are not taken for two cones."""
 
 PER_RING, AT_NONE = 0.41, 0.16
 """Radius of a disc in widths of a lobe that n rings resolve: the first times n, less the second."""
@@ -61,7 +61,7 @@ def most_rings(source: float, detector: float) -> int:
 
 
 def ray_counts(source: Floats, detector: Floats, other: bool = False) -> NDArray[np.int64]:
-    """Rings of the source, of the detector, and pairs of azimuths, for each reading, (N, 3).
+    """Rings of the source, of the detector, and pairs of azimuths, for each measurement, (N, 3).
 
     source, detector: (N,), radii of the discs in widths of the lobe, 0 for a single direction. other: a ring more of
     each, or one less where that would be too many: the difference tells the error.

@@ -1,4 +1,4 @@
-"""A transport's totals as a forward model: what a sphere takes in of a stack's light, reading by reading."""
+"""A transport's totals as a forward model: what a sphere takes in of a stack's light, measurement by measurement."""
 
 from typing import Any
 
@@ -23,9 +23,9 @@ class Totalling(eqx.Module):
 
     Attributes:
         transport: a layerjax transport, or "auto".
-        kinds: of the N readings.
+        kinds: of the N measurements.
         asked: rows with different lights, which are solved for.
-        light: the place among these of each reading's.
+        light: the place among these of each measurement's.
         spheres: that read them; None: shares of the sample alone.
     """
 
@@ -37,7 +37,7 @@ class Totalling(eqx.Module):
 
     @classmethod
     def of(cls, totals: Totals, transport: Any) -> "Totalling":
-        """The totals of these readings, by a transport that is no function of the user's own."""
+        """The totals of these measurements, by a transport that is no function of the user's own."""
         if not isinstance(transport, lj.Transport) and transport != "auto":
             raise ValueError(f"transport is {transport!r}; totals take a layerjax transport, or 'auto'")
         _, asked, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)

@@ -1,7 +1,7 @@
-"""What stands between a BSDF and its readings: apertures, a sample that leans, gains, a floor.
+"""What stands between a BSDF and its measurements: apertures, a tilted sample, gains, a floor.
 
-A reading is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. How many pairs
-of directions that takes follows from how wide the cones are beside the lobes of the stack: see `rays`.
+A measurement is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. How many
+pairs of directions that takes follows from how wide the cones are beside the lobes of the stack: see `rays`.
 """
 
 import math
@@ -24,8 +24,8 @@ from layerjax.transport.known_directions import KnownDirections, known_direction
 
 Floats = NDArray[np.float64]
 
-WIDEST, LEANS_MOST, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
-"""Degrees of a cone, degrees that a sample may lean, and relative standard deviations of gains."""
+WIDEST, MOST_TILT, GAIN_SPREADS = 30.0, 10.0, (1e-4, 1.0)
+"""Degrees of a cone, degrees that a sample may be tilted, and relative standard deviations of gains."""
 
 GAINS_END = 6.0
 """Standard deviations of their logarithm at which gains are bounded."""
@@ -33,13 +33,13 @@ GAINS_END = 6.0
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument by which readings were taken. Angles in degrees.
+    """An instrument by which measurements were taken. Angles in degrees.
 
     source_aperture, detector_aperture: full angles of the cones, in [0, 30]; a measurement is the mean over them, which
     costs four times as much where a lobe may be narrow, more where one is narrower than the cones, and nothing
     elsewhere.
-    tilt: how far the sample's normal leans towards the mirror side of the plane of incidence, in [-10, 10]; a number,
-    `Free`, or None for 0.
+    tilt: by how much the sample's normal is tilted towards the mirror side of the plane of incidence, in [-10, 10]; a
+    number, `Free`, or None for 0.
     gain_sd: relative standard deviation, in [1e-4, 1], of a factor of its own that every polar angle of the
     light has, at all azimuths, beside the common scale, with a log-normal prior about 1 that they share; None: none.
     floor: of the noise, in 1/sr: as `Noise.floor`, in whose place it stands.
@@ -63,9 +63,9 @@ class Instrument:
             if self.tilt.shape != ():
                 raise ValueError("Instrument.tilt has channels; it must be a single number")
             for end in ("low", "high"):
-                _require(f"tilt.{end}", getattr(self.tilt, end), -LEANS_MOST, LEANS_MOST)
+                _require(f"tilt.{end}", getattr(self.tilt, end), -MOST_TILT, MOST_TILT)
         elif self.tilt is not None:
-            _require("tilt", self.tilt, -LEANS_MOST, LEANS_MOST)
+            _require("tilt", self.tilt, -MOST_TILT, MOST_TILT)
         if self.gain_sd is not None:
             _require("gain_sd", self.gain_sd, *GAIN_SPREADS)
         if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
@@ -85,11 +85,11 @@ class Setting(NamedTuple):
 
 
 class Optics(eqx.Module):
-    """Pairs of directions that stand for N readings: K of them, each a share of a reading.
+    """Pairs of directions that stand for N measurements: K of them, each a share of a measurement.
 
-    wi, wo: (K, 3). row: (K,), the reading; share: (K,), of it; None where each is one of its own. forward: (K, 2), the
-    horizontal unit vector towards the mirror side; None where it is known how the sample leans. incidence: (N,), whose
-    gain it has; None where there are none.
+    wi, wo: (K, 3). row: (K,), the measurement; share: (K,), of it; None where each is one of its own. forward: (K, 2),
+    the horizontal unit vector towards the mirror side; None where it is known how the sample is tilted. incidence:
+    (N,), whose gain it has; None where there are none.
     """
 
     wi: Array
@@ -101,10 +101,10 @@ class Optics(eqx.Module):
     known: KnownDirections | None
 
     def seen(self, values: Any, setting: Setting, count: int) -> Array:
-        """Readings (N, C), where values(wi, wo, known) is the BSDF (K, C)."""
+        """Measurements (N, C), where values(wi, wo, known) is the BSDF (K, C)."""
         wi, wo = self.wi, self.wo
         if self.forward is not None:
-            wi, wo = (_leaning(w, self.forward, setting.tilt) for w in (wi, wo))
+            wi, wo = (_tilted(w, self.forward, setting.tilt) for w in (wi, wo))
         found = values(wi, wo, self.known)
         if self.row is not None:
             assert self.share is not None
@@ -116,7 +116,7 @@ class Optics(eqx.Module):
 
 
 def setting_of(instrument: Instrument, incidences: Floats) -> Setting:
-    """Its free numbers and those that are known, for readings with these K polar angles of the light."""
+    """Its free numbers and those that are known, for measurements with these K polar angles of the light."""
     gains = None
     if instrument.gain_sd is not None:
         spread = instrument.gain_sd
@@ -134,24 +134,24 @@ def optics_of(
     follow: bool,
     other: bool = False,
 ) -> Optics:
-    """What stands for readings along these directions, (N, 3) each, of a stack, `Free` or not.
+    """What stands for measurements along these directions, (N, 3) each, of a stack, `Free` or not.
 
     incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
     other numbers of rays, see `ray_counts`.
     """
     gain = None if instrument.gain_sd is None else _which(wi, incidences)
-    free, lean = isinstance(instrument.tilt, Free), 0.0
+    free, tilt = isinstance(instrument.tilt, Free), 0.0
     forward = _forward(wi) if instrument.tilt else None
     if isinstance(instrument.tilt, Free):
-        lean = float(np.max(np.abs(instrument.tilt.arrays()[1:])))
+        tilt = float(np.max(np.abs(instrument.tilt.arrays()[1:])))
     elif forward is not None:
-        wi, wo = (np.asarray(_leaning(w, forward, instrument.tilt), float) for w in (wi, wo))
+        wi, wo = (np.asarray(_tilted(w, forward, instrument.tilt), float) for w in (wi, wo))
         forward = None
     row = share = None
     pairs, widths = (wi, wo), (instrument.source_aperture, instrument.detector_aperture)
     if (
         instrument.has_cones
-        and (spread := spread_over_lobes(*widths, stack, wi, wo, lean, instrument.rings)).matters.any()
+        and (spread := spread_over_lobes(*widths, stack, wi, wo, tilt, instrument.rings)).matters.any()
     ):
         pairs, row, share = _cones(instrument, wi, wo, spread, other)
         forward = None if forward is None else forward[row]  # a sample leans one way, whichever ray of a cone it meets
@@ -168,8 +168,8 @@ def optics_of(
 
 def rings_for(instrument: Instrument, setting: Setting, stack: Any, wi: Floats, wo: Floats) -> int:
     """Rings of rays of a cone that the lobes of a stack ask for, none of it `Free`, along directions (N, 3) each."""
-    lean = 0.0 if setting.tilt is None else abs(float(setting.tilt))
-    spread = spread_over_lobes(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, lean)
+    tilt = 0.0 if setting.tilt is None else abs(float(setting.tilt))
+    spread = spread_over_lobes(instrument.source_aperture, instrument.detector_aperture, stack, wi, wo, tilt)
     if not spread.matters.any():
         return 1
     return int(np.max(ray_counts(spread.source[spread.matters], spread.detector[spread.matters])[:, :2]))
@@ -247,7 +247,7 @@ def _forward(wi: Floats) -> Floats:
     return -np.where(away, _horizontal(wi), [math.cos(turn), math.sin(turn)])
 
 
-def _leaning(w: Any, forward: Any, offset: Any) -> Array:
+def _tilted(w: Any, forward: Any, offset: Any) -> Array:
     """Directions (K, 3) as a sample sees them whose normal leans forward by so many degrees."""
     angle = jnp.radians(offset)
     cosine, sine = jnp.cos(angle), jnp.sin(angle)

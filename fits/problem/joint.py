@@ -1,7 +1,7 @@
-"""Several measurements with parameters in common: one likelihood, the product of theirs."""
+"""Several data sets with parameters in common: one likelihood, the product of theirs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,30 +13,26 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from fits.names import Objective
-from fits.problem.base import Assembled, Floats, Posed
-from fits.problem.density import Density
-from fits.problem.model import Model, half_squares
+from fits.problem.model import Density, Model
 from fits.problem.parameters import Box
-from fits.problem.problem import Problem
+from fits.problem.problem import Assembled, FittingProblem, Floats, Problem
 
 OF_EACH = tuple(field for field in Box.__dataclass_fields__ if field != "between")
 """What a box holds of each parameter."""
 
 
 class JointParts(NamedTuple):
-    """What a vector makes of each measurement, by its name: stacks, and calibration factors."""
+    """What a vector makes of each data set, by its name: stacks, and calibration factors."""
 
     stack: dict[str, Any]
     scale: dict[str, Any]
 
 
 class JointModel(Density):
-    """Pure functions of the physical vector (P,) over the readings of all measurements, one after the other, (N, 1).
-
-    They are those of `Model`, and stand under the same names.
+    """The density of several data sets, one after the other, (N, 1): the product of theirs.
 
     Attributes:
-        parts: the models of the measurements.
+        parts: the densities of the data sets.
         own: for each of them, the places of its parameters in the vector.
         box: bounds and priors of the P parameters.
     """
@@ -44,99 +40,80 @@ class JointModel(Density):
     parts: tuple[Model, ...]
     box: Box
     own: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    varying: bool = eqx.field(static=True)
 
     @property
     def objective(self) -> Objective:
-        """Measurements are weighed against each other by their noise alone."""
+        """Data sets are weighed against each other by their noise alone."""
         return "likelihood"
 
     @property
     def values(self) -> Array:
-        """BSDF of all readings, (N, 1), in 1/sr."""
+        """BSDF of all measurements, (N, 1), in 1/sr."""
         return _column([part.values for part in self.parts])
 
     @property
-    def varying(self) -> bool:
-        """Whether sigma of any measurement depends on the parameters."""
-        return any(part.varying for part in self.parts)
-
-    @property
     def logarithmic(self) -> tuple[int, ...]:
-        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
+        """See `Density`."""
         return (2,) if any(part.logarithmic for part in self.parts) else ()
 
     @property
     def rows(self) -> int:
-        """Number of `residuals` without those of the prior."""
+        """See `Density`."""
         return sum(part.rows for part in self.parts)
 
     def vectors(self, vector: Array) -> list[Array]:
-        """The parameters of each measurement."""
+        """The parameters of each data set."""
         return [vector[np.array(own)] for own in self.own]
 
     def predict(self, vector: Array) -> Array:
-        """Scaled BSDF of all readings."""
+        """See `Density`."""
         return _column([part.predict(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)])
 
-    def near_sigma(self, vector: Array) -> Array:
-        """See `Model.near_sigma`."""
-        return _column([part.near_sigma(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)])
+    def initial_sigma(self, vector: Array) -> Array:
+        """See `Density`."""
+        return _column([part.initial_sigma(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)])
 
     def sigma_at(self, vector: Array, predicted: Array) -> Array:
-        """Scale of the noise."""
-        return self._each("sigma_at", vector, predicted)
+        """See `Density`."""
+        return _column(self._each(Model.sigma_at, vector, predicted))
 
     def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Model.offsets_at`."""
-        return self._each("offsets_at", vector, predicted)
+        """See `Density`."""
+        return _column(self._each(Model.offsets_at, vector, predicted))
 
-    def unshared_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Model.unshared_at`."""
-        return self._each("unshared_at", vector, predicted)
+    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return _column(self._each(Model.offsets_after_discrepancy_at, vector, predicted))
 
-    def independent_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Model.independent_at`."""
-        return self._each("independent_at", vector, predicted)
+    def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return _column(self._each(Model.whitened_residuals_at, vector, predicted))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-density of each reading; where readings share errors, given all others."""
-        return self._each("log_likelihood_per_datum_at", vector, predicted)
-
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """The same with these parameters."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+        """See `Density`."""
+        return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """Of all measurements."""
-        return jnp.sum(self._each("chi_square_at", vector, predicted))
+        """See `Density`."""
+        return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-likelihood of all readings, from what the parameters predict, (N, 1)."""
-        return jnp.sum(self._each("log_likelihood_at", vector, predicted))
+        """See `Density`."""
+        return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))
 
-    def log_likelihood(self, vector: Array) -> Array:
-        """Normalised log-likelihood of all readings."""
-        found = [part.log_likelihood(own) for part, own in zip(self.parts, self.vectors(vector), strict=True)]
-        return jnp.sum(jnp.stack(found))
-
-    def cost_at(self, vector: Array, predicted: Array) -> Array:
-        """Half the sum of squared residuals with these parameters and what they predict, (N, 1)."""
-        vectors, shares = self.vectors(vector), self._shares(predicted)
-        found = [part.residuals_at(own, share) for part, own, share in zip(self.parts, vectors, shares, strict=True)]
-        return half_squares(self._gathered(vector, found))
-
-    def residuals(self, vector: Array) -> tuple[Array, ...]:
-        """Arrays whose half sum of squares is minus the log-posterior up to a constant: see `Model.residuals`."""
-        return self.linear_parts(vector)[0]
+    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
+        """See `Density`."""
+        return self._together(vector, self._each(Model.residuals_at, vector, predicted))
 
     def linear_parts(
         self, vector: Array, first_step: tuple[Array, Array] | None = None
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        """See `Model.linear_parts`; each measurement is differentiated by its own parameters alone."""
+        """See `Density`; each data set is differentiated by its own parameters alone."""
         steps: Sequence[tuple[Array, Array] | None] = [None] * len(self.parts)
         if first_step is not None:
             held, shared = first_step
-            sigmas = [held] * len(self.parts) if held.size == 1 else self._shares(held)
+            sigmas = [held] * len(self.parts) if held.size == 1 else self._split(held)
             steps = [(sigma, shared) for sigma in sigmas]
         residuals, predicted, rows = [], [], []
         for part, own, step in zip(self.parts, self.vectors(vector), steps, strict=True):
@@ -144,32 +121,33 @@ class JointModel(Density):
             residuals.append(found)
             predicted.append(values)
             rows.append(information)
-        return self._gathered(vector, residuals), (_column(predicted), jnp.concatenate(rows))
+        return self._together(vector, residuals), (_column(predicted), jnp.concatenate(rows))
 
-    def _gathered(self, vector: Array, found: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
-        """Residuals of the measurements as those of all: data, prior, levels of noise."""
+    def _together(self, vector: Array, found: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
+        """Residuals of the data sets as those of all: data, prior, levels of noise."""
         levels = [level.reshape(-1) for _, _, *levels in found for level in levels]
         data = jnp.concatenate([residuals[0].reshape(-1) for residuals in found])
         return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))
 
-    def _shares(self, column: Array) -> list[Array]:
-        """What of a column (N, 1) belongs to each measurement, in the shape of its values."""
+    def _split(self, column: Array) -> list[Array]:
+        """What of a column (N, 1) belongs to each data set, in the shape of its values."""
         shapes = [part.values.shape for part in self.parts]
         split = jnp.split(column[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         return [share.reshape(shape) for share, shape in zip(split, shapes, strict=True)]
 
-    def _each(self, name: str, vector: Array, predicted: Array) -> Array:
-        vectors, shares = self.vectors(vector), self._shares(predicted)
-        return _column(
-            [getattr(part, name)(own, share) for part, own, share in zip(self.parts, vectors, shares, strict=True)]
-        )
+    def _each(self, function: Callable[[Model, Array, Array], Any], vector: Array, predicted: Array) -> list[Any]:
+        """What a function says of each data set."""
+        return [
+            function(part, own, share)
+            for part, own, share in zip(self.parts, self.vectors(vector), self._split(predicted), strict=True)
+        ]
 
 
-class Joint(Posed):
-    """Measurements that are fitted together, each a `Problem` of its own, with parameters in common.
+class Joint(FittingProblem):
+    """Data sets that are fitted together, each a `Problem` of its own, with parameters in common.
 
     It stands in the place of a stack and its data: `fits.fit(fits.Joint({...}, shared=[...]))`. What is found of one
-    measurement is `Fit.part(name)`, and `Posterior.part(name)`.
+    data set is `Fit.part(name)`, and `Posterior.part(name)`.
 
     Args:
         parts: the problems by name, two or more, each with a likelihood.
@@ -205,6 +183,7 @@ class Joint(Posed):
                 places.append(names.index(name) if self._is_shared(name) else len(names) - 1)
             own.append(tuple(places))
         models = tuple(problem.model for problem in self.parts.values())
+        varying = any(one.varying for one in models)
         start, low, high = (
             _gathered(len(names), own, [getattr(problem, bound) for problem in self.parts.values()])
             for bound in ("start", "low", "high")
@@ -216,11 +195,13 @@ class Joint(Posed):
             },
             between=jnp.asarray(_steps(len(names), own, [np.asarray(m.box.between) for m in models])),
         )
-        return Assembled(tuple(names), start, low, high, JointModel(parts=models, box=box, own=tuple(own)))
+        return Assembled(
+            tuple(names), start, low, high, JointModel(parts=models, box=box, own=tuple(own), varying=varying)
+        )
 
     @property
     def model(self) -> JointModel:
-        """All measurements as pure functions of the physical vector (P,)."""
+        """All data sets as pure functions of the physical vector (P,)."""
         return self._assembled.model
 
     @property
@@ -233,7 +214,7 @@ class Joint(Posed):
         return found
 
     def places(self, part: str) -> tuple[int, ...]:
-        """Where the parameters of one measurement stand in the vector."""
+        """Where the parameters of one data set stand in the vector."""
         if part not in self.parts:
             raise ValueError(f"part {part!r} is not one of {', '.join(self.parts)}")
         return self.model.own[list(self.parts).index(part)]
@@ -251,7 +232,7 @@ class Joint(Posed):
         return self.parts
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
-        """What `predict` gives of each measurement, in the shape of its data."""
+        """What `predict` gives of each data set, in the shape of its data."""
         shapes = [problem.model.values.shape for problem in self.parts.values()]
         split = np.split(predicted[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         return {name: part.reshape(shape) for name, part, shape in zip(self.parts, split, shapes, strict=True)}
@@ -311,7 +292,7 @@ def _same(one: Problem, other: Problem, name: str) -> bool:
 
 
 def _gathered(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarray]) -> Floats:
-    """What each measurement has of its parameters, at their places in the vector; of shared ones, of the first."""
+    """What each data set has of its parameters, at their places in the vector; of shared ones, of the first."""
     found = np.zeros(count, parts[0].dtype)
     for places, values in reversed(list(zip(own, parts, strict=True))):
         found[list(places)] = values
@@ -319,7 +300,7 @@ def _gathered(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarr
 
 
 def _steps(count: int, own: Sequence[Sequence[int]], parts: Sequence[np.ndarray]) -> Floats:
-    """Differences between neighbouring channels of all measurements, (Q, count); of shared ones once."""
+    """Differences between neighbouring channels of all data sets, (Q, count); of shared ones once."""
     found: list[Floats] = []
     for places, rows in zip(own, parts, strict=True):
         for row in rows:

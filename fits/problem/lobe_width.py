@@ -1,4 +1,5 @@
-"""Where a reading has to be the mean over a cone of directions, by what a stack may hold: see `spread_over_lobes`."""
+"""Where a measurement has to be the mean over a cone of directions, by what a stack may hold: see
+`spread_over_lobes`."""
 
 from typing import Any, NamedTuple
 
@@ -31,7 +32,7 @@ Floats = NDArray[np.float64]
 
 
 class Spread(NamedTuple):
-    """How the cones of an instrument lie to the lobes of a stack, at N readings.
+    """How the cones of an instrument lie to the lobes of a stack, at N measurements.
 
     matters: (N,), whether the mean over the cones may differ from their middle by more than `SHIFT`. source, detector:
     (N,), radii of the cones in widths of the lobe there.
@@ -43,7 +44,7 @@ class Spread(NamedTuple):
 
 
 def spread_over_lobes(
-    source: float, detector: float, stack: Any, wi: Floats, wo: Floats, lean: float = 0.0, rings: int | None = None
+    source: float, detector: float, stack: Any, wi: Floats, wo: Floats, tilt: float = 0.0, rings: int | None = None
 ) -> Spread:
     """See `Spread`.
 
@@ -56,7 +57,7 @@ def spread_over_lobes(
         source, detector: full angles of the cones, degrees.
         stack: of free parameters the end counts at which lobes are narrowest; of anything but stacks all may be narrow.
         wi, wo: (N, 3).
-        lean: degrees by which the sample may lean, besides.
+        tilt: degrees by which the sample may be tilted, besides.
         rings: lobes count as no narrower than what so many resolve; None: as they are.
     """
     seen = np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) > TANGENT_COSINE
@@ -69,8 +70,8 @@ def spread_over_lobes(
     half = wi + wo
     passing = wi[:, 2] * wo[:, 2] < 0.0
     square = (radii[0] ** 2 + radii[1] ** 2) / np.maximum(np.sum(half**2, axis=-1), LEAST)
-    tilt = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2])) - np.radians(lean)
-    nearest = np.maximum(np.tan(np.minimum(tilt, STEEPEST)) - np.sqrt(square), 0.0)
+    half_angle = np.arctan2(np.hypot(half[:, 0], half[:, 1]), np.abs(half[:, 2])) - np.radians(tilt)
+    nearest = np.maximum(np.tan(np.minimum(half_angle, STEEPEST)) - np.sqrt(square), 0.0)
     lobe = 2.0 * square / (nearest**2 + facets**2) + 2.0 * square / others**2
     steep = [0.25 * (r / np.maximum(np.abs(w[:, 2]), r)) ** 2 for r, w in zip(radii, (wi, wo), strict=True) if r > 0.0]
     matters = seen & ((np.maximum(lobe, sum(steep)) > SHIFT) | passing)

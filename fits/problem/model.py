@@ -1,9 +1,11 @@
 """What a vector of parameters predicts, and how far that is from the data: pure functions that compile once.
 
-`Model` holds a problem as arrays and static choices, so that one compiled program serves every problem of the same
-structure and shape: new data, bounds or fixed numbers do not recompile.
+A `Density` holds a problem as arrays and static choices, so that one compiled program serves every problem of the same
+structure and shape: new data, bounds or fixed numbers do not recompile. `Model` is that of one data set;
+`fits.problem.joint` has that of several.
 """
 
+import abc
 import math
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, cast
@@ -17,7 +19,6 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.names import Objective
-from fits.problem.density import Density
 from fits.problem.discrepancy.logarithm import logarithm, size
 from fits.problem.discrepancy.process import Process, Whitened
 from fits.problem.discrepancy.whitening import Correlation
@@ -52,8 +53,7 @@ Side = Literal["all", "reflection"]
 class Parts(NamedTuple):
     """What a vector of parameters stands for: the stack, the common scale, and the levels of the noise model.
 
-    instrument: None where there is nothing to say of it. correlation: of errors that readings share, None where they
-    share none.
+    instrument: None where there is nothing to say of it. correlation: of the model discrepancy, None without.
     """
 
     stack: Any
@@ -64,8 +64,116 @@ class Parts(NamedTuple):
     correlation: Correlation | None
 
 
+class Density(eqx.Module):
+    """Pure functions of the physical vector (P,): predictions, residuals and log-densities over all measurements.
+
+    What ends with `_at` takes what the vector predicts, (N, C), beside it, so that nothing is computed twice.
+
+    Attributes:
+        box: bounds and priors of the P parameters.
+        varying: whether sigma depends on the parameters.
+    """
+
+    box: eqx.AbstractVar[Box]
+    varying: eqx.AbstractVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def logarithmic(self) -> tuple[int, ...]:
+        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
+
+    @property
+    @abc.abstractmethod
+    def rows(self) -> int:
+        """Number of `residuals` without those of the prior."""
+
+    @abc.abstractmethod
+    def predict(self, vector: Array) -> Array:
+        """Scaled BSDF, (N, C), in 1/sr."""
+
+    @abc.abstractmethod
+    def initial_sigma(self, vector: Array) -> Array:
+        """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
+
+    @abc.abstractmethod
+    def sigma_at(self, vector: Array, predicted: Array) -> Array:
+        """Scale of the noise, (N, C), in 1/sr."""
+
+    @abc.abstractmethod
+    def offsets_at(self, vector: Array, predicted: Array) -> Array:
+        """(datum - model) / sigma, (N, C); with model discrepancy, of their `logarithm` in units of the datum's noise;
+        for a named objective, datum minus model in its own measure."""
+
+    @abc.abstractmethod
+    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
+        """`offsets_at`, less the model discrepancy that the data imply."""
+
+    @abc.abstractmethod
+    def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
+        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+
+    @abc.abstractmethod
+    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
+        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 without model discrepancy."""
+
+    @abc.abstractmethod
+    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
+        """Normalised log-density of each datum, (N, C); with model discrepancy, given all others."""
+
+    @abc.abstractmethod
+    def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
+        """Normalised log-likelihood of all data."""
+
+    @abc.abstractmethod
+    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
+        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
+
+        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
+        `logarithmic`).
+        """
+
+    @abc.abstractmethod
+    def linear_parts(
+        self, vector: Array, first_step: tuple[Array, Array] | None = None
+    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        """`residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
+
+        The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
+        only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
+
+        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
+        and how much of the model discrepancy counts.
+        """
+
+    def residuals(self, vector: Array) -> tuple[Array, ...]:
+        """`residuals_at` what these parameters predict."""
+        return self.linear_parts(vector)[0]
+
+    def cost_at(self, vector: Array, predicted: Array) -> Array:
+        """Half the sum of squared residuals."""
+        return half_squares(self.residuals_at(vector, predicted))
+
+    def log_likelihood_per_datum(self, vector: Array) -> Array:
+        """`log_likelihood_per_datum_at` what these parameters predict."""
+        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
+
+    def log_likelihood(self, vector: Array) -> Array:
+        """Normalised log-likelihood of all data."""
+        return self.log_likelihood_at(vector, self.predict(vector))
+
+    def log_prior(self, vector: Array) -> Array:
+        """Log-density of the physical vector, -inf outside the bounds."""
+        return self.box.log_prior(vector)
+
+    def log_posterior_unconstrained(self, u: Array) -> Array:
+        """Log-posterior (not normalised) as a density over the unconstrained vector; -inf where undefined."""
+        vector = self.box.constrain(u)
+        total = self.log_likelihood(vector) + self.box.log_prior(vector) + self.box.log_determinant(u)
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+
 class Model(Density):
-    """Pure functions of the physical vector (P,): predictions, residuals and log-densities over the used samples.
+    """The density of one data set: see `Density`.
 
     Attributes:
         template: the stack, scale and noise levels without their free parameters.
@@ -78,9 +186,9 @@ class Model(Density):
         transport: how the values are computed.
         side: "reflection" if all directions lie above.
         known: what is known of the directions beforehand.
-        optics: how an instrument sees them, None where there is nothing to say of it.
-        process: errors that readings share, None where they share none.
-        softness: of their `logarithm`, (N, C), in 1/sr; None where they share none.
+        optics: how an instrument sees them, None for exact directions.
+        process: the model discrepancy, None without.
+        softness: of its `logarithm`, (N, C), in 1/sr; None without.
         objective, tails: see `Problem` and `Noise`.
         varying: whether sigma depends on the parameters.
         moving: so many of them come first, on which predictions depend; the others are those of the noise.
@@ -123,7 +231,7 @@ class Model(Density):
         return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
     def sigma_at(self, vector: Array, predicted: Array) -> Array:
-        """Scale of the noise, (N, C), in 1/sr, with these parameters and what they predict, (N, C)."""
+        """See `Density`."""
         parts = self.build(vector)
         return total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
@@ -134,91 +242,71 @@ class Model(Density):
         return (self.values - predicted) / self.sigma_at(vector, predicted)
 
     def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """`standardised_at`; where readings share errors, of their `logarithm`, in units of the datum's noise."""
+        """See `Density`."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self._logarithmic(predicted, self._noise_at(vector, predicted))[0]
 
-    def unshared_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at`, without the errors that readings share as far as the data tell them."""
+    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
 
-    def independent_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+    def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return -self.process.independent(*scaled, self._correlation(vector))
+        return -self.process.whitened_residuals(*scaled, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 where readings share no errors."""
+        """See `Density`."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
         found = self.whitened_at(vector, predicted, self._noise_at(vector, predicted))
         return jnp.sum(found.residuals**2) + jnp.sum(found.latent**2)
 
     def whitened_at(self, vector: Array, predicted: Array, noise: Array, shared: Array | float = 1.0) -> Whitened:
-        """Residuals without what they share, with these parameters, what they predict and the scale of the noise.
+        """Residuals less the model discrepancy that the data imply, by the scale of the noise.
 
-        shared: what the amplitude of that is multiplied by.
+        shared: factor of the amplitude.
         """
         assert self.process is not None
         return self.process.whitened(*self._logarithmic(predicted, noise), self._correlation(vector, shared))
 
     def discrepancy_at(self, vector: Array, predicted: Array, places: Array) -> tuple[Array, Array]:
-        """What the model's logarithm lacks at other `places`, as far as the data say: mean and sd, (M, C)."""
+        """The model discrepancy at other `places`, as far as the data tell: mean and sd of the logarithm, (M, C)."""
         at = self._correlation(vector)
         assert self.process is not None
         z, relative = self._logarithmic(predicted, self._noise_at(vector, predicted))
-        return self.process.elsewhere(self.process.whitened(z, relative, at), relative, places, at)
+        return self.process.predict(self.process.whitened(z, relative, at), relative, places, at)
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
-        """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
+        """See `Density`."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
 
     @property
     def rows(self) -> int:
-        """Number of `residuals` without those of the prior."""
+        """See `Density`."""
         own = self.values.size * (1 + self.varying)
         return own if self.process is None else own + self.process.rows_beside(self.values.shape[-1])
 
-    def cost_at(self, vector: Array, predicted: Array) -> Array:
-        """Half the sum of squared residuals with these parameters and what they predict, (N, C)."""
-        return half_squares(self.residuals_at(vector, predicted))
-
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """`residuals`, with these parameters and what they predict, (N, C)."""
+        """See `Density`."""
         return self._residuals(vector, predicted, self._noise_at(vector, predicted))
 
-    def near_sigma(self, vector: Array) -> Array:
-        """A scale of the noise, (N, C), in 1/sr, with these parameters, that no reading near 0 stands out by."""
+    def initial_sigma(self, vector: Array) -> Array:
+        """See `Density`."""
         parts = self.build(vector)
-        typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps readings near 0 from outweighing all others
+        typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps data near 0 from outweighing all others
         return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
-
-    def residuals(self, vector: Array) -> tuple[Array, ...]:
-        """Arrays whose half sum of squares is minus the log-posterior up to a constant, or the named objective.
-
-        The first of them is of the data, the second of the prior, those that are left of levels of noise (see
-        `logarithmic`).
-        """
-        return self.linear_parts(vector)[0]
 
     def linear_parts(
         self, vector: Array, first_step: tuple[Array, Array] | None = None, others: bool = False
     ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
-        """See `residuals`; and what is predicted, (N, C), with the rows (rows,) of the data's Fisher information.
-
-        The Jacobian A of these rows has the Fisher information A'A. The expected information needs first derivatives
-        only and is never indefinite; for Gaussian noise that is known it is J'J. For a named objective: its residuals.
-
-        first_step: towards a fit of levels of noise, a scale of it, (N, C), in the place of sigma where it is finite,
-        and how much of the errors that readings share counts. others: whether derivatives are also by parameters of
-        other models, which nothing depends on here.
-        """
+        """See `Density`. others: whether derivatives are also by parameters that nothing depends on here."""
         alone = self.moving == vector.size and not others
         predicted = self.predict(vector) if alone else _by_columns(vector, model=self)
         sigma = self._noise_at(vector, predicted)
@@ -230,28 +318,20 @@ class Model(Density):
         rows = self._information_rows(vector, predicted, sigma, shared)
         return self._residuals(vector, predicted, held, shared), (predicted, rows)
 
-    def log_likelihood_per_datum(self, vector: Array) -> Array:
-        """Normalised log-density of each datum, (N, C); where readings share errors, given all others."""
-        return self.log_likelihood_per_datum_at(vector, self.predict(vector))
-
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """`log_likelihood_per_datum`, (N, C), from the values (N, C) that the parameters predict."""
+        """See `Density`."""
         sigma = self._noise_at(vector, predicted)
         if self.process is None:
             z = (self.values - predicted) / sigma
             return log_density(z, sigma, self.tails, self.degrees_of_freedom)
         z, relative = self._logarithmic(predicted, sigma)
         at = self._correlation(vector)
-        own, precision = self.process.given_others(self.process.whitened(z, relative, at), relative, at)
+        own, precision = self.process.leave_one_out(self.process.whitened(z, relative, at), relative, at)
         width = sigma / jnp.sqrt(precision)
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
-    def log_likelihood(self, vector: Array) -> Array:
-        """Normalised log-likelihood of all data."""
-        return self.log_likelihood_at(vector, self.predict(vector))
-
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """Normalised log-likelihood of all data, from the values (N, C) that the parameters predict."""
+        """See `Density`."""
         if self.process is None:
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
         sigma = self._noise_at(vector, predicted)
@@ -265,7 +345,7 @@ class Model(Density):
         return named_residual(self.objective, predicted, self.values, jnp.abs(self.wi[:, 2:]))
 
     def _noise_at(self, vector: Array, predicted: Array) -> Array:
-        """`sigma_at`; where readings share errors, of the datum, so that it does not depend on what is predicted."""
+        """`sigma_at`; with model discrepancy of the datum, so that it does not depend on what is predicted."""
         return self.sigma_at(vector, predicted if self.process is None else self.values)
 
     def _logarithmic(self, predicted: Array, noise: Array) -> tuple[Array, Array]:

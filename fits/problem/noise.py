@@ -43,10 +43,10 @@ class Noise:
     use_sigma: take the measurement's own sigma where it has one.
     tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
     then sigma.
-    correlated: errors of the model that neighbouring readings share, beside those: `Discrepancy`, or True for one whose
-    numbers are all free; only with Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted
-    without; where residuals of neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is
-    fitted with them, and the fit tells of both (`Fit.without_discrepancy`). A `Problem` by itself has none then.
+    discrepancy: model discrepancy beside that: `Discrepancy`, or True for one whose numbers are all free; only with
+    Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted without; where residuals of
+    neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is fitted again with it, and the
+    fit keeps both (`Fit.without_discrepancy`). A `Problem` by itself has none then.
     Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
@@ -174,11 +174,11 @@ class Levels(NamedTuple):
         return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
 
     def softness(self, values: Floats) -> Floats:
-        """Of the logarithms of readings (N, C), see `fits.problem.discrepancy.logarithm`."""
+        """Of the logarithms of measurements (N, C), see `fits.problem.discrepancy.logarithm`."""
         return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
 
     def gram(self, process: Process, values: Floats) -> Array | None:
-        """What readings (N, C) tell of a process that they share; None where it depends on parameters."""
+        """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
         variance, relative, floor = (jnp.asarray(level) for level in self)

@@ -1,14 +1,15 @@
-"""What is fitted to what: a stack with free parameters, measurements, a noise model and a calibration factor.
+"""A fitting problem: stack, data sets, noise model, instrument.
 
 `Problem` is what users and results hold; its `model` holds the same as arrays, for compiled programs.
 """
 
+import abc
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -22,13 +23,12 @@ from fits.data.measurements import Measurements
 from fits.data.scans import groups
 from fits.data.totals import Totals
 from fits.names import Objective
-from fits.problem.base import Assembled, Posed
 from fits.problem.compilation import Static, run
 from fits.problem.discrepancy.parameters import Discrepancy, numbers_of
 from fits.problem.discrepancy.process import Process, make_process
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import Model, Parts, Side, Transport
+from fits.problem.model import Density, Model, Parts, Side, Transport
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
 from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
 from fits.problem.spectra import require_in_range
@@ -43,8 +43,128 @@ from layerjax.transport.known_directions import known_directions
 Floats = NDArray[np.float64]
 
 
+class Assembled(NamedTuple):
+    """What follows from a problem as it was given; start, low, high: (P,)."""
+
+    names: tuple[str, ...]
+    start: Floats
+    low: Floats
+    high: Floats
+    model: Any
+
+
+class FittingProblem(abc.ABC):
+    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,)."""
+
+    objective: Objective
+
+    @property
+    @abc.abstractmethod
+    def _assembled(self) -> Assembled:
+        """What follows from it."""
+
+    @property
+    @abc.abstractmethod
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter; "1" for plain ratios."""
+
+    @property
+    @abc.abstractmethod
+    def problems(self) -> Mapping[str, Any]:
+        """A `Problem` for each data set, by its name."""
+
+    @abc.abstractmethod
+    def places(self, name: str) -> tuple[int, ...]:
+        """Where the parameters of one data set stand in the vector."""
+
+    @abc.abstractmethod
+    def shares(self, predicted: Floats) -> dict[str, Floats]:
+        """What `predict` gives of each data set, in the shape of its data."""
+
+    @abc.abstractmethod
+    def with_problems(self, changed: Mapping[str, Any]) -> "FittingProblem":
+        """The same with other problems in the place of those of the same names."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the P parameters: paths such as ``layers[0].thickness``, ``noise.floor`` or ``scale``."""
+        return self._assembled.names
+
+    @property
+    def start(self) -> Floats:
+        """Where the parameters start, (P,)."""
+        return self._assembled.start
+
+    @property
+    def low(self) -> Floats:
+        """Lower bounds of the parameters, (P,)."""
+        return self._assembled.low
+
+    @property
+    def high(self) -> Floats:
+        """Upper bounds of the parameters, (P,)."""
+        return self._assembled.high
+
+    @property
+    def model(self) -> Any:
+        """The problem as pure functions of the physical vector (P,)."""
+        return self._assembled.model
+
+    @property
+    def count(self) -> int:
+        """Number of data: used samples times channels."""
+        return int(self.model.values.size)
+
+    def build(self, vector: ArrayLike) -> Any:
+        """Stack, scale and noise levels with the physical vector (P,)."""
+        return jax.tree.map(jnp.asarray, self.model.build(jnp.asarray(vector)))
+
+    def predict(self, vector: ArrayLike) -> Array:
+        """Scaled BSDF of the used samples, (N, C), in 1/sr; of several data sets one after the other, (N, 1)."""
+        return self.call(Density.predict, vector)
+
+    def residuals(self, vector: ArrayLike) -> Array:
+        """All residuals of the least-squares problem, (rows,): half their sum of squares is what a fit minimises."""
+        return jnp.concatenate([part.reshape(-1) for part in self.call(Density.residuals, vector)])
+
+    def log_likelihood(self, vector: ArrayLike) -> Array:
+        """Normalised log-likelihood of the used samples with the physical vector (P,)."""
+        return self.call(Density.log_likelihood, vector)
+
+    def log_likelihood_per_datum(self, vector: ArrayLike) -> Array:
+        """Normalised log-density of each datum with the physical vector (P,), (N, C)."""
+        return self.call(Density.log_likelihood_per_datum, vector)
+
+    def log_prior(self, vector: ArrayLike) -> Array:
+        """Log-density of the physical vector, -inf outside the bounds."""
+        return self.call(Density.log_prior, vector)
+
+    def log_posterior_unconstrained(self, u: ArrayLike) -> Array:
+        """Log-posterior over the unconstrained vector (P,), -inf where undefined."""
+        return self.call(Density.log_posterior_unconstrained, u)
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """`function(model, *arguments)`, compiled once for all of this structure; of a method of `Density` the model's
+        own of that name."""
+        if function in vars(Density).values():
+            function = getattr(type(self.model), function.__name__)
+        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
+        return run(function, self.split_model, *arrays)
+
+    @cached_property
+    def split_model(self) -> tuple[Any, Static]:
+        """The model's arrays, and what is static in it wrapped for use as a key."""
+        arrays, static = eqx.partition(self.model, eqx.is_array)
+        return arrays, Static(static)
+
+
+def _is_vector(argument: Any) -> bool:
+    """Whether numbers are listed, which make an array; a named tuple holds arrays."""
+    return type(argument) in (list, tuple)
+
+
 @dataclass(frozen=True, eq=False)
-class Problem(Posed):
+class Problem(FittingProblem):
     """A stack with `Free` leaves, the measurements that it should explain, and how they scatter about it.
 
     Args:
@@ -57,7 +177,7 @@ class Problem(Posed):
         noise: how a datum scatters about the model.
         scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".
-        instrument: by which the readings were taken; None: exact directions, one scale.
+        instrument: by which the measurements were taken; None: exact directions, one scale.
 
     Raises:
         ValueError: no parameter is free or no sample used, channels do not match, the noise can vanish, the transport
@@ -244,7 +364,7 @@ def _require_noise(levels: Levels) -> None:
 
 
 def _refuse_angular_only(problem: Problem) -> None:
-    """What is said of readings along directions, and means nothing of totals."""
+    """What is said of measurements along directions, and means nothing of totals."""
     for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
         if given:
             raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
@@ -293,7 +413,7 @@ def _model(
 
 
 def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
-    """What a model holds of readings along these directions, (N, 3) each."""
+    """What a model holds of measurements along these directions, (N, 3) each."""
     follow, given, optics = _uses_known(problem.transport), problem.instrument, None
     if isinstance(problem.data, Totals):
         follow = False  # light leaves along all directions

@@ -81,11 +81,6 @@ def shown(value: Any) -> str:
     return _shortened(" ".join(_Shown().repr(value).split()), 3 * _LONGEST)
 
 
-def portable_repr(thing: Any) -> str:
-    """As it shows itself, but not where in memory it is, which no other process knows."""
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(thing))
-
-
 def _shortened(text: str, most: int) -> str:
     half = most // 2
     return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"

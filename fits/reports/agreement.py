@@ -7,6 +7,7 @@ import numpy as np
 
 from fits.data.checks import repeats
 from fits.data.totals import Totals
+from fits.problem.model import Density
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.problem.parameters import is_free
 from fits.reports.diagnostics import ResidualStructure
@@ -30,7 +31,7 @@ def describes(fit: "Fit") -> bool:
     """Whether the stack alone comes as near to the data as the stated noise lets expect, but for a moderate misfit."""
     if not fit.is_posterior:
         return True  # nothing is stated
-    offsets = np.abs(np.asarray(fit.problem.call("offsets_at", fit.vector, fit.predicted), float))
+    offsets = np.abs(np.asarray(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted), float))
     significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > MISFIT_SIGMAS
     return not (significant and float(np.median(offsets)) > UNDESCRIBED)
 
@@ -40,7 +41,7 @@ def misdescribed(fit: "Fit") -> list[str]:
     if describes(fit):
         return []
     values = fit.problem.data.used().values
-    sigma = np.asarray(fit.problem.call("sigma_at", fit.vector, values))  # of what was measured: a share of that
+    sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, values))  # of what was measured: a share of that
     lit = values > 0.0
     if not lit.any():
         return ["This stack does not describe the sample."]
@@ -85,8 +86,8 @@ def discrepancy(fit: "Fit") -> list[str]:
     if at is None:
         return []
     left, whole = (
-        float(np.sum(np.square(fit.problem.call(name, fit.vector, fit.predicted))))
-        for name in ("unshared_at", "offsets_at")
+        float(np.sum(np.square(fit.problem.call(offsets, fit.vector, fit.predicted))))
+        for offsets in (Density.offsets_after_discrepancy_at, Density.offsets_at)
     )
     share = 1.0 - left / whole if whole > 0.0 else 0.0
     size = 100.0 * float(at.amplitude)
@@ -120,7 +121,7 @@ def without_discrepancy(fit: "Fit") -> float:
     if fit.without_discrepancy is not None:
         square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
     else:
-        square = float(np.sum(np.square(fit.problem.call("offsets_at", fit.vector, fit.predicted))))
+        square = float(np.sum(np.square(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted))))
         freedom = fit.degrees_of_freedom
     return square / freedom if freedom > 0 else math.nan
 

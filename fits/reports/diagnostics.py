@@ -12,6 +12,7 @@ import numpy as np
 
 from fits.data.neighbours import correlation, neighbours
 from fits.data.scans import incidences
+from fits.problem.model import Density
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -89,7 +90,7 @@ def misfit(fit: "Fit") -> np.ndarray:
 
     With a model discrepancy these are smaller than the noise, since it follows the readings: `standardised` are not.
     """
-    left = np.asarray(fit.problem.call("unshared_at", fit.vector, fit.predicted), float)
+    left = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, left / _unit(fit))
 
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.optimise.identifiability import OPEN_BEYOND, UNIDENTIFIED_BEYOND, Direction
+from fits.optimise.identifiability import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
-from fits.optimise.resolution import ENOUGH
+from fits.optimise.options import DEFAULT
 from fits.optimise.result import OUTCOMES
 from fits.reports.agreement import (
     MISFIT_SIGMAS,
@@ -56,7 +56,7 @@ def identifiability(fit: "Fit") -> dict[str, str]:
         elif name in limited:
             words[name] = f"LIMITED by the instrument: moves with {limited[name][0]}"
         elif math.hypot(*(own := [one.error_of(name) for one in fit.unidentified])) > UNIDENTIFIED_BEYOND:
-            kind = "unconstrained by the data" if math.hypot(*own) > OPEN_BEYOND else "weakly constrained"
+            kind = "unconstrained by the data" if math.hypot(*own) > UNCONSTRAINED_BEYOND else "weakly constrained"
             words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
         elif not math.isfinite(error):
             words[name] = "not determined"
@@ -85,7 +85,7 @@ def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]
             "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
         )
     sentences += discrepancy(fit)
-    if fit.numerical_error is not None and not fit.numerical_error <= ENOUGH:
+    if fit.numerical_error is not None and not fit.numerical_error <= DEFAULT.numerical_error:
         sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
     for name, least in instrument_limits(fit).items():
         sentences.append(f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved.")
@@ -207,7 +207,7 @@ def starts_in_words(fit: "Fit") -> str:
     """How many starts there were, and where they ended, in one line."""
     if not fit.start_outcomes:
         return "not recorded"
-    run = ", ".join(f"{name} {value}" for name, value in fit.settings.items() if name != "starts")
+    run = ", ".join(f"{name} {fit.settings[name]}" for name in ("seed", "solver") if name in fit.settings)
     where = ", ".join(f"{fit.start_outcomes[key]} {word}" for key, word in OUTCOMES.items() if fit.start_outcomes[key])
     ran = sum(fit.start_outcomes.values())
     if not _refitted(fit):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit, gammaln, logit
 
-from fits.optimise.descent import here
+from fits.optimise.descent import evaluate_at
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 
@@ -106,7 +106,7 @@ def slope_at_bounds(problem: Problem, unit: Floats, held: NDArray[np.bool_]) -> 
     """
     if not held.any():
         return np.zeros(len(unit))
-    return np.abs(here(problem, unit).gradient)
+    return np.abs(evaluate_at(problem, unit).gradient)
 
 
 def first_positions(

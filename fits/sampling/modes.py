@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.optimise.multi_start import least_squares_end, unit_of
+from fits.optimise.multi_start import least_squares_descent, unit_of
 from fits.optimise.result import Fit, Minimum
 from fits.optimise.uncertainty import uncertainty
 
@@ -42,7 +42,7 @@ def places(fit: Fit) -> list[Place]:
     found = [Place(best, np.isin(problem.names, fit.at_bound))]
     for minimum in other_minima(fit):
         vector = np.array([minimum.values[name] for name in problem.names])
-        end = least_squares_end(problem, unit_of(problem, vector), fresh=False)
+        end = least_squares_descent(problem, unit_of(problem, vector), fresh=False)
         if end.cost < fit.cost + LOOKED_AT:
             found.append(Place(unit_of(problem, end.vector), uncertainty(problem, end.vector, end.cost).at_bound))
     return found

@@ -242,7 +242,7 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
             at = model.build(vector).correlation
             assert at is not None
             assert model.softness is not None
-            lack = model.process.drawn(numbers, at)
+            lack = model.process.sample(numbers, at)
             expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + lack)
         return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
 

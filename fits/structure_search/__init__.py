@@ -1,1 +1,1 @@
-"""Which stack is behind data: libraries of layers and bases, the search through what they make, and what it found."""
+"""Which stack is behind data: libraries of layers and bases, and the search through the stacks that they make."""

@@ -20,17 +20,16 @@ class Library:
 
     Raises:
         ValueError: no base, a name that is used twice, or one that would be no name of a file, or that of another part:
-            with a slash, a + or a dot in front, the same but for case, blanks and hyphens, or a base called "search".
+            with a slash, a + or a dot in front, or the same but for case, blanks and hyphens.
     """
 
     layers: Mapping[str, lj.Interface | lj.Medium]
     bases: Mapping[str, lj.Stack]
 
     def __post_init__(self) -> None:
-        if not self.bases:
-            raise ValueError("library: it has no base; it must have at least one")
-        if not self.layers:
-            raise ValueError("library: it has no layer; it must have at least one")
+        for kind, parts in (("base", self.bases), ("layer", self.layers)):
+            if not parts:
+                raise ValueError(f"library: it has no {kind}; it must have at least one")
         twice = sorted(set(self.layers) & set(self.bases))
         if twice:
             raise ValueError(f"library: {twice[0]!r} names a layer and a base")
@@ -42,9 +41,6 @@ class Library:
             other = files.setdefault(name.replace(" ", "-").casefold(), name)
             if other != name:
                 raise ValueError(f"library: {other!r} and {name!r} are one name as files; they must differ by letters")
-        for name in self.bases:
-            if name.casefold() == "search":
-                raise ValueError(f"library: a base is called {name!r}, must be another: a search keeps search.json")
 
     def stack(self, structure: Structure) -> lj.Stack:
         """The stack with these layers over this base."""
@@ -59,11 +55,9 @@ def default_library(channels: int = 1) -> Library:
     """
 
     def coloured(start: float, low: float, high: float) -> Free:
-        return (
-            Free(start, low, high)
-            if channels == 1
-            else Free((start,) * channels, (low,) * channels, (high,) * channels)
-        )
+        if channels == 1:
+            return Free(start, low, high)
+        return Free((start,) * channels, (low,) * channels, (high,) * channels)
 
     def thickness(start: float, low: float, high: float) -> Free:
         return Free(start, low, high, LogUniform())

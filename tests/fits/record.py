@@ -72,9 +72,9 @@ def of_comparison(comparison: Any) -> dict[str, Any]:
 def of_search(search: Any) -> dict[str, Any]:
     """Ranking and what cannot be told from the best."""
     return {
-        "ranking": [one.name for one in search.found],
-        "indistinguishable": sorted(search.alike),
-        "bic": {one.name: one.bic for one in search.found},
+        "ranking": [one.name for one in search.candidates],
+        "indistinguishable": sorted(search.indistinguishable),
+        "bic": {one.name: one.bic for one in search.candidates},
     }
 
 
@@ -178,7 +178,9 @@ def structures() -> dict[str, Any]:
     truth = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
     geometry = fits.slices(incidence=(10.0, 40.0, 70.0), outgoing=np.arange(-80.0, 81.0, 10.0))
     data = fits.simulate(truth, geometry, transport=TRANSPORT, noise=0.02, seed=0)
-    return of_search(fits.search(data, LIBRARY, layers=1, transport=TRANSPORT, starts=STARTS))
+    return of_search(
+        fits.search(data, LIBRARY, transport=TRANSPORT, options=fits.SearchOptions(layers=1, starts=STARTS))
+    )
 
 
 def compared() -> dict[str, Any]:

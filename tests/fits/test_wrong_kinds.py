@@ -18,7 +18,7 @@ FIT = fits.fit(STACK, DATA, starts=1)
 FUNCTIONS = {
     "fit": {"stack": STACK, "data": DATA, "transport": "auto", "noise": None, "instrument": None},
     "Problem": {"stack": STACK, "data": DATA, "transport": "auto", "noise": fits.Noise(), "instrument": None},
-    "search": {"data": DATA, "library": None, "layers": 0, "noise": None},
+    "search": {"data": DATA, "library": None, "noise": None},
     "simulate": {"stack": PLAIN, "geometry": VIEW, "transport": "auto", "noise": 0.1, "floor": 0.1},
     "predict": {"fitted": FIT, "at": VIEW},
     "sample": {"fit": FIT},

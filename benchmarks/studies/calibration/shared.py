@@ -10,13 +10,18 @@ from fits.data.measurements import Measurements
 
 FREE = {
     "amplitude": fits.Free(0.05, 0.01, 0.3, fits.LogNormal(0.05, 0.5)),
-    "half": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
-    "difference": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
-    "growth": fits.Free(0.5, 0.0, 1.0),
+    "length_half": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
+    "length_difference": fits.Free(18.0, 10.0, 40.0, fits.LogNormal(18.0, 0.35)),
+    "grazing_exponent": fits.Free(0.5, 0.0, 1.0),
 }
 """Of `fits.Discrepancy`."""
 
-LABELS = {"amplitude": "amplitude", "half": "reach, half vector", "difference": "reach, difference", "growth": "growth"}
+LABELS = {
+    "amplitude": "amplitude",
+    "length_half": "length scale, half angle",
+    "length_difference": "length scale, difference angle",
+    "grazing_exponent": "grazing exponent",
+}
 
 Floats = NDArray[np.float64]
 
@@ -26,9 +31,9 @@ def with_errors(data: Measurements, numbers: dict[str, float], generator: np.ran
     half = data.wi + data.wo
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     tilt, apart = (np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))) for cosine in (half[:, 2], _dot(half, data.wi)))
-    covariance = _matern(tilt, numbers["half"]) * _matern(apart, numbers["difference"])
+    covariance = _matern(tilt, numbers["length_half"]) * _matern(apart, numbers["length_difference"])
     root = np.linalg.cholesky(covariance + 1e-10 * np.eye(len(tilt)))
-    sizes = numbers["amplitude"] * (0.5 * (data.wi[:, 2] + data.wo[:, 2])) ** -numbers["growth"]
+    sizes = numbers["amplitude"] * (0.5 * (data.wi[:, 2] + data.wo[:, 2])) ** -numbers["grazing_exponent"]
     errors = sizes * (root @ generator.standard_normal(len(tilt)))
     return replace(data, values=data.values * np.exp(errors)[:, None])
 

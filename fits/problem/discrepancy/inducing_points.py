@@ -1,46 +1,46 @@
-"""Where a process of model errors lives: angles of half vector and difference, and nodes among the readings there."""
+"""Inducing points of the model discrepancy: places in half and difference angle, chosen among the measurements."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fits.problem.discrepancy.kernel import alike
+from fits.problem.discrepancy.kernel import correlation
 
 Floats = NDArray[np.float64]
 
 SHORTEST, LEAST_SHORTEST = 5.0, 0.05
-"""Reach of errors in degrees that nodes carry where readings reach far, and at least."""
+"""Shortest length scale in degrees that inducing points carry where measurements reach far, and at least."""
 
 REACHES = 16
-"""At least across readings that do not reach far."""
+"""At least across measurements that do not reach far."""
 
 FEWEST_NODES, SOME_NODES, MOST_NODES = 80, 160, 250
-"""Nodes at most: the first where there are many channels, the last where there are many readings."""
+"""Inducing points at most: the first with many channels, the last with many measurements."""
 
 A_NODE, MOST_ROWS = 50, 400
-"""Readings that one more node is for; and rows of the matrix, nodes times channels, that more nodes may not lead to."""
+"""Measurements that one more inducing point is for; and the most rows of the matrix, points times channels."""
 
 LOST, LONGER = 0.02, 1.25
-"""Where nodes leave more of the variance at a reading, the shortest reach is made so much longer until they do not."""
+"""Where the points leave more of the variance at a measurement, the shortest length scale grows by this factor."""
 
 CANDIDATES = 4000
-"""Places of readings that nodes are chosen from, at most."""
+"""Places of measurements that inducing points are chosen from, at most."""
 
 SAME = 6
 """Decimals of a degree in which places are the same."""
 
 TYPICAL = 2.0
-"""Readings are regressed on nodes as if errors reached so many times as far as they do at least."""
+"""Measurements are regressed on the points with so many times the shortest length scale."""
 
 TINY, ROUNDING = 1e-9, 1e-10
 
 
-class Nodes(NamedTuple):
-    """R places among those of N readings.
+class InducingPoints(NamedTuple):
+    """R places among those of N measurements.
 
-    where: (R, 4), see `places`. weights: (N, R), from nodes to readings. shortest: (2,), what errors reach at least, in
-    degrees of half vector and difference, so that nodes carry them.
+    where: (R, 4), see `places`. weights: (N, R), from inducing points to measurements. shortest: (2,), what errors
+    reach at least, in degrees of half vector and difference, so that inducing points carry them.
     """
 
     where: Floats
@@ -48,11 +48,11 @@ class Nodes(NamedTuple):
     shortest: Floats
 
 
-def nodes(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Nodes:
-    """Of readings along these directions, (N, 3) each: all of their places, where these are few.
+def inducing_points(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> InducingPoints:
+    """Of measurements along these directions, (N, 3) each: all of their places, where these are few.
 
     Else those that a pivoted Cholesky decomposition takes first (Fine & Scheinberg 2001): of what errors vary by given
-    those at the nodes before, the place where it is most. The other readings are regressed on them.
+    those at the inducing points before, the place where it is most. The other measurements are regressed on them.
     """
     where = places(wi, wo)
     _, first = np.unique(np.round(where, SAME), axis=0, return_index=True)
@@ -68,9 +68,9 @@ def nodes(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Nodes:
         chosen, lost = _pivots(those, shortest, most)
     among = those[chosen]
     typical = TYPICAL * shortest
-    own = alike(among, among, *typical) + ROUNDING * np.eye(len(among))
-    weights = np.linalg.solve(own, alike(among, where, *typical)).T
-    return Nodes(among, weights, shortest)
+    own = correlation(among, among, *typical) + ROUNDING * np.eye(len(among))
+    weights = np.linalg.solve(own, correlation(among, where, *typical)).T
+    return InducingPoints(among, weights, shortest)
 
 
 def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
@@ -80,7 +80,7 @@ def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
         pivot = int(np.argmax(left))
         if left[pivot] < ROUNDING:
             break
-        rest = alike(where[pivot : pivot + 1], where, *reach)[0] - rows[:row, pivot] @ rows[:row]
+        rest = correlation(where[pivot : pivot + 1], where, *reach)[0] - rows[:row, pivot] @ rows[:row]
         rows[row] = rest / np.sqrt(left[pivot])
         left = np.maximum(left - rows[row] ** 2, 0.0)
         left[pivot] = 0.0

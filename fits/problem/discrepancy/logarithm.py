@@ -1,7 +1,7 @@
-"""The logarithm of readings, which becomes a straight line where they are no larger than their noise.
+"""The logarithm of measurements, which becomes a straight line where they are no larger than their noise.
 
-g(x) = asinh(x / s): log(2 x / s) for x far above s, x / s below, and defined for readings that are not positive. It is
-the generalised logarithm of Durbin, Hardin, Hawkins & Rocke 2002, Bioinformatics 18, S105.
+g(x) = asinh(x / s): log(2 x / s) for x far above s, x / s below, and defined for measurements that are not positive. It
+is the generalised logarithm of Durbin, Hardin, Hawkins & Rocke 2002, Bioinformatics 18, S105.
 """
 
 from typing import Any
@@ -15,11 +15,12 @@ STRAIGHT = 4.0
 """Standard deviations of the noise, without its relative part, below which it is straight."""
 
 LEAST = 1e-6
-"""Of the median reading: s is not below that, where nothing is said of additive noise."""
+"""Of the median measurement: s is not below that, where nothing is said of additive noise."""
 
 
 def softness(values: ArrayLike, additive: ArrayLike) -> NDArray[np.float64]:
-    """s of readings, in 1/sr, from the standard deviation of their additive noise, which broadcasts against them."""
+    """s of measurements, in 1/sr, from the standard deviation of their additive noise, which broadcasts against
+    them."""
     values = np.asarray(values, float)
     typical = LEAST * float(np.median(np.abs(values))) or 1.0
     return np.maximum(np.broadcast_to(STRAIGHT * np.asarray(additive, float), values.shape), typical)

@@ -8,8 +8,8 @@ from fits.problem.parameters import Free, LogNormal, Normal
 from fits.problem.values import shown
 
 LONGEST = 40.0
-"""Of a length whose prior is not given, in degrees. What is alike farther than that is no error of a shape: it would
-take the place of the stack's level."""
+"""Of a length scale whose prior is not given, in degrees: what is correlated farther would take the place of the
+stack's level."""
 
 ANGLES = (0.1, 360.0)
 RANGES = {"amplitude": (1e-6, 1.0), "grazing_exponent": (0.0, 2.0), "channel_correlation": (0.0, 1.0)}

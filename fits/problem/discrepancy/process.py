@@ -1,16 +1,16 @@
-"""What a model lacks, as a Gaussian process: errors of its logarithm that are alike where directions are alike.
+"""Model discrepancy as a Gaussian process of the logarithm of the BSDF (Kennedy & O'Hagan 2001).
 
 With model value f, datum d and noise n, g(d) = g(f) + e + n, where g is the logarithm and, below four standard
 deviations of the noise, a straight line (`logarithm`). e has Matern kernels of the angles of half vector and difference
 (Rusinkiewicz 1998), folded so that light and viewer may change places: errors follow a lobe from one incidence to the
-next, and a reading at 10 and 70 degrees tells of that at 70 and 10. Their standard deviation grows towards grazing, by
-a power of the mean cosine of light and viewer, cos half cos difference. Channels have one correlation. The process
-lives on nodes, and costs a matrix of as many rows: the places of all readings where these are few, else of some, on
-which the others are regressed. Noise is that of the datum, so that the covariance does not depend on the model, and
-most of its derivatives vanish.
+next, and a measurement at 10 and 70 degrees says something of that at 70 and 10. Their standard deviation grows towards
+grazing, by a power of the mean cosine of light and viewer, cos half cos difference. Channels have one correlation. The
+process lives on inducing points, and costs a matrix of as many rows: the places of all measurements where these are
+few, else of some, on which the others are regressed. Noise is that of the datum, so that the covariance does not depend
+on the model, and most of its derivatives vanish.
 
-The negative log-density of all readings is half a sum of squares again, up to a constant: with A from white numbers c
-to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
+The negative log-density of all measurements is half a sum of squares again, up to a constant: with A from white numbers
+c to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
 
     (z'(1 + A A')^-1 z + log det (1 + A A')) / 2 = min_c (|z - A c|^2 + |c|^2) / 2 + sum log diag C.
 """
@@ -25,8 +25,8 @@ from jax.scipy.linalg import solve_triangular
 from numpy.typing import ArrayLike
 
 from fits.problem.discrepancy import whitening
-from fits.problem.discrepancy.inducing_points import nodes
-from fits.problem.discrepancy.kernel import alike, log_sizes
+from fits.problem.discrepancy.inducing_points import inducing_points
+from fits.problem.discrepancy.kernel import correlation, log_scales
 from fits.problem.discrepancy.whitening import Correlation, Roots, moved, roots_of, triangular_inverse, vector_of
 
 LEAST = 1e-6
@@ -34,7 +34,7 @@ LEAST = 1e-6
 
 
 class Whitened(NamedTuple):
-    """Residuals that are independent, of N readings in C channels, with C R white numbers.
+    """Residuals that are independent, of N measurements in C channels, with C R white numbers.
 
     residuals: z - A c, (N, C). latent: c, (C R,). levels: the logarithms of the diagonal of B's root, (C R,), none
     below 0.
@@ -46,7 +46,8 @@ class Whitened(NamedTuple):
 
 
 class Process(eqx.Module):
-    """A process on R `Nodes`. gram: `gram_of` readings, (C, R, R), where their noise is known; else None."""
+    """A process on R `InducingPoints`. gram: `gram_of` measurements, (C, R, R), where their noise is known; else
+    None."""
 
     where: Array
     weights: Array
@@ -54,11 +55,12 @@ class Process(eqx.Module):
     gram: Array | None = None
 
     def rows_beside(self, channels: int) -> int:
-        """Residuals beside those of the readings: of white numbers, and of levels."""
+        """Residuals beside those of the measurements: of white numbers, and of levels."""
         return 2 * channels * len(self.where)
 
     def gram_of(self, relative: Array) -> Array:
-        """What readings tell of nodes, (C, R, R); relative: an error of 1 in units of the noise, (N, C)."""
+        """What measurements say of inducing points, (C, R, R); relative: an error of 1 in units of the noise, (N,
+        C)."""
         return whitening.gram_of(self.weights, relative)
 
     def whitened(self, z: Array, relative: Array, at: Correlation) -> Whitened:
@@ -66,42 +68,44 @@ class Process(eqx.Module):
         numbers = vector_of(at, z.shape[-1])
         return Whitened(*whitening.whitened(numbers, self.where, self.weights, self.gram, z, relative))
 
-    def drawn(self, white: Array, at: Correlation) -> Array:
-        """Errors of the readings, (N, C), from standard normal numbers (C, R)."""
+    def sample(self, white: Array, at: Correlation) -> Array:
+        """Errors of the measurements, (N, C), from standard normal numbers (C, R)."""
         roots = roots_of(vector_of(at, len(white)), self.where, len(white))
-        return at.amplitude * self.weights @ whitening.on_nodes(roots, white.reshape(-1)).T
+        return at.amplitude * self.weights @ whitening.on_points(roots, white.reshape(-1)).T
 
-    def independent(self, z: Array, relative: Array, at: Correlation) -> Array:
+    def whitened_residuals(self, z: Array, relative: Array, at: Correlation) -> Array:
         """Residuals z (N, C) by the symmetric root of their covariance, K^-1/2 z with K = 1 + A A'.
 
         Where the model holds they are independent standard normal, and their squares add up to z'K^-1 z. What is left
         of z beside what the process explains (`whitened`) is neither: the process follows each datum, so that it is
-        smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`given_others`) have
+        smaller than 1, and negatively correlated between neighbours. Leave-one-out residuals (`leave_one_out`) have
         variance 1, but are correlated, too.
         """
         gram = self.gram_of(relative) if self.gram is None else self.gram
         roots = roots_of(vector_of(at, z.shape[-1]), self.where, z.shape[-1])
         spread, axes = jnp.linalg.eigh(at.amplitude**2 * whitening.unit_square(roots, gram))  # of A'A
         root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
-        told = at.amplitude * whitening.from_nodes(roots, (self.weights.T @ (relative * z)).T)
+        told = at.amplitude * whitening.from_points(roots, (self.weights.T @ (relative * z)).T)
         white = -(axes @ ((axes.T @ told) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
-        return z + relative * (self.weights @ (at.amplitude * whitening.on_nodes(roots, white)).T)
+        return z + relative * (self.weights @ (at.amplitude * whitening.on_points(roots, white)).T)
 
-    def given_others(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
-        """Of each reading its weighted residual and precision, (N, C): given all others it has mean residual /
+    def leave_one_out(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
+        """Of each measurement its weighted residual and precision, (N, C): given all others it has mean residual /
         precision and variance 1 / precision, in units of the noise.
         """
         roots, root = self._factors(relative, at)
-        rows = at.amplitude * jnp.einsum("nc,cx,nr->ncxr", relative, roots.channels, self.weights @ roots.nodes)
+        rows = at.amplitude * jnp.einsum(
+            "nc,cx,nr->ncxr", relative, roots.channels, self.weights @ roots.inducing_points
+        )
         solved = solve_triangular(root, rows.reshape(relative.size, -1).T, lower=True)
         return found.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
 
-    def elsewhere(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
+    def predict(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
         """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
         roots, root = self._factors(relative, at)
-        sizes, own = (jnp.exp(at.grazing_exponent * log_sizes(where)) for where in (self.where, at_places))
-        across = sizes[:, None] * own * alike(self.where, at_places, at.length_half, at.length_difference)
-        across = solve_triangular(roots.nodes, across, lower=True)
+        sizes, own = (jnp.exp(at.grazing_exponent * log_scales(where)) for where in (self.where, at_places))
+        across = sizes[:, None] * own * correlation(self.where, at_places, at.length_half, at.length_difference)
+        across = solve_triangular(roots.inducing_points, across, lower=True)
         rows = at.amplitude * jnp.einsum("cx,rm->mcxr", roots.channels, across)
         rows = rows.reshape(*rows.shape[:2], -1)
         solved = solve_triangular(root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
@@ -110,7 +114,7 @@ class Process(eqx.Module):
         return -rows @ found.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - told, 0.0))
 
     def information_rows(self, relative: Array, at: Correlation) -> Array:
-        """Rows whose Jacobian A has in A'A the Fisher information of the readings about the numbers of the process.
+        """Rows whose Jacobian A has in A'A the Fisher information of the measurements about the numbers of the process.
 
         With M = 1 - B^-1 and E = X + X' (see `whitening`), it is tr(M E M E) / 2.
         """
@@ -137,5 +141,5 @@ class Process(eqx.Module):
 
 
 def make_process(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Process:
-    """The process of readings along these directions, (N, 3) each, in so many channels."""
-    return Process(*map(jnp.asarray, nodes(wi, wo, channels)))
+    """The process of measurements along these directions, (N, 3) each, in so many channels."""
+    return Process(*map(jnp.asarray, inducing_points(wi, wo, channels)))

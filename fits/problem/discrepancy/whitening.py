@@ -1,4 +1,4 @@
-"""Residuals without the errors that they share, with derivatives in closed form.
+"""Residuals less the model discrepancy, with derivatives in closed form.
 
 With A from white numbers c to errors in standard deviations of the noise, z the residuals, and B = 1 + A'A = C C',
 c = B^-1 A'z. A number of the process moves the root of its covariance by dA = A X, where X + X' is the change of that
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.scipy.linalg import solve_triangular
 
-from fits.problem.discrepancy.kernel import alike, log_sizes
+from fits.problem.discrepancy.kernel import correlation, log_scales
 
 Trio = tuple[Array, Array, Array]
 
@@ -35,15 +35,16 @@ class Correlation(NamedTuple):
 
 
 class Roots(NamedTuple):
-    """Of the covariance of channels, (C, C), and of nodes, (R, R), but for the amplitude; that of all is their
-    product."""
+    """Of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; that of all is
+    their product."""
 
     channels: Array
-    nodes: Array
+    inducing_points: Array
 
 
 class Move(NamedTuple):
-    """X of a number of the process: a factor between channels, (C, C), or between nodes, (R, R); the other is 1."""
+    """X of a number of the process: a factor between channels, (C, C), or between inducing points, (R, R); the other is
+    1."""
 
     between_channels: bool
     factor: Array
@@ -55,22 +56,22 @@ def vector_of(at: Correlation, channels: int) -> Array:
 
 
 def roots_of(numbers: Array, where: Array, channels: int) -> Roots:
-    """Of a process on nodes `where`, (R, 4)."""
+    """Of a process on inducing points `where`, (R, 4)."""
     _, half, difference, growth = numbers[:4]
-    own = alike(where, where, half, difference) + JITTER * jnp.eye(len(where))
+    own = correlation(where, where, half, difference) + JITTER * jnp.eye(len(where))
     between = numbers[4] + (1.0 - numbers[4]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
-    sizes = jnp.exp(growth * log_sizes(where))
+    sizes = jnp.exp(growth * log_scales(where))
     return Roots(jnp.linalg.cholesky(between + JITTER * jnp.eye(channels)), sizes[:, None] * jnp.linalg.cholesky(own))
 
 
 def moves_of(numbers: Array, where: Array, roots: Roots) -> list[Move]:
     """Of all numbers but the amplitude."""
-    inverse = triangular_inverse(roots.nodes)
-    sizes = jnp.exp(numbers[3] * log_sizes(where))
-    by_lengths = jax.jacfwd(lambda lengths: alike(where, where, *lengths))(numbers[1:3])
+    inverse = triangular_inverse(roots.inducing_points)
+    sizes = jnp.exp(numbers[3] * log_scales(where))
+    by_lengths = jax.jacfwd(lambda lengths: correlation(where, where, *lengths))(numbers[1:3])
     scaled = inverse * sizes
     found = [Move(False, _halved(scaled @ by_lengths[..., k] @ scaled.T)) for k in range(2)]
-    found.append(Move(False, inverse @ (log_sizes(where)[:, None] * roots.nodes)))
+    found.append(Move(False, inverse @ (log_scales(where)[:, None] * roots.inducing_points)))
     if len(numbers) > 4:
         inverse = triangular_inverse(roots.channels)
         found.append(Move(True, _halved(inverse @ (1.0 - jnp.eye(len(inverse))) @ inverse.T)))
@@ -79,29 +80,30 @@ def moves_of(numbers: Array, where: Array, roots: Roots) -> list[Move]:
 
 def moved(rows: Array, move: Move, roots: Roots) -> Array:
     """Rows (M, C R) of white numbers times X."""
-    split = rows.reshape(-1, len(roots.channels), len(roots.nodes))
+    split = rows.reshape(-1, len(roots.channels), len(roots.inducing_points))
     by = "mcr,cx->mxr" if move.between_channels else "mcr,rx->mcx"
     return jnp.einsum(by, split, move.factor).reshape(rows.shape)
 
 
-def on_nodes(roots: Roots, white: Array) -> Array:
+def on_points(roots: Roots, white: Array) -> Array:
     """Errors (C, R), at an amplitude of 1, from white numbers (C R,)."""
-    return roots.channels @ white.reshape(len(roots.channels), -1) @ roots.nodes.T
+    return roots.channels @ white.reshape(len(roots.channels), -1) @ roots.inducing_points.T
 
 
-def from_nodes(roots: Roots, told: Array) -> Array:
-    """The transpose of `on_nodes`: (C R,) from (C, R)."""
-    return (roots.channels.T @ told @ roots.nodes).reshape(-1)
+def from_points(roots: Roots, told: Array) -> Array:
+    """The transpose of `on_points`: (C R,) from (C, R)."""
+    return (roots.channels.T @ told @ roots.inducing_points).reshape(-1)
 
 
 def gram_of(weights: Array, relative: Array) -> Array:
-    """What readings tell of nodes, (C, R, R), by weights (N, R); relative: an error of 1 in units of noise, (N, C)."""
+    """What measurements say of inducing points, (C, R, R), by weights (N, R); relative: an error of 1 in units of
+    noise, (N, C)."""
     return jnp.stack([weights.T @ (column[:, None] ** 2 * weights) for column in relative.T])
 
 
 def unit_square(roots: Roots, gram: Array) -> Array:
     """A'A at an amplitude of 1, (C R, C R)."""
-    square = jnp.einsum("ri,crs,sj->cij", roots.nodes, gram, roots.nodes)
+    square = jnp.einsum("ri,crs,sj->cij", roots.inducing_points, gram, roots.inducing_points)
     if len(square) == 1:
         return roots.channels[0, 0] ** 2 * square[0]
     size = square.shape[0] * square.shape[1]
@@ -122,15 +124,15 @@ def triangular_inverse(root: Array) -> Array:
 def whitened(numbers: Array, where: Array, weights: Array, gram: Array | None, z: Array, relative: Array) -> Trio:
     """z - A c (N, C), c (C R,) and log diag C (C R,), of residuals z (N, C) in units of the noise.
 
-    Nodes, weights (N, R) and a `gram` (C, R, R) that is given do not depend on parameters, nor does `relative` (N, C)
-    with it.
+    Inducing points, weights (N, R) and a `gram` (C, R, R) that is given do not depend on parameters, nor does
+    `relative` (N, C) with it.
     """
     roots = roots_of(numbers, where, z.shape[-1])
     square = unit_square(roots, gram_of(weights, relative) if gram is None else gram)
     root, amplitude = root_of(numbers[0], square), numbers[0]
-    half = solve_triangular(root, amplitude * from_nodes(roots, (weights.T @ (relative * z)).T), lower=True)
+    half = solve_triangular(root, amplitude * from_points(roots, (weights.T @ (relative * z)).T), lower=True)
     white = solve_triangular(root, half, lower=True, trans=1)
-    errors = relative * (weights @ (amplitude * on_nodes(roots, white)).T)
+    errors = relative * (weights @ (amplitude * on_points(roots, white)).T)
     return z - errors, white, jnp.log(jnp.diagonal(root))
 
 
@@ -144,15 +146,15 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
     inverse = triangular_inverse(root)
 
     def back(x: Array) -> Array:
-        """Towards white numbers, (C R,), from readings, (N, C)."""
-        return from_nodes(roots, (weights.T @ x).T)
+        """Towards white numbers, (C R,), from measurements, (N, C)."""
+        return from_points(roots, (weights.T @ x).T)
 
     def solved(x: Array) -> Array:
         return inverse.T @ (inverse @ x)
 
     wanted = back(relative * z)
     white = amplitude * solved(wanted)
-    lack = weights @ (amplitude * on_nodes(roots, white)).T
+    lack = weights @ (amplitude * on_points(roots, white)).T
     left = z - relative * lack
 
     steps = moves_of(numbers, where, roots)
@@ -171,11 +173,11 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
     if gram is None:
         by_lack = by_relative * lack
         told = told + by_relative * left - relative * by_lack
-        parts = inverse.reshape(len(root), *map(len, roots)), roots.channels, weights @ roots.nodes
+        parts = inverse.reshape(len(root), *map(len, roots)), roots.channels, weights @ roots.inducing_points
         seen = amplitude * jnp.einsum("mcr,dc,nr->mnd", *parts)
         by_levels = by_levels + jnp.tensordot(seen**2, relative * by_relative, 2)
     own = amplitude * solved(back(told))
-    moved_nodes = on_nodes(roots, by_numbers @ jnp.stack(errors) + amplitude * own)
+    moved_nodes = on_points(roots, by_numbers @ jnp.stack(errors) + amplitude * own)
     by_left = by_z - by_lack - relative * (weights @ moved_nodes.T)
     found = left, white, jnp.log(jnp.diagonal(root))
     return found, (by_left, by_numbers @ jnp.stack(whites) + own, by_levels)

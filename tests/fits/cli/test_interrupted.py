@@ -1,6 +1,7 @@
 """Disks that fill up, processes that are killed or that meet, and damaged files: what was kept stays, and is seen."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,23 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits._files import locked
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
-from fits.optimise.fit import fit
-from fits.optimise.multi_start import start_points
 from fits.optimise.result import Fit
-from fits.optimise.starts_file import StartsFile
-from fits.problem.noise import Noise
-from fits.problem.problem import Problem
 from fits.reports.directories import reserved
 from fits.reports.plots.data import data_picture
 from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior
 from fits.sampling.chain import FileChain
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import identity_of, load, sample
+from fits.store import Store
 from tests.helpers.files import contents, largest_file, mounted, read_only
-from tests.helpers.models import LINE, line, line_data
 from tests.helpers.places import ROOT
 
 MANY = {"walkers": 400, "seed": 1, "max_steps": 300}  # a step is 12.5 kB in the journal, 9.6 kB in the file
@@ -158,7 +153,8 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
     with largest_file(30_000):
         assert refusal(words, capsys) == "layerjax: error: result: file too large"
     after = contents(work)
-    assert len(after.pop(str(work / ".result.starts")).splitlines()) == 1 + 3
+    after.pop(str(work / ".result.starts"))
+    assert len(Store.read(".result.starts").keys()) == 3
     assert after == before
     monkeypatch.setattr(starts, "least_squares_end", None)  # no start is run again
     assert main(words) == 0
@@ -232,15 +228,14 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
     done = work / ".result.starts"
 
     def some_starts() -> bool:
-        return done.is_file() and done.read_bytes().count(b"\n") > 3
+        return done.is_file() and len(Store.read(done).keys()) > 2
 
     with stopped(BOUNDED, tmp_path_factory.getbasetemp() / "cache", some_starts) as process:
-        before = done.read_bytes()
+        before = contents(work)
         assert f"result is in use by another process ({process.pid})" in refusal(BOUNDED, capsys)
-        assert done.read_bytes() == before
-    kept = before.count(b"\n") - 1
+        kept = len(Store.read(done).keys())
+        assert contents(work) == before
     assert 2 < kept < 12
-    done.write_bytes(before + b'00000000 {"start": 11, ')  # as if it had been killed in the middle of a line
     solve, solved = starts.bounded_end, []
     monkeypatch.setattr(starts, "bounded_end", lambda *given: solved.append(given) or solve(*given))
     assert main(BOUNDED) == 0
@@ -251,27 +246,30 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
         assert (work / "result" / name).read_bytes() == (work / "whole" / name).read_bytes()
 
 
-def test_starts_are_those_of_the_same_fit_only(tmp_path: Path) -> None:
-    def kept(count: int = 4, seed: int = 0, solver: str = "least_squares", **changed: object) -> int:
-        problem = Problem(**{"stack": LINE, "data": line_data(), "transport": line} | changed)
-        path = tmp_path / "starts"
-        path.write_bytes(written)
-        with StartsFile(path, problem, start_points(problem, count, seed), solver) as file:
-            return len(file.ends)
+def test_a_killed_batch_goes_on_with_the_fits_that_are_done(
+    work: Path, capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    (work / "scans").mkdir()
+    for name in ("a.csv", "b.csv", "c.csv"):
+        shutil.copy("data.csv", work / "scans" / name)
+    words = ["fit-many", "scans", "--stacks", "coat.toml", "--starts", "2", "--no-reports", "--processes", "1", "--out"]
+    store = work / "out" / "batch.store"
 
-    fit(LINE, line_data(), transport=line, starts=4, checkpoint=tmp_path / "starts")
-    written = (tmp_path / "starts").read_bytes()
-    assert kept() == 4
-    assert kept(count=5) == 0
-    assert kept(seed=1) == 0
-    assert kept(solver="bounded") == 0
-    assert kept(data=line_data(seed=1)) == 0
-    assert kept(noise=Noise(relative=0.01)) == 0
-    assert kept(noise=Noise(tails="student")) == 0
-    assert kept(objective="cosine_l2") == 0
-    assert kept(scale=1.01) == 0
-    assert kept(stack={**LINE, "b": LINE["b"].start}) == 0
-    assert kept(transport=lambda stack, wi, wo: 2.0 * line(stack, wi, wo)) == 0
+    def one_is_done() -> bool:
+        return store.is_file() and Store.read(store).get("a.csv/coat") is not None
+
+    with stopped([*words, "out"], tmp_path_factory.getbasetemp() / "cache", one_is_done) as process:
+        before = contents(work)
+        assert f"in use by another process ({process.pid})" in refusal([*words, "out"], capsys)
+        assert contents(work) == before
+    first = before[str(work / "out" / "a.csv" / "coat" / "fit.json")]
+    for out in ("out", "whole"):
+        assert main([*words, out]) == 0
+    assert (work / "out" / "a.csv" / "coat" / "fit.json").read_bytes() == first  # not fitted again
+    for name in ("a.csv", "b.csv", "c.csv"):
+        one, other = (load_fit(work / out / name / "coat") for out in ("out", "whole"))
+        np.testing.assert_array_equal(one.vector, other.vector)
+    assert not list((work / "out").rglob(".*"))
 
 
 def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
@@ -309,18 +307,3 @@ def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) 
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
     with reserved(directory, force=True), pytest.raises(ValueError, match="in use"):
         save_fit(coat_fit, directory, force=True)
-
-
-def test_a_lock_is_free_again_after_its_process(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
-    script = (
-        f"import os; from pathlib import Path; from fits._files import locked\n"
-        f"with locked(Path({str(path)!r}), 'it'): os._exit(9)"
-    )
-    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=False)
-    assert path.exists()
-    with locked(path, "it"):
-        assert path.read_text() == f"{os.getpid()}\n"
-        with pytest.raises(ValueError, match=rf"it is in use by another process \({os.getpid()}\)"), locked(path, "it"):
-            pass
-    assert not path.exists()

@@ -11,7 +11,7 @@ from fits.maps import descending
 from fits.maps.searching import search, starts_at
 from fits.maps.solving import _solved, all_known, solve
 from fits.maps.texels import blank, texels, with_own_directions
-from fits.optimise.descent import PROMISE, descend
+from fits.optimise.descent import COST_TOLERANCE, descend
 from fits.problem.compilation import _run
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps
@@ -57,10 +57,10 @@ LEVELS = fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)
 def test_each_ends_where_a_descent_of_its_own_does(geometry, readings, noise, objective):
     """From starts far away, and near, however the descent is cut short.
 
-    Within what `Found.better` counts as nothing gained: 10 `PROMISE` of the cost, half a square of standard errors. A
-    named objective stops at 1e-10 of its cost.
+    Within what `Found.better` counts as nothing gained: 10 `COST_TOLERANCE` of the cost, half a square of standard
+    errors. A named objective stops at 1e-10 of its cost.
     """
-    left = 10.0 * PROMISE
+    left = 10.0 * COST_TOLERANCE
     cost, apart = (left, np.sqrt(2.0 * left)) if objective == "likelihood" else (0.0, 1e-3)
     problem, rng = problem_of(geometry, noise, objective=objective), np.random.default_rng(7)
     rows = texels(readings, least=1e-4)
@@ -69,7 +69,7 @@ def test_each_ends_where_a_descent_of_its_own_does(geometry, readings, noise, ob
         found = solve(problem, units, rows, SIZE, fresh)
         for place in range(TEXELS):
             own = problem_of(geometry, noise, readings[place], objective)
-            alone = own.call(descend, units[place], fresh, 200, PROMISE)
+            alone = own.call(descend, units[place], fresh, 200, COST_TOLERANCE)
             assert bool(alone.converged)
             assert bool(found.converged[place])
             assert found.cost[place] == pytest.approx(float(alone.cost), abs=cost, rel=2e-10 if not cost else 0.0)

@@ -12,6 +12,7 @@ from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.maps.tabulated import chebyshev, coarser, with_table
 from fits.maps.tabulating import ACCEPTED, tabulate
+from fits.problem.model import Density
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
@@ -52,7 +53,7 @@ def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, 
     ends = np.stack([problem.low, problem.high])
     for vector in (*vectors, *ends):
         exact, found = (np.asarray(one.predict(vector)) for one in (problem, table))
-        sigma = np.asarray(problem.call("sigma_at", vector, problem.predict(vector)))
+        sigma = np.asarray(problem.call(Density.sigma_at, vector, problem.predict(vector)))
         assert np.max(np.abs(found - exact) / sigma) < 2.0 * ACCEPTED  # at points that no check has seen
 
 

@@ -10,15 +10,14 @@ from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
+from fits.optimise.multi_start import Floats
 from fits.optimise.result import Fit
-from fits.optimise.starts_file import Floats
-from fits.problem.base import Posed
 from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.kernel import log_sizes
+from fits.problem.discrepancy.kernel import log_scales
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.reports import tables, verdicts
 from fits.reports.agreement import discrepancy
 from fits.reports.results import load_fit, save_fit
@@ -76,7 +75,7 @@ def test_simulated_readings_share_errors(wrong: Fit) -> None:
     simulated = posterior.inference_data.posterior_predictive["value"].to_numpy().reshape(-1, *wrong.predicted.shape)
     found = simulated / wrong.predicted
     at = wrong.problem.build(wrong.vector).correlation
-    shared = at.amplitude * np.exp(at.growth * np.asarray(log_sizes(places(GEOMETRY.wi, GEOMETRY.wo))))
+    shared = at.amplitude * np.exp(at.grazing_exponent * np.asarray(log_scales(places(GEOMETRY.wi, GEOMETRY.wo))))
     # of 2048 draws, and a regression on nodes between them
     np.testing.assert_allclose(np.log(found).std(axis=0)[:, 0], np.hypot(shared, 0.02), rtol=0.1)
 
@@ -140,7 +139,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     run: list[str] = []
     end = starts_module.rough_end
 
-    def counted(problem: Posed, point: Floats) -> starts_module.End:
+    def counted(problem: FittingProblem, point: Floats) -> starts_module.End:
         run.append(type(problem).__name__)
         return end(problem, point)
 
@@ -148,7 +147,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     found = fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(found.vector, wrong.vector)
     assert len(run) == 1  # of two starts and, with shared errors, three
-    assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-shared"}
+    assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-discrepancy"}
 
 
 def test_a_result_directory_keeps_it(tmp_path, coat_fit: Fit) -> None:

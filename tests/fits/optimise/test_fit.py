@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 import layerjax as lj
 from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
-from fits.optimise.descent import PROMISE
+from fits.optimise.descent import COST_TOLERANCE
 from fits.optimise.fit import fit, fit_problem, start_points
 from fits.optimise.identifiability import Direction
 from fits.problem.compilation import _run
@@ -154,7 +154,7 @@ def test_a_prior_closes_an_open_direction() -> None:
     stack = {"a": Free(0.1, -2.0, 2.0, Normal(0.3, 0.2)), "b": Free(0.1, -2.0, 2.0)}
     result = fit(stack, measured(np.full((COUNT, 1), 1.0), 0.01), transport=total, starts=4)
     assert result.standard_errors["['a']"] == pytest.approx(0.2, rel=1e-6)
-    left = np.sqrt(2.0 * PROMISE) * 0.2  # a step that promises less ends the fit
+    left = np.sqrt(2.0 * COST_TOLERANCE) * 0.2  # a step that promises less ends the fit
     assert named(result) == pytest.approx({"a": 0.3, "b": 0.7}, abs=left)
     (combination,) = result.unidentified  # it is the prior that decides, and the data are said not to
     assert combination.unconstrained

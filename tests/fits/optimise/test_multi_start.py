@@ -13,9 +13,8 @@ from fits.data.geometry import slices
 from fits.optimise import multi_start as starts_module
 from fits.optimise.bounded import cost_and_gradient
 from fits.optimise.fit import fit
-from fits.optimise.multi_start import WORTH, run_starts
+from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store
 from fits.optimise.result import OUTCOMES
-from fits.optimise.starts_file import End, StartsFile
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.priors import LogUniform
@@ -77,7 +76,7 @@ def test_a_stack_never_ends_above_what_it_contains(pair, name, degrees, count):
     for old, new in renamed.items():
         values = {parameter.replace(old, new): value for parameter, value in values.items()}
     # to what a start that goes on is worth
-    assert whole.minima[0].cost <= cost_at(whole.problem, values) + WORTH
+    assert whole.minima[0].cost <= cost_at(whole.problem, values) + LEAST_GAIN
 
 
 @pytest.mark.parametrize("name", [STEEL, "aeroglaze_650nm_inplane.csv"])
@@ -88,9 +87,9 @@ def test_a_race_ends_where_all_starts_do(name, monkeypatch):
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
-    ends, every = starts_module.race(problem, points), run_starts(problem, points, "least_squares", lambda *told: None)
-    assert min(end.cost for end in ends) <= min(end.cost for end in every) + WORTH
-    left = [end for end in ends if end.unfinished]
+    ends, every = starts_module.race(problem, points), multi_start(problem, points, "least_squares", lambda *told: None)
+    assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
+    left = [end for end in ends if end.max_steps_reached]
     assert 1 <= len(left) <= len(points) - starts_module.FRONT
     assert {end.steps for end in left} == {20}  # with sigma held, and free
     assert sum(end.steps for end in ends) < sum(end.steps for end in every)
@@ -119,7 +118,7 @@ def test_a_start_that_ran_out_of_steps_goes_on(monkeypatch):
     monkeypatch.undo()
     at_once = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=1)
     assert slowly.converged
-    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=WORTH)
+    assert slowly.minima[0].cost == pytest.approx(at_once.minima[0].cost, abs=LEAST_GAIN)
 
 
 class Dimmed:
@@ -130,14 +129,39 @@ class Dimmed:
 
 
 @pytest.mark.parametrize("made", [lambda: jax.jit(lambda *a: line(*a)), Dimmed], ids=["compiled", "object"])
-def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path):
-    data, points, path = line_data(), np.full((1, 2), 0.5), tmp_path / "starts"
+def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path, monkeypatch):
     transports = made(), made()  # both at once, so that they differ in place
-    first, second = (Problem(LINE, data, one) for one in transports)
-    with StartsFile(path, first, points, "least_squares") as kept:
-        kept.add(0, End(np.array([1.0, 0.5]), 1.0, 5, True, False))
-    with StartsFile(path, second, points, "least_squares") as kept:
-        assert list(kept.ends) == [0]
+    fit(LINE, line_data(), transport=transports[0], starts=2, checkpoint=tmp_path / "starts")
+    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    fit(LINE, line_data(), transport=transports[1], starts=2, checkpoint=tmp_path / "starts")
+
+
+def test_starts_are_those_of_the_same_fit_only(tmp_path):
+    path = tmp_path / "starts"
+
+    def kept(count=4, seed=0, solver="least_squares", **changed):
+        """How many starts of an earlier fit are taken for this one."""
+        path.write_bytes(written)
+        problem = Problem(**{"stack": LINE, "data": line_data(), "transport": line} | changed)
+        with starts_store(path, problem, start_points(problem, count, seed), solver) as store:
+            return len(store.keys())
+
+    fit(LINE, line_data(), transport=line, starts=4, checkpoint=path)
+    written = path.read_bytes()
+    assert kept() == 4
+    others = [
+        {"count": 5},
+        {"seed": 1},
+        {"solver": "bounded"},
+        {"data": line_data(seed=1)},
+        {"noise": Noise(relative=0.01)},
+        {"noise": Noise(tails="student")},
+        {"objective": "cosine_l2"},
+        {"scale": 1.01},
+        {"stack": {**LINE, "b": LINE["b"].start}},
+        {"transport": lambda stack, wi, wo: 2.0 * line(stack, wi, wo)},
+    ]
+    assert [kept(**other) for other in others] == [0] * len(others)
 
 
 def test_a_fit_does_not_end_on_a_plateau():

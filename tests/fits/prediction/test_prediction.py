@@ -37,7 +37,7 @@ def measurements(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     assert process is not None
     assert at is not None
     white = generator.standard_normal((1, len(process.where)))
-    discrepancy = np.asarray(process.drawn(white, at))
+    discrepancy = np.asarray(process.sample(white, at))
     values = exact * (np.exp(discrepancy) + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
 

@@ -8,7 +8,7 @@ from scipy import stats
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
-from fits.optimise.descent import here
+from fits.optimise.descent import evaluate_at
 from fits.problem.discrepancy.inducing_points import places
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.discrepancy.process import make_process
@@ -111,7 +111,11 @@ def dense(of: Problem, vector: np.ndarray, nodes: bool = True) -> tuple[np.ndarr
     weights, grid = np.asarray(process.weights), np.asarray(process.where)
     own = folded(of.data)
     shared = weights @ kernel(grid, grid, at) @ weights.T if nodes else kernel(own, own, at)
-    colours = float(at.channels) + (1.0 - float(at.channels)) * np.eye(channels) if channels > 1 else np.ones((1, 1))
+    colours = (
+        float(at.channel_correlation) + (1.0 - float(at.channel_correlation)) * np.eye(channels)
+        if channels > 1
+        else np.ones((1, 1))
+    )
     full = np.einsum("nm,cd->ncmd", shared, colours).reshape(count * channels, -1)
     values, s = of.data.values, soft(of)
     noise = np.sqrt((s / 4.0) ** 2 + (0.01 * values) ** 2) / np.hypot(values, s)
@@ -211,7 +215,7 @@ def test_nodes_cannot_be_told_from_the_exact_process(layout: str) -> None:
 
 
 def test_errors_elsewhere_are_those_of_regression() -> None:
-    of = problem("two incidences", amplitude=0.2, half=20.0, difference=18.0)
+    of = problem("two incidences", amplitude=0.2, length_half=20.0, length_difference=18.0)
     model = of.model
     at, process = model.build(jnp.asarray(of.start)).correlation, model.process
     assert process is not None
@@ -307,7 +311,7 @@ def test_derivatives_at_the_ends(end: str, relative: float | Free) -> None:
 def test_gradient_of_the_fit_is_that_of_its_cost() -> None:
     of = problem("two incidences", 2)
     unit = np.asarray(of.model.box.to_unit(jnp.asarray(of.start)))
-    found = here(of, unit)
+    found = evaluate_at(of, unit)
 
     def cost(model: Model, s: jax.Array) -> jax.Array:
         return 0.5 * sum(jnp.sum(part**2) for part in model.residuals(model.box.from_unit(s)))
@@ -322,7 +326,8 @@ def test_what_is_given_is_no_parameter() -> None:
     )
     assert problem("one scan").names == ("['a']", *every[:4])
     assert problem("two planes", 3).names[1:] == every
-    fixed = problem("two planes", amplitude=0.1, half=20.0, difference=Free(20.0, 10.0, 50.0), growth=0.0)
+    free = Free(20.0, 10.0, 50.0)
+    fixed = problem("two planes", amplitude=0.1, length_half=20.0, length_difference=free, grazing_exponent=0.0)
     assert fixed.names == ("['a']", "noise.discrepancy.length_difference")
     assert fixed.units["noise.discrepancy.length_difference"] == "deg"
 
@@ -338,7 +343,7 @@ def test_readings_all_over_the_hemisphere_are_carried() -> None:
 
 
 def test_bad_noise_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"Noise.tails is 'student'; with correlated noise it must be gaussian"):
+    with pytest.raises(ValueError, match=r"Noise.tails is 'student'; with model discrepancy it must be gaussian"):
         Noise(tails="student", discrepancy=True)
     with pytest.raises(ValueError, match=r"Noise.discrepancy is 0.3; it must be true, false or Discrepancy"):
         Noise(discrepancy=0.3)

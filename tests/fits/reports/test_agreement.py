@@ -13,6 +13,7 @@ from fits.data.neighbours import correlation, neighbours
 from fits.data.scans import signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
+from fits.problem.model import Density
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -42,7 +43,7 @@ def simulated(seed: int, factor: float = 1.0) -> Problem:
     model = assumed(exact).model
     process, at = model.process, model.build(TRUTH).correlation
     assert process is not None
-    lack = np.asarray(process.drawn(generator.standard_normal((1, len(process.where))), at))
+    lack = np.asarray(process.sample(generator.standard_normal((1, len(process.where))), at))
     return assumed(factor * exact * np.exp(lack) * (1.0 + 0.02 * generator.standard_normal(exact.shape)))
 
 
@@ -109,7 +110,9 @@ def test_a_stack_that_misses_is_said_to_though_the_discrepancy_explains_all(fitt
     assert float(said[1]) == pytest.approx(100.0 * np.median(off.predicted / values - 1.0), abs=1.0)
     assert float(said[2]) == pytest.approx(2.0)
     last = verdicts.outcome(off, residual_structure(off.problem.data, standardised(off)))[-1]
-    without = np.sum(np.square(off.problem.call("offsets_at", off.vector, off.predicted))) / off.degrees_of_freedom
+    without = (
+        np.sum(np.square(off.problem.call(Density.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
+    )
     assert f"with the discrepancy term, {without:.4g} without" in last
     assert misdescribed(replace(fitted, problem=simulated(0), vector=TRUTH)) != []  # 10 % beside a noise of 2 %
     right = replace(fitted.problem, noise=Noise(relative=0.2, floor=1e-4, discrepancy=False))

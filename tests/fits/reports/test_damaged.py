@@ -1,16 +1,13 @@
 """Files that were damaged on the disk: whatever is read from them is what was written, or an error that names them."""
 
 import json
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.optimise.multi_start import start_points
 from fits.optimise.result import Fit
-from fits.optimise.starts_file import End, StartsFile
 from fits.reports.results import load_fit, save_fit
 from fits.sampling.chain import USER_BLOCK, read_chain
 from fits.sampling.sample import load, sample
@@ -25,24 +22,6 @@ def damaged(content: bytes, step: int) -> Iterator[tuple[int, bytes]]:
             if other != run:
                 first = next(index for index, byte in enumerate(run) if byte != other[index])
                 yield place + first, content[:place] + other + content[place + 64 :]
-
-
-def test_damage_to_the_starts_costs_those_behind_it(result: Fit, tmp_path: Path) -> None:
-    path, points = tmp_path / "starts", start_points(result.problem, 6, 0)
-    with StartsFile(path, result.problem, points, "least_squares") as file:
-        for index in range(6):
-            file.add(index, End(points[index], 0.1 * index, index, index % 2 == 0, False))
-        with pytest.raises(ValueError, match=rf"in use by another process \({os.getpid()}\)"), file:
-            pass
-    whole = path.read_bytes()
-    assert whole.count(b"\n") == 1 + 6
-    for place, bad in damaged(whole, 32):
-        path.write_bytes(bad)
-        with StartsFile(path, result.problem, points, "least_squares") as file:
-            assert sorted(file.ends) == list(range(whole[:place].count(b"\n") - 1))
-            for index, end in file.ends.items():
-                np.testing.assert_array_equal(end.vector, points[index])
-                assert end[1:] == (0.1 * index, index, index % 2 == 0, False)
 
 
 def test_damage_to_a_chain_is_seen(result: Fit, tmp_path: Path) -> None:

@@ -68,7 +68,6 @@ def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
         ({"a": COAT}, {"a": BASE}, "'a' names a layer and a base"),
         ({"a/b": COAT}, {"c": BASE}, "'a/b' is no name"),
         ({"a": COAT}, {"b c": BASE, "B-c": BASE}, "'b c' and 'B-c' are one name as files"),
-        ({"a": COAT}, {"Search": BASE}, "a base is called 'Search'"),
     ],
 )
 def test_bad_names_are_refused(layers: dict, bases: dict, message: str) -> None:

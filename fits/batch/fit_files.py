@@ -1,0 +1,497 @@
+"""Every file of a folder fitted by every one of several stacks: `fits.fit_files`, and `layerjax fit-many`.
+
+OUT/FILE/STACK/       a result directory as `layerjax fit` writes it
+OUT/FILE/search/      the best that a search found, and OUT/FILE/search-stacks/ all that it fitted
+OUT/table.csv         a row for each file and stack; report.html is the same to read, with links
+OUT/batch.store       what is done, and of what it was made
+"""
+
+import csv
+import html
+import io
+import math
+import shutil
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from fits._files import named, read_json, require_there, write_text
+from fits.batch.fit_file import fit_into, require_posterior, write_into
+from fits.data.formats import sniff
+from fits.data.reading import Reading
+from fits.data.totals import Totals
+from fits.engines import Failure, run
+from fits.engines.failures import one_line
+from fits.names import Objective
+from fits.optimise.multi_start import Solver
+from fits.prediction.options import ComparisonOptions
+from fits.problem.compilation import make_room
+from fits.problem.stack_file import ProblemFile, read_problem
+from fits.progress import Progress, silent
+from fits.reports import tables
+from fits.reports.directories import FIT
+from fits.reports.pages import document, section, sentences
+from fits.reports.results import REPORT
+from fits.reports.verdicts import listed
+from fits.store import Store, another, differences, fingerprint
+from fits.structure_search.report import write_report as write_search
+from fits.structure_search.search import search as run_search
+
+TABLE, PAGE, STORE = "table.csv", "report.html", "batch.store"
+SEARCH, STACKS = "search", "search-stacks"
+"""Directories of a search below that of a file."""
+MEASURED = (".csv", ".tsv", ".binary", ".bsdf", ".brdf", ".anisotropicbsdf", ".astm", ".rxt", ".ssdd")
+"""Endings that say of a file in a folder that it should hold measurements; others do if their content says so."""
+NOT_YET = "not done yet"
+SHOWN = 40
+"""Rows on a terminal."""
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class FittedFiles:
+    """What became of every file and stack.
+
+    Attributes:
+        directory: where results, table and page are.
+        rows: a mapping for each file and stack, as a line of the table: `file`, `stack`, `result` ("converged", "not
+            converged" or "failed"), `status` (of the fit, or why there is none), `standing` among the stacks of the
+            file; of a fit `criterion` and `loss`, by which stacks are ranked (-2 log predictive density of held-out
+            data, else AIC, else the named objective), `reduced_chi_square`, with and without the model discrepancy,
+            values and errors of the parameters, those at a bound, the number of readings, seconds; of a search the
+            `structure` that is best.
+        left_out: files of the folders that hold no measurements.
+    """
+
+    directory: Path
+    rows: tuple[Row, ...]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every file was fitted by every stack, and all of the fits converged."""
+        return all(row["result"] == "converged" for row in self.rows)
+
+    @property
+    def best(self) -> dict[str, str]:
+        """By file, the stack of the lowest loss, or the only one that was fitted."""
+        fitted = [row for row in self.rows if row["result"] != "failed"]
+        files = [row["file"] for row in fitted]
+        return {
+            row["file"]: row["stack"] for row in fitted if row["standing"] == "best" or files.count(row["file"]) == 1
+        }
+
+
+def fit_files(
+    files: str | Path | Sequence[str | Path],
+    stacks: str | Path | Sequence[str | Path],
+    out: str | Path,
+    *,
+    processes: int = 1,
+    client: Any = None,
+    search: bool | Mapping[str, Any] = False,
+    reading: Reading | None = None,
+    objective: Objective | None = None,
+    starts: int = 32,
+    seed: int = 0,
+    solver: Solver = "least_squares",
+    reports: bool = True,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> FittedFiles:
+    """Fit every measurement file by every stack, each into a result directory ``out/FILE/STACK``, and tabulate them.
+
+    What is there already is not done again; a run that was interrupted goes on. A file that cannot be read, or a fit
+    that fails, is a row with the reason, and the others go on.
+
+    Args:
+        files: a folder, of which files that hold no measurements are left out, or files and folders.
+        stacks: stack files; may be none where a search is asked for.
+        out: directory to write, or to go on with.
+        processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
+            a cluster see files and `out` by these paths.
+        search: look for the stack behind each file as well; a mapping has the arguments of `fits.search`.
+        reading: how all files are read, see `fits.data.reading.Reading`.
+        objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
+        reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
+        force: fit again what is there of another stack, of other settings or of what a file held before.
+        progress: called with ("fits", done, all, file and stack).
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
+            `force`; a directory in use, or that holds something else; as `fits.engines.run`.
+    """
+    reading, out, progress = reading or Reading(), Path(out), progress or silent
+    found, left_out = measurement_files(_several(files), reading.format)
+    named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
+    given = {name: read_problem(path) for name, path in named_stacks.items()}
+    if not given and search is False:
+        raise ValueError("no stack is given, nor a search asked for; there must be one of them")
+    if not given and (objective, solver) != (None, "least_squares"):
+        raise ValueError(
+            f"objective {objective} and solver {solver} are of no stack; a search fits likelihoods, by least squares"
+        )
+    for problem in given.values():
+        require_posterior(objective or problem.objective, "--hold-out" if reading.hold_out else None)
+    searching = None if search is False else {"seed": seed} | ({} if search is True else dict(search))
+    fitting = {"objective": objective, "starts": starts, "seed": seed, "solver": solver}
+    job = Job(out.absolute(), given, searching, reading, fitting, reports, force)
+    if not out.resolve().parent.is_dir():
+        raise ValueError(f"{out}: there is no directory {out.parent}")
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out}: is a file, must be a directory")
+    if out.exists() and any(out.iterdir()) and not (out / STORE).is_file():
+        raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
+    done = Store.read(out / STORE) if (out / STORE).is_file() else None
+    # workers of a cluster have another working directory
+    paths = [path if client is None else path.absolute() for path in found.values()]
+    rows, tasks = _planned(job, paths, out, done)
+    if not tasks and all(row["result"] == "failed" for row in rows.values()):
+        reasons = list(dict.fromkeys(row["status"] for row in rows.values()))
+        raise ValueError(f"no file can be fitted: {'; '.join(reasons[:3])}")
+    with named(out):
+        out.mkdir(exist_ok=True)
+    with Store.open(out / STORE, fingerprint(of="fit-many")) as store:
+        # where one of these has a directory and no row, that is what a killed run left
+        store.put("begun", sorted({*(store.get("begun") or ()), *(task.key for task in tasks)}))
+        total, count = len(rows), len(rows) - len(tasks)
+        try:
+            progress("fits", count, total)
+            # by a single thread: a fit takes all cores, and another that waits for it could not be interrupted
+            for index, outcome in run(fit_one, job, tasks, processes=processes, client=client, threads=1):
+                task, count = tasks[index], count + 1
+                if isinstance(outcome, Failure):
+                    outcome = task.failed(outcome.error)
+                else:
+                    store.put(task.key, {"of": job.fingerprint(task), "row": outcome})
+                rows[task.key] = outcome
+                progress("fits", count, total, f"{task.path.name} by {task.stack}")
+        finally:
+            for key, row in rows.items():
+                if row["result"] != "failed" and not (out / key / FIT).is_file():
+                    row |= {"result": "failed", "status": f"{key}: was removed while others were fitted"}
+            result = FittedFiles(out, ranked(list(rows.values())), left_out)
+            write_text(out / TABLE, table_csv(result.rows), force=True)
+            write_text(out / PAGE, page(result), force=True)
+    return result
+
+
+# ---- what is fitted by what ----
+
+
+def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Files by name, those of folders among them; and what folders hold beside measurements.
+
+    Raises:
+        FileNotFoundError: no such file or folder.
+        ValueError: a folder without measurements, or a name that is there twice.
+    """
+    files: list[Path] = []
+    beside: list[str] = []
+    for place in map(Path, given):
+        require_there(place, "no such file or folder")
+        if not place.is_dir():
+            files.append(place)
+            continue
+        every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))
+        some = [one for one in every if format is not None or _holds_measurements(one)]
+        if not some:
+            raise ValueError(f"{place}: holds no measurement file")
+        files += some
+        beside += [str(one) for one in every if one not in some]
+    if not files:
+        raise ValueError("no file is given; there must be at least one")
+    return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(beside)
+
+
+def _holds_measurements(path: Path) -> bool:
+    if path.suffix.lower() in MEASURED:
+        return True
+    try:
+        sniff(path)
+    except (ValueError, OSError):
+        return False
+    return True
+
+
+def _by_name(names: Sequence[tuple[Path, str]], taken: Sequence[str]) -> dict[str, Path]:
+    """The paths by name. ValueError for a name that is there twice, or taken."""
+    found: dict[str, Path] = {}
+    for path, name in names:
+        if name in found:
+            raise ValueError(f"{found[name]} and {path}: results go by this name, which must differ")
+        if name in taken:
+            raise ValueError(f"{path}: its name must be another: fit-many writes a {name} of its own")
+        found[name] = path
+    return found
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all tasks share: where results go, stacks by name or how they are searched, and how files are read."""
+
+    out: Path
+    stacks: Mapping[str, ProblemFile]
+    searching: Mapping[str, Any] | None
+    reading: Reading
+    fitting: Mapping[str, Any]
+    reports: bool
+    force: bool
+
+    @property
+    def names(self) -> list[str]:
+        """Of stacks, and of the search."""
+        return [*self.stacks, *([] if self.searching is None else [SEARCH])]
+
+    def fingerprint(self, task: "Task") -> dict[str, str]:
+        """Of a result."""
+        how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
+        return fingerprint(file=task.content, **vars(self.reading), **(how or {}))
+
+
+class Task(NamedTuple):
+    """A file, by its path and what tells its content from others, and the name of a stack."""
+
+    path: Path
+    content: str
+    stack: str
+
+    @property
+    def key(self) -> str:
+        """Of its row in the store, and the place of its result."""
+        return f"{self.path.name}/{self.stack}"
+
+    def failed(self, why: str) -> Row:
+        """Its row where there is no result."""
+        return {"file": self.path.name, "stack": self.stack, "result": "failed", "status": why}
+
+
+def _lines(path: Path) -> str:
+    """What tells the content of a file from others, whatever its line ends."""
+    content = path.read_bytes().replace(b"\r\n", b"\n")
+    return fingerprint(content=np.frombuffer(content, np.uint8))["content"]
+
+
+def _planned(job: Job, files: list[Path], out: Path, done: Store | None) -> tuple[dict[str, Row], list[Task]]:
+    """A row for each file and stack, in order; and the tasks that are left, stack by stack: they share programs.
+
+    done: what an earlier run has kept.
+
+    Raises:
+        ValueError: a result of something else is there.
+    """
+    rows: dict[str, Row] = {}
+    tasks: list[Task] = []
+    for path in files:
+        every, why = [Task(path, "", stack) for stack in job.names], NOT_YET
+        try:
+            content = _lines(path)
+            every = [task._replace(content=content) for task in every]
+        except OSError as error:
+            why = one_line(error)
+        rows |= {task.key: task.failed(why) for task in every}
+        if why == NOT_YET:
+            rows |= {task.key: row for task in every if (row := _done_before(job, task, out, done)) is not None}
+        left = [task for task in every if rows[task.key]["status"] == NOT_YET]
+        try:
+            if left:
+                job.reading.parts(path)  # before any is fitted
+            tasks += left
+        except (ValueError, OSError) as error:
+            rows |= {task.key: task.failed(one_line(error)) for task in left}
+    return rows, sorted(tasks, key=lambda task: job.names.index(task.stack))
+
+
+def _done_before(job: Job, task: Task, out: Path, done: Store | None) -> Row | None:
+    """The row of a result that is there, or of one that is damaged; None: it is to be fitted.
+
+    Raises:
+        ValueError: another result, or something else altogether, is in its place.
+    """
+    directory = out / task.key
+    if not directory.exists() or not any(directory.iterdir()):
+        return None
+    kept = None if done is None else done.get(task.key)
+    if kept is None:
+        if done is None or task.key not in done.get("begun"):
+            raise ValueError(f"{directory}: holds something that fit-many did not make")
+        return None
+    words = differences(kept["of"], job.fingerprint(task))
+    if words and not job.force:
+        raise ValueError(another(directory, words))
+    try:
+        read_json(directory / FIT)
+    except (ValueError, OSError) as error:
+        return None if job.force else task.failed(f"{one_line(error)} (--force fits it again)")
+    return None if words else kept["row"]
+
+
+def _several(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    return [given] if isinstance(given, str | Path) else list(given)
+
+
+# ---- a worker's task ----
+
+_one_at_a_time = threading.Lock()
+"""In a process: a fit takes all cores for its starts, pictures cannot be drawn side by side, and programs may go."""
+
+
+def fit_one(job: Job, task: Task) -> Row:
+    """Fit one file by one stack and write the result.
+
+    Raises:
+        ValueError, OSError: it cannot be fitted. What is wrong with one of many ends none of the others.
+    """
+    with _one_at_a_time:
+        make_room()
+        try:
+            return _fitted(job, task)
+        except (ValueError, OSError):
+            raise
+        except Exception as error:
+            raise ValueError(f"{type(error).__name__}: {error}") from error
+
+
+def _fitted(job: Job, task: Task) -> Row:
+    began, directory, structure = time.monotonic(), job.out / task.key, ""
+    if _lines(task.path) != task.content:
+        raise ValueError(f"{task.path}: was changed while others were fitted")
+    data, held_out = job.reading.parts(task.path)
+    with named(directory.parent):
+        directory.parent.mkdir(exist_ok=True)
+    if task.stack == SEARCH:
+        if isinstance(data, Totals):
+            raise ValueError(f"{task.path}: holds totals; a search takes values along directions")
+        stacks = directory.with_name(STACKS)
+        if job.force and directory.exists() and stacks.exists():  # of another search
+            shutil.rmtree(stacks)
+        found = run_search(data, **(job.searching or {}), directory=stacks)
+        write_search(found, stacks)
+        structure = found.best.name
+        fit, foretold = write_into(directory, found.best.fit, force=True, report=job.reports)
+    else:
+        given = job.stacks[task.stack]
+        fit, foretold = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
+    without = fit.without_discrepancy
+    row = task.failed(fit.status) | {
+        "result": "converged" if fit.converged else "not converged",
+        "structure": structure,
+        "criterion": "AIC" if fit.is_posterior else fit.problem.objective,
+        "loss": 2.0 * len(fit.vector) - 2.0 * fit.log_likelihood if fit.is_posterior else fit.chi_square,
+        "reduced_chi_square": fit.reduced_chi_square,
+        "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
+    }
+    if foretold is not None and (scores := foretold.prediction.scores) is not None:
+        row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
+    for name, value in fit.values.items():
+        row |= {name: value, f"{name} error": fit.standard_errors[name]}
+    row |= {"at_bound": " ".join(fit.at_bound), "readings": int(fit.problem.data.mask.sum())}
+    return row | {"seconds": round(time.monotonic() - began, 2)}
+
+
+# ---- what became of them ----
+
+
+def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows with the `standing` of each among the stacks of its file: "best", "as good" as the best, or by how much
+    its loss is higher; empty where nothing can be said.
+
+    A best fit that misses the data by more than their noise says that the noise is larger than stated: differences in
+    AIC are divided by its reduced chi-square, as in `fits.compare`.
+    """
+    words = [""] * len(rows)
+    for file in dict.fromkeys(row["file"] for row in rows):
+        own = [k for k, row in enumerate(rows) if row["file"] == file and math.isfinite(row.get("loss", math.nan))]
+        if len(own) < 2 or len({rows[k]["criterion"] for k in own}) > 1:
+            continue
+        first = min(own, key=lambda k: (rows[k]["result"] != "converged", rows[k]["loss"]))
+        best = rows[first]
+        excess = max(1.0, np.nan_to_num(best["reduced_chi_square"])) if best["criterion"] == "AIC" else 1.0
+        for k in own:
+            behind = (rows[k]["loss"] - best["loss"]) / excess
+            alike = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
+            alike &= behind < ComparisonOptions().slight_difference
+            words[k] = "best" if k == first else "as good" if alike else f"{behind:+.1f}"
+    return tuple(row | {"standing": word} for row, word in zip(rows, words, strict=True))
+
+
+def table_csv(rows: Sequence[Row]) -> str:
+    """A line each; value and error of every parameter that any of them has, empty where it has none."""
+    first, last = ("file", "stack", "structure", "result", "standing"), ("readings", "seconds", "at_bound", "status")
+    names = dict.fromkeys(name for row in rows for name in row if name not in last)
+    out = io.StringIO()
+    writer = csv.DictWriter(out, list(dict.fromkeys((*first, *names, *last))), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value, 8) for name, value in row.items()} for row in rows)
+    return out.getvalue()
+
+
+def _cell(value: Any, digits: int) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.{digits}g}"
+    return str(value)
+
+
+def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
+    """A row each, without the parameters."""
+    columns = ["file", "stack", "result", "standing", "reduced_chi_square", "criterion", "loss", "seconds", "structure"]
+    columns = [*(name for name in columns if any(row.get(name, "") != "" for row in rows)), "status"]
+    # all of the status is in the table and in the report of the fit
+    shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
+    note = (
+        "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC: as good as "
+        "the best, or by how much behind; where the best misses the data, the scatter that it leaves counts as noise."
+    )
+    return tables.Table(
+        "Fits", tuple(columns), tuple(shown if most is None else tables.shortened(shown, most)), note, keys=2
+    )
+
+
+def statements(found: FittedFiles) -> list[str]:
+    """What became of them, in sentences."""
+    rows = found.rows
+    files, stacks = ({row[name]: None for row in rows} for name in ("file", "stack"))
+    results = [row["result"] for row in rows]
+    best = [row["stack"] for row in rows if row["standing"] == "best"]
+    said = {
+        "No result of": list(dict.fromkeys(row["file"] for row in rows if row["result"] == "failed")),
+        "Not converged:": [f"{row['file']} by {row['stack']}" for row in rows if row["result"] == "not converged"],
+        "Best of a file:": [f"{name} {_count(best.count(name), 'time')}" for name in stacks if len(stacks) > 1],
+        "Not taken for measurements:": list(found.left_out),
+    }
+    return [
+        f"{_count(len(files), 'file')} by {_count(len(stacks), 'stack')}: {len(rows) - results.count('failed')} of "
+        f"{len(rows)} fits are there, {results.count('converged')} of them converged.",
+        *(f"{word} {_few(names)}." for word, names in said.items() if names),
+    ]
+
+
+def page(found: FittedFiles) -> str:
+    """The table with a link to each report, as one HTML file that stands beside the results."""
+    title = f"Fits of {_count(len({row['file'] for row in found.rows}), 'file')}"
+    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in found.rows if row["result"] != "failed"]
+    links = [
+        f'<li><a href="{quote(place)}">{html.escape(place)}</a></li>'
+        for place in places
+        if (found.directory / place).is_file()
+    ]
+    reports = [section("Reports", f"<ul>{''.join(links)}</ul>")] if links else []
+    body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(found))]
+    return document(title, [*body, section("All fits", tables.html_table(overview(found.rows))), *reports])
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def _few(words: list[str], most: int = 5) -> str:
+    """The first of them, and how many more there are."""
+    return listed([*words[:most], *([f"{len(words) - most} more"] if len(words) > most else [])])

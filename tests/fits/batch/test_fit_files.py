@@ -1,0 +1,369 @@
+"""Files of a folder by several stacks: every result as of a fit alone, what is done stays, what fails costs itself."""
+
+import csv
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import fits
+from fits._files import locked
+from fits.batch import fit_files as batch
+from fits.batch.fit_files import STORE
+from fits.data.reading import Reading
+from fits.store import Store
+from fits.structure_search.search import SearchOptions
+from tests.helpers.coats import TRUE
+from tests.helpers.files import contents
+
+STACKS = ["coat.toml", "bare.toml"]
+FEW = {"starts": 2}
+
+
+@pytest.fixture
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Which fits are made, in this process."""
+    made: list[str] = []
+    fit = batch.fit_into
+
+    def counting(directory: Path, *given: object, **options: object) -> object:
+        made.append(f"{directory.parent.name} {directory.name}")
+        return fit(directory, *given, **options)
+
+    monkeypatch.setattr(batch, "fit_into", counting)
+    return made
+
+
+def table() -> list[dict[str, str]]:
+    with open("out/table.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -> None:
+    told: list[tuple[object, ...]] = []
+    found = fits.fit_files("scans", STACKS, "out", progress=lambda *given: told.append(given), **FEW)
+    assert [(row["file"], row["stack"]) for row in found.rows] == [
+        (file, stack) for file in ("broken.csv", "coated.csv", "paint.csv") for stack in ("coat", "bare")
+    ]
+    assert not found.complete
+    assert [Path(path).name for path in found.left_out] == ["README.md"]
+    assert "twenty" in found.rows[0]["status"]
+    assert found.best == {"coated.csv": "coat", "paint.csv": "bare"}
+    assert len(counted) == 4
+    assert [told[0][:3], told[-1][:3]] == [("fits", 2, 6), ("fits", 6, 6)]
+    for file, truth in TRUE.items():
+        fit = fits.load_fit(Path("out") / file / found.best[file])
+        for name, value in truth.items():
+            assert abs(fit.values[name] - value) < 4.0 * fit.standard_errors[name]
+    lines = table()
+    assert len(lines) == 6
+    for row, line in zip(found.rows, lines, strict=True):
+        assert (line["file"], line["stack"], line["result"]) == (row["file"], row["stack"], row["result"])
+        assert ("twenty" in line["status"]) == (row["result"] == "failed")
+        if row["result"] == "failed":
+            continue
+        fit = fits.load_fit(Path("out") / row["file"] / row["stack"])
+        assert (row["result"] == "converged") == fit.converged
+        data = fit.problem.data.used()
+        density = stats.norm.logpdf(data.values, fit.predicted, data.sigma).sum()
+        assert row["criterion"] == "AIC"
+        assert row["loss"] == pytest.approx(2 * len(fit.vector) - 2 * density, rel=1e-9)
+        assert row["readings"] == len(data) == int(line["readings"])
+        for name, value in fit.values.items():
+            assert (row[name], row[f"{name} error"]) == (value, pytest.approx(fit.standard_errors[name], nan_ok=True))
+            np.testing.assert_allclose(float(line[name]), value, rtol=1e-7)
+            error = line[f"{name} error"] or "nan"  # empty of a parameter at a bound
+            np.testing.assert_allclose(float(error), fit.standard_errors[name], rtol=1e-7)
+    assert [line["layers[0].thickness"] != "" for line in lines[4:]] == [True, False]
+    assert [line["standing"] for line in lines[:3]] == ["", "", "best"]
+    assert lines[3]["standing"].startswith("+")
+    page = Path("out/report.html").read_text()
+    for word in ("coated.csv/coat/report.html", "paint.csv/bare/report.html", "twenty", "README.md"):
+        assert word in page
+    for link in {part.split('"')[0] for part in page.split('href="')[1:]}:
+        assert (folder / "out" / link).is_file()
+
+    before = contents(folder)
+    before.pop(str(folder / "out" / STORE))
+    again = fits.fit_files("scans", STACKS, "out", **FEW)
+    assert len(counted) == 4
+    assert repr(again.rows) == repr(found.rows)
+    after = contents(folder)
+    after.pop(str(folder / "out" / STORE))
+    assert after == before
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["between", "before the row is kept"])
+def test_what_was_interrupted_goes_on(
+    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    whole = batch.fit_one
+
+    def interrupted(job: batch.Job, task: batch.Task) -> batch.Row:
+        if len(counted) == 2 and not late:
+            raise KeyboardInterrupt
+        row = whole(job, task)
+        if len(counted) == 3:
+            raise KeyboardInterrupt
+        return row
+
+    monkeypatch.setattr(batch, "fit_one", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fits.fit_files("scans", STACKS, "out", **FEW)
+    assert [line["status"] for line in table()].count("not done yet") == 2
+    monkeypatch.setattr(batch, "fit_one", whole)
+    found = fits.fit_files("scans", STACKS, "out", **FEW)
+    assert [row["result"] == "failed" for row in found.rows] == [True, True, False, False, False, False]
+    assert len(counted) == 4 + late
+    assert len(set(counted)) == 4
+
+
+def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: list[str]) -> None:
+    fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    before = contents(folder / "out")
+
+    def refused(message: str, **options: object) -> None:
+        with pytest.raises(ValueError, match=message):
+            fits.fit_files("scans/paint.csv", STACKS, "out", **(FEW | options))
+        assert contents(folder / "out") == before
+
+    refused(r"out/paint.csv/coat: holds the work of another problem \(starts 2, not 3\); --force", starts=3)
+    refused(r"\(mask_grazing None, not 60.0\)", reading=Reading(mask_grazing=60.0))
+    (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
+    refused(r"out/paint.csv/bare: holds the work of another problem \(stack\)")
+    del counted[:]
+    assert fits.fit_files("scans/paint.csv", STACKS, "out", force=True, **FEW).complete
+    assert counted == ["paint.csv bare"]
+    with open("scans/paint.csv", "a") as file:
+        file.write("\n")
+    before = contents(folder / "out")
+    refused(r"\(file\)")
+
+
+def test_a_damaged_result_costs_itself_alone(folder: Path, counted: list[str]) -> None:
+    fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    path = folder / "out" / "paint.csv" / "bare" / "fit.json"
+    path.write_text(path.read_text()[:-100])
+    found = fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    assert [row["result"] == "failed" for row in found.rows] == [False, True]
+    assert "fit.json" in found.rows[1]["status"]
+    assert "--force" in found.rows[1]["status"]
+    assert fits.fit_files("scans/paint.csv", STACKS, "out", force=True, **FEW).complete
+    assert counted == ["paint.csv coat", "paint.csv bare", "paint.csv bare"]
+
+
+@pytest.mark.slow
+def test_held_out_data_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from fits.reports.html import foretell
+    from fits.reports.stored import held_out_of
+
+    monkeypatch.setattr("fits.batch.fit_file.write_report", lambda at, name, fit: foretell(fit, None, held_out_of(at)))
+    found = fits.fit_files(["scans/coated.csv"], STACKS, "out", reading=Reading(hold_out=("incidence=50",)), **FEW)
+    assert found.best == {"coated.csv": "coat"}
+    coat, bare = found.rows
+    assert coat["criterion"] == bare["criterion"] == "-2 log score"
+    assert coat["loss"] < bare["loss"]
+    fit = fits.load_fit("out/coated.csv/coat")
+    seen = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
+    assert coat["loss"] == pytest.approx(-2.0 * seen.elpd * seen.count, abs=2e-3 * seen.count)
+
+
+def test_the_best_of_a_search_is_a_result_like_others(
+    folder: Path, coat_fit: fits.Fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched: list[Path] = []
+
+    def search(data: fits.Measurements, *, directory: Path, seed: int, options: SearchOptions) -> SimpleNamespace:
+        searched.append(directory.relative_to(folder))
+        assert (seed, options.layers) == (0, 1)
+        return SimpleNamespace(best=SimpleNamespace(name="haze / diffuse", fit=coat_fit))
+
+    monkeypatch.setattr(batch, "run_search", search)
+    monkeypatch.setattr(batch, "write_search", lambda *_: None)
+    looked = {"search": {"options": SearchOptions(layers=1)}, **FEW}
+    found = fits.fit_files(["scans/paint.csv", "scans/broken.csv"], ["bare.toml"], "out", **looked)
+    assert [(row["stack"], row.get("structure", ""), row["result"] == "failed") for row in found.rows] == [
+        ("bare", "", False),
+        ("search", "haze / diffuse", False),
+        ("bare", "", True),
+        ("search", "", True),
+    ]
+    assert fits.load_fit("out/paint.csv/search").values == pytest.approx(coat_fit.values)
+    fits.fit_files("scans/paint.csv", [], "out", **looked)
+    assert searched == [Path("out/paint.csv/search-stacks")]
+    with pytest.raises(ValueError, match=r"search: holds the work of another problem \(options\)"):
+        fits.fit_files("scans/paint.csv", [], "out", search=True)
+
+
+def test_processes_give_what_threads_give(folder: Path) -> None:
+    """A worker knows nothing of the patches here: reports are drawn."""
+    alone = fits.fit_files(["scans/paint.csv"], ["bare.toml"], "alone", reports=False, **FEW)
+    assert not list((folder / "alone").glob("*/*/report.html"))
+    assert "href=" not in Path("alone/report.html").read_text()
+    found = fits.fit_files(["scans/paint.csv", "scans/broken.csv"], ["bare.toml"], "out", processes=2, **FEW)
+    assert [row["result"] == "failed" for row in found.rows] == [False, True]
+    assert found.rows[0]["base.albedo"] == pytest.approx(alone.rows[0]["base.albedo"], rel=1e-6)
+    assert "data:image/png" in Path("out/paint.csv/bare/report.html").read_text()
+
+
+def test_a_mistake_in_one_fit_ends_none_of_the_others(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = batch.fit_into
+
+    def broken(directory: Path, *given: object, **options: object) -> object:
+        if directory.name == "coat":
+            raise RuntimeError("no memory\nis left")
+        return fit(directory, *given, **options)
+
+    monkeypatch.setattr(batch, "fit_into", broken)
+    found = fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+    assert found.rows[0]["status"] == "RuntimeError: no memory is left"
+    assert found.rows[1]["result"] == "converged"
+
+
+@pytest.mark.parametrize(
+    ("files", "stacks", "message"),
+    [
+        (["nowhere"], STACKS, "no such file or folder: 'nowhere'"),
+        (["empty"], STACKS, "empty: holds no measurement file"),
+        ([], STACKS, "no file is given"),
+        (["scans"], [], "no stack is given"),
+        (["scans"], ["nowhere.toml"], "no such file: 'nowhere.toml'"),
+        (["scans/broken.csv"], STACKS, "no file can be fitted: .*twenty"),
+        (["scans", "copies"], STACKS, r"scans/paint.csv and copies/paint.csv: results go by this name"),
+        (["scans"], ["coat.toml", "copies/coat.toml"], "results go by this name"),
+        (["scans"], ["search.toml"], r"search.toml: its name must be another"),
+        (["table.csv"], STACKS, r"table.csv: its name must be another"),
+    ],
+)
+def test_bad_input_is_named_and_writes_nothing(folder: Path, files: list[str], stacks: list[str], message: str) -> None:
+    for name in ("empty", "copies"):
+        (folder / name).mkdir()
+    for name in ("search.toml", "table.csv", "copies/coat.toml"):
+        shutil.copy(folder / "bare.toml", folder / name)
+    shutil.copy(folder / "scans" / "paint.csv", folder / "copies" / "paint.csv")
+    before = contents(folder)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        fits.fit_files(files, stacks, "out")
+    assert contents(folder) == before
+    assert not (folder / "out").exists()
+
+
+def test_places_that_hold_something_else_or_are_in_use_are_left_alone(folder: Path) -> None:
+    before = contents(folder)
+    for place, message in (
+        ("scans", "is not empty, and holds no fits"),
+        ("coat.toml", "is a file"),
+        ("no/such", "there is no directory"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fits.fit_files("scans", STACKS, place, **FEW)
+    assert contents(folder) == before
+    fits.fit_files("scans/paint.csv", ["bare.toml"], "out", **FEW)
+    lock = folder / "out" / f"{STORE}.lock"
+    with locked(lock, "it"), pytest.raises(ValueError, match=f"out/{STORE} is in use by another process"):
+        fits.fit_files("scans", ["bare.toml"], "out", **FEW)
+    (folder / "out" / "paint.csv" / "coat").mkdir()
+    (folder / "out" / "paint.csv" / "coat" / "precious").write_text("")
+    for force in (False, True):
+        with pytest.raises(ValueError, match="coat: holds something that fit-many did not make"):
+            fits.fit_files("scans/paint.csv", STACKS, "out", force=force, **FEW)
+
+
+@pytest.mark.parametrize("all_of_it", [False, True])
+def test_what_is_removed_meanwhile_is_not_there(folder: Path, monkeypatch: pytest.MonkeyPatch, all_of_it: bool) -> None:
+    whole, done = batch.fit_one, list[str]()
+
+    def removing(job: batch.Job, task: batch.Task) -> batch.Row:
+        if done:
+            shutil.rmtree(folder / "out" / ("" if all_of_it else done[0]))
+        row = whole(job, task)
+        done.append(task.key)
+        return row
+
+    monkeypatch.setattr(batch, "fit_one", removing)
+
+    def call() -> fits.FittedFiles:
+        return fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
+
+    if all_of_it:
+        with pytest.raises((ValueError, FileNotFoundError), match="out"):
+            call()
+        assert not (folder / "out").exists()
+        return
+    found = call()
+    assert [row["result"] == "failed" and row["status"] for row in found.rows] == [
+        "paint.csv/coat: was removed while others were fitted",
+        False,
+    ]
+    assert "was removed" in table()[0]["status"]
+    assert Store.read(Path("out") / STORE).keys() == ["begun", "paint.csv/coat", "paint.csv/bare"]
+
+
+# ---- which stack is best of a file ----
+
+
+def row(stack: str, loss: float, file: str = "a.csv", **more: object) -> batch.Row:
+    usual = {"result": "converged", "criterion": "AIC", "reduced_chi_square": 1.0, "status": ""}
+    return {"file": file, "stack": stack, "loss": loss} | usual | more
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        # the lowest criterion is best, and what chance explains as good
+        ([row("one", 10.0), row("two", 11.9), row("three", 15.0)], ["best", "as good", "+5.0"]),
+        # scatter that the best leaves counts as noise
+        (
+            [row("one", 10.0, reduced_chi_square=4.0), row("two", 17.0), row("three", 90.0)],
+            ["best", "as good", "+20.0"],
+        ),
+        # of held-out data it does not
+        (
+            [
+                row(name, loss, criterion="-2 log score", reduced_chi_square=4.0)
+                for name, loss in (("a", 9.0), ("b", 1.0))
+            ],
+            ["+8.0", "best"],
+        ),
+        # what did not converge is not the best of what did
+        ([row("one", 10.0, result="not converged"), row("two", 17.0)], ["-7.0", "best"]),
+        # named objectives of one kind are ranked without a verdict on chance
+        ([row("one", 1.0, criterion="cube_root"), row("two", 1.5, criterion="cube_root")], ["best", "+0.5"]),
+        # nothing is said of what cannot be compared
+        ([row("one", 10.0)], [""]),
+        ([row("one", 10.0), {"file": "a.csv", "stack": "two", "result": "failed", "status": "unreadable"}], ["", ""]),
+        ([row("one", 10.0), row("two", 90.0, criterion="cube_root")], ["", ""]),
+    ],
+)
+def test_stacks_of_a_file_are_ranked(rows: list[batch.Row], words: list[str]) -> None:
+    assert [row["standing"] for row in batch.ranked(rows)] == words
+
+
+def test_files_are_judged_one_by_one() -> None:
+    rows = [row("one", 1.0), row("two", 9.0), row("one", 9.0, "b.csv"), row("two", 1.0, "b.csv"), row("one", 1.0, "c")]
+    assert fits.FittedFiles(Path(), batch.ranked(rows)).best == {"a.csv": "one", "b.csv": "two", "c": "one"}
+
+
+def test_table_page_and_sentences(tmp_path: Path) -> None:
+    some = [row("coat", 1.0, file=f"<{k}> #.csv", status="converged", seconds=1.0) for k in range(3)]
+    bad = {"file": "b.csv", "stack": "coat", "result": "failed", "status": "line 2: <x> is no number"}
+    rows = batch.ranked([*some, bad, row("coat", 1.0, "c.csv", result="not converged")])
+    found = fits.FittedFiles(tmp_path, rows, ("scans/README.md",))
+    report = tmp_path / "<0> #.csv" / "coat" / "report.html"
+    report.parent.mkdir(parents=True)
+    report.touch()
+    text = batch.page(found)
+    assert text.count("href=") == 1
+    for word in ("%3C0%3E%20%23.csv/coat/report.html", "&lt;0&gt; #.csv", "line 2: &lt;x&gt; is no number"):
+        assert word in text
+    assert "<0>" not in text
+    assert batch.statements(found) == [
+        "5 files by 1 stack: 4 of 5 fits are there, 3 of them converged.",
+        "No result of b.csv.",
+        "Not converged: c.csv by coat.",
+        "Not taken for measurements: scans/README.md.",
+    ]
+    assert len(batch.overview(some * 20, most=10).rows) == 11

@@ -1,0 +1,263 @@
+"""Kills, full disks, a second writer and damage: what was kept is there, or an error names the file."""
+
+import os
+import random
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fits.store import Store, differences, fingerprint
+from tests.helpers.files import contents, largest_file, mounted, read_only
+from tests.helpers.places import ROOT
+
+WHOSE = fingerprint(data=np.arange(3.0), seed=0)
+SCRIPT = """
+import sys, os, signal
+from pathlib import Path
+import numpy as np
+from fits.store import Store, fingerprint
+path, hold = sys.argv[1:]
+with Store.open(path, fingerprint(data=np.arange(3.0), seed=0)) as store:
+    for number in range(len(store.all("steps")), 100_000):
+        store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
+        store.put("last", number)
+        if hold == "between" and number == 5:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        if hold == "within" and number == 5:
+            with store._connection:
+                store._connection.execute("PRAGMA cache_size = 1")  # pages go to the file before the end
+                for _ in range(50):
+                    store._connection.execute("UPDATE records SET content = zeroblob(20000), checksum = 0")
+                os.kill(os.getpid(), signal.SIGSTOP)
+"""
+
+
+@contextmanager
+def writer(path: Path, hold: str = "") -> Iterator[subprocess.Popen]:
+    """A process that writes until it is killed in the end; it stops between two records, or within one."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-c", SCRIPT, str(path), hold], env=environment) as process:
+        try:
+            if hold:
+                os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+            yield process
+        finally:
+            process.kill()
+
+
+def steps_of(store: Store) -> int:
+    """How many steps were kept, all of which must be as they were written."""
+    steps = store.all("steps")
+    for number, record in enumerate(steps):
+        assert record["number"] == number
+        np.testing.assert_array_equal(record["coords"], np.full((8, 32, 3), number))
+    assert store.get("last") in (len(steps) - 1, len(steps) - 2, None)
+    return len(steps)
+
+
+def test_records_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    record = {
+        "coords": np.arange(24.0).reshape(2, 4, 3),
+        "state": ["MT19937", np.arange(5, dtype=np.uint32), 3, 0.1],
+        "nothing": None,
+        "cost": float("inf"),
+        "worst": np.float64("nan"),
+        "count": np.int64(3),
+        "none": np.zeros((0, 3)),
+        "device": jnp.ones(2),
+        "words": {"ä": True},
+    }
+    with Store.open(path, WHOSE) as store:
+        for name in ("old", "new"):
+            store.put("record", {"name": name})
+        store.put("record", record)
+        for number in range(3):
+            store.append("block", number)
+    with Store.open(path, WHOSE) as again:
+        for one in (store.read(path), again):
+            assert one.keys() == ["record", "block"]
+            assert one.all("block") == [0, 1, 2]
+            assert one.get("other") is None
+            assert one.fingerprint == WHOSE
+            found = one.get("record")
+            for key in ("coords", "none", "device"):
+                np.testing.assert_array_equal(found[key], record[key])
+                assert found[key].dtype == record[key].dtype
+            np.testing.assert_array_equal(found["state"][1], record["state"][1])
+            assert [found["state"][k] for k in (0, 2, 3)] == ["MT19937", 3, 0.1]
+            assert np.isnan(found["worst"])
+            assert (found["cost"], found["count"], found["nothing"], found["words"]) == (np.inf, 3, None, {"ä": True})
+        with pytest.raises(TypeError, match="object cannot be kept in a store"):
+            again.put("record", {"it": object()})
+    assert [one.name for one in tmp_path.iterdir()] == ["store"]
+
+
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 50))])
+def test_a_killed_writer_is_gone_on_from(tmp_path: Path, seed: int) -> None:
+    """Killed twice at moments that nobody chose; then in the middle of a transaction."""
+    path, chance = tmp_path / "store", random.Random(seed)
+    kept = [0]
+    for _ in range(2):
+        with writer(path):
+            while not path.is_file() or not path.stat().st_size:
+                time.sleep(0.001)
+            time.sleep(chance.uniform(0.0, 0.1))
+        kept.append(steps_of(Store.read(path)))
+        assert kept[-1] >= kept[-2]
+    with Store.open(path, WHOSE) as store:
+        assert steps_of(store) == kept[-1]
+
+
+def test_readers_change_nothing_and_a_second_writer_is_refused(tmp_path: Path) -> None:
+    """Beside a writer that stands still between two records, within one, and one that was killed there."""
+    for hold in ("between", "within"):
+        path = tmp_path / hold / "store"
+        path.parent.mkdir()
+        with writer(path, hold) as process:
+            before = contents(tmp_path)
+            assert (f"{path}-journal" in before) == (hold == "within")
+            assert steps_of(Store.read(path, WHOSE)) == 6
+            with pytest.raises(ValueError, match=rf"store is in use by another process \({process.pid}\)"):
+                Store.open(path, WHOSE).__enter__()
+            assert contents(tmp_path) == before
+        with read_only(path.parent):
+            assert steps_of(Store.read(path)) == 6
+        with Store.open(path, WHOSE) as store:
+            assert steps_of(store) == 6
+
+
+def test_a_running_writer_can_be_read_at_any_time(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with writer(path):
+        while not path.is_file():
+            time.sleep(0.001)
+        seen, end = [0], time.monotonic() + 60.0
+        while seen[-1] < 30 and time.monotonic() < end:
+            seen.append(steps_of(Store.read(path)))
+    assert seen == sorted(seen)
+
+
+def fill(path: Path) -> None:
+    with Store.open(path, WHOSE) as store:
+        for number in range(len(store.all("steps")), 60):
+            store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
+
+
+def test_a_full_disk_costs_the_record_that_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with largest_file(100_000), pytest.raises(OSError, match="No space left") as error:
+        fill(path)
+    assert error.value.filename == str(path)
+    assert 0 < steps_of(Store.read(path)) < 60
+    fill(path)
+    assert steps_of(Store.read(path)) == 60
+
+
+def test_a_small_disk_that_is_given_more_room(tmp_path: Path) -> None:
+    with mounted(tmp_path, "-t", "tmpfs", "-o", "size=200k", "tmpfs"):
+        with pytest.raises(OSError, match="No space left"):
+            fill(tmp_path / "store")
+        assert 0 < steps_of(Store.read(tmp_path / "store")) < 60
+        subprocess.run(["mount", "-o", "remount,size=2m", str(tmp_path)], check=True)
+        fill(tmp_path / "store")
+        assert steps_of(Store.read(tmp_path / "store")) == 60
+
+
+def test_damage_is_reported_and_never_read(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    with Store.open(path, WHOSE) as store:
+        for number in range(6):
+            store.append("steps", {"number": number, "coords": np.full((8, 32, 3), number)})
+        store.put("last", 5)
+    whole, reported = path.read_bytes(), 0
+    places = [*range(0, 8192, 64), *range(8192, len(whole), 512)]
+    for place in places:
+        run = whole[place : place + 64]
+        for bad in (bytes(len(run)), bytes(255 - byte for byte in run), run[:1] + bytes([run[1] ^ 1]) + run[2:]):
+            path.write_bytes(whole[:place] + bad + whole[place + 64 :])
+            try:
+                found = Store.read(path, WHOSE)
+            except ValueError as error:
+                assert str(error).startswith(f"{path}: damaged")  # noqa: PT017
+                reported += 1
+            else:  # of what no record uses
+                assert steps_of(found) == 6
+                assert found.fingerprint == WHOSE
+    assert reported > len(places) / 2
+    for length in (100, 4096, len(whole) - 4096):
+        path.write_bytes(whole[:length])
+        for call in (lambda: Store.read(path), lambda: Store.open(path, WHOSE).__enter__()):
+            with pytest.raises(
+                ValueError, match=r"store: damaged, or no store .*; without this file the work begins anew"
+            ):
+                call()
+    with Store.open(path, WHOSE, fresh=True) as store:
+        assert store.keys() == []
+
+
+def test_what_is_no_store_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "text").write_text("precious")
+    with closing(sqlite3.connect(tmp_path / "database")) as connection:
+        connection.execute("CREATE TABLE head (it)")
+        connection.commit()
+    before = contents(tmp_path)
+    for name in ("text", "database"):
+        with pytest.raises(ValueError, match=f"{name}: damaged, or no store"):
+            Store.open(tmp_path / name, WHOSE, replace=True).__enter__()
+    assert contents(tmp_path) == before
+    with pytest.raises(FileNotFoundError, match="absent"):
+        Store.read(tmp_path / "absent")
+    (tmp_path / "absent").touch()  # killed as it was made
+    assert Store.read(tmp_path / "absent").keys() == []
+    fill(tmp_path / "absent")
+
+
+def test_the_work_of_another_problem_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "store"
+    fill(path)
+    before = contents(tmp_path)
+    other = fingerprint(data=np.arange(4.0), seed=1)
+    for call in (lambda: Store.read(path, other), lambda: Store.open(path, other).__enter__()):
+        with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\); --force"):
+            call()
+    assert contents(tmp_path) == before
+    with Store.open(path, other, replace=True) as store:
+        assert store.keys() == []
+    assert Store.read(path, other).fingerprint == other
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (1, 2),
+        (None, 0.0),
+        ("a", "b"),
+        ("a" * 100, "a" * 99),
+        (np.zeros(2), np.zeros(3)),
+        (np.zeros((2, 3)), np.zeros((3, 2))),
+        (np.zeros(2), np.zeros(2, np.float32)),
+        ([np.zeros(2), 1], [np.zeros(2), 2]),
+        ({"a": np.zeros(1)}, {"b": np.zeros(1)}),
+        ([["a"], "b"], [["a", "b"]]),
+        (("a", "b"), ("a;b",)),
+    ],
+)
+def test_a_fingerprint_tells_problems_apart(one: object, other: object) -> None:
+    assert "part" in differences(fingerprint(part=one), fingerprint(part=other))
+    assert fingerprint(part=one) == fingerprint(part=one)
+
+
+def test_a_fingerprint_holds_in_other_processes() -> None:
+    made: list[Callable[[], object]] = [lambda: object(), lambda: [lambda: None]]
+    for make in made:
+        one, other = make(), make()  # both at once, so that they differ in place
+        assert fingerprint(part=one) == fingerprint(part=other)
