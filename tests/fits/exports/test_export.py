@@ -9,7 +9,7 @@ import pytest
 import fits
 import layerjax as lj
 from fits.cli.parser import main
-from fits.data.formats._square import Between
+from fits.data.formats._square import Interpolation
 from fits.data.formats.rgl_table import read_table
 from fits.data.measurements import Measurements
 from fits.exports import merl
@@ -131,8 +131,8 @@ def test_what_is_drawn_from_an_rgl_file_is_drawn_as_light_goes(tmp_path: Path) -
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.02)
 
 
-def _only(table: int, count: int) -> Between:
-    return Between(np.full((count, 1), table), np.ones((count, 1)))
+def _only(table: int, count: int) -> Interpolation:
+    return Interpolation(np.full((count, 1), table), np.ones((count, 1)))
 
 
 def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path: Path) -> None:
