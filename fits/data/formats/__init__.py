@@ -147,7 +147,7 @@ def _read_as(
 
 
 def sniff(path: Path) -> str:
-    """Which of `FORMATS` a file is in, by its content and then by its name; ValueError that names what was seen."""
+    """The one of `FORMATS` that a file has, by its content and then by its name; ValueError that names the content."""
     with path.open("rb") as file:
         head = file.read(1 << 16)
     if not head.strip():

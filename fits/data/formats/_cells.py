@@ -64,7 +64,7 @@ def _cells(line: Line, delimiter: str) -> list[str]:
 
 
 def delimiter_of(header: str) -> str:
-    """What divides the cells of a header line."""
+    """The delimiter of the cells of a header line."""
     return max(",;\t", key=header.count)
 
 

@@ -9,7 +9,7 @@ from fits.data.geometry import Floats
 
 
 class Rows:
-    """What is left of the lines of a file. Errors say what was expected, or name the line."""
+    """The lines of a file that remain to be read. Errors say what was expected, or name the line."""
 
     def __init__(self, path: Path, lines: list[Line]) -> None:
         self._path, self._lines, self._next = path, lines, 0
@@ -42,7 +42,7 @@ class Rows:
         return line
 
     def numbers(self, count: int, wanted: str, allowed: tuple[float, float] = ANY_NUMBER) -> Floats:
-        """So many numbers of the closed range `allowed`, on one line that is not blank, or on several."""
+        """The next `count` numbers, in the closed range `allowed`, on one or several lines, without blank ones."""
         values: list[float] = []
         while len(values) < count:
             values += self.filled(wanted).numbers(allowed)

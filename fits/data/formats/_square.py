@@ -107,7 +107,7 @@ def _integrated(values: Floats) -> Floats:
 
 
 def _invert(integral: Floats, wanted: Floats) -> tuple[Whole, Floats]:
-    """The cells (R, N) in which integrals (R, n) reach what is wanted, (R, N), and what is left of it there."""
+    """The cells (R, N) in which integrals (R, n) reach `wanted`, (R, N), and its remainder in them."""
     rows, nodes = integral.shape
     total = np.maximum(integral[:, -1:], np.finfo(float).tiny)
     # one search for all rows: each begins where the one before it ends
@@ -118,7 +118,7 @@ def _invert(integral: Floats, wanted: Floats) -> tuple[Whole, Floats]:
 
 
 def _solved(start: Floats, end: Floats, wanted: Floats) -> Floats:
-    """Where in a cell the integral of a density that goes from start to end is what is wanted."""
+    """Position in a cell at which the integral of a density, linear from `start` to `end`, is `wanted`."""
     root = np.sqrt(np.maximum(start * start + 2.0 * wanted * (end - start), 0.0))
     bottom = start + root
     return np.clip(np.where(bottom > 0, 2.0 * wanted / np.where(bottom > 0, bottom, 1.0), 0.0), 0.0, 1.0)

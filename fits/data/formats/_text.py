@@ -1,4 +1,4 @@
-"""What the text readers share: numbered lines, numbers, and one-line errors that say where."""
+"""Common parts of the text readers: numbered lines, numbers, and one-line errors that name the line."""
 
 import math
 from dataclasses import dataclass

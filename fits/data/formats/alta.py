@@ -113,7 +113,7 @@ def _dimensions(said: dict[str, tuple[Line, list[str]]]) -> tuple[int, int, int]
 def _quantity(
     path: Path, said: dict[str, tuple[Line, list[str]]], dim_y: int, requested: Quantity | None
 ) -> tuple[Quantity, tuple[str, ...] | None]:
-    """What the values are, by the file or else by who asks, and names of their columns."""
+    """Quantity of the values, by the file or else by the caller, and names of their columns."""
     line, words = said.get("PARAM_OUT", (said["DIM"][0], []))
     word = words[0] if words else "UNKNOWN"
     if word not in _HOLDS:

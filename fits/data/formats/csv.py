@@ -135,7 +135,7 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
 
 
 def csv_text(measurements: Measurements) -> str:
-    """What `write_csv` writes."""
+    """The text of `write_csv`."""
     value_names = _names_to_write(measurements.channels)
     names = ["theta_i", "phi_i", "theta_o", "phi_o", *value_names]
     columns = [
@@ -178,7 +178,7 @@ def _directions(table: Table, written_here: bool) -> tuple[Floats, Floats, list[
 
 
 def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
-    """What the names of the value columns begin with, one of `_QUANTITY_OF`, and they, as channel name -> column."""
+    """Prefix of the value columns, one of `_QUANTITY_OF`, and their names, as channel name -> column."""
     columns_of: dict[str, dict[str, str]] = {}
     for name in names:
         kind, channel = _kind_and_channel(name)
@@ -208,7 +208,7 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
 
 
 def _kind_and_channel(column: str) -> tuple[str | None, str]:
-    """Which of `_QUANTITY_OF` the name of a column begins with, None for another column, and the channel it names."""
+    """Prefix of a column's name, one of `_QUANTITY_OF` or None for another column, and the channel that it names."""
     longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
     kind = next((known for known in longest_first if column == known or column.startswith(f"{known}_")), None)
     return kind, column.removeprefix(kind or "").removeprefix("_") or channel_names(1)[0]

@@ -152,7 +152,7 @@ def _samples(
 
 
 def _damaged(path: Path, values: Floats) -> NDArray[np.bool_]:
-    """Where values are nan, which programs write for what was not measured; ValueError for infinite ones."""
+    """Mask of values that are nan, which programs write for bins not measured; ValueError for infinite ones."""
     if np.isinf(values).any():
         raise ValueError(f"{path}: the table holds {values[np.isinf(values)][0]}, must be finite")
     return np.isnan(values)

@@ -34,7 +34,7 @@ def all_bins(readable: NDArray[np.bool_]) -> tuple[Indices, str]:
 
 
 def choice(readable: NDArray[np.bool_], measure: Table, count: int, strata: Strata, seed: int) -> tuple[Indices, str]:
-    """So many of the bins that can be read, (count, 3), none twice, each for an equal share of `measure`; and a note.
+    """Choose `count` of the readable bins, (count, 3), none twice, each for an equal share of `measure`; and a note.
 
     Raises:
         ValueError: there are not so many.

@@ -37,7 +37,7 @@ _DIMENSIONS = {
 
 @dataclass(frozen=True)
 class Table:
-    """What such a file holds.
+    """Content of such a file.
 
     theta_i (T,), phi_i (P,): of the light, radians, ascending. ndf, sigma: (h, w), rows over azimuth. vndf: (P, T, h,
     w). luminance: (P, T, n, n), what is drawn from. values: (P, T, C, n, n). wavelengths: (C,) nm; None for red, green
@@ -65,7 +65,7 @@ class Table:
 
     @property
     def turns(self) -> int:
-        """How often the azimuths that the file holds make the full circle; 1 for an isotropic material."""
+        """Number of times that the azimuths of the file fill the circle; 1 for an isotropic material."""
         if self.isotropic:
             return 1
         return int(np.rint(2 * np.pi / (self.phi_i[-1] - self.phi_i[0])))
@@ -76,14 +76,14 @@ class Table:
         return Density(self.vndf.reshape(-1, *self.vndf.shape[2:]))
 
     def factor(self, theta_m: Floats, phi_m: Floats, theta_i: Floats, phi_i: Floats) -> Floats:
-        """What values are multiplied by, (N,)."""
+        """Factor of the values, (N,)."""
         if not self.jacobian:
             return np.ones_like(theta_m)
         sigma = bilinear(self.sigma[None], to_u(theta_i), to_v(phi_i))
         return bilinear(self.ndf[None], to_u(theta_m), to_v(phi_m)) / (4.0 * sigma)
 
     def nodes(self, place: slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
-        """Where values stand: azimuth of the light (L,), its polar angle (L,), of half vectors theta, phi (L, n, n).
+        """Nodes of the values: azimuth of the light (L,), its polar angle (L,), of half vectors theta, phi (L, n, n).
 
         The azimuth of half vectors is from that of the light where the material is isotropic. place: some of the L
         directions.

@@ -69,19 +69,19 @@ UNUSED = {
     "e": "tolerance",
     "q": "quadrature",
 }
-"""Columns that iad's inversion takes and that say nothing of the measurements."""
+"""Columns of settings of iad's inversion, which do not concern the measurements."""
 
 MUST_BE = {"c": 1.0, "C": 1.0, "E": 0.0}
-"""What the model cannot follow otherwise."""
+"""Columns whose other values the model does not support."""
 
 SMOOTH = 1e-4
 """Roughness of a polished face."""
 
 SAME_VALUE = 0.01
-"""Numbers of the slab and of the standard that vary by less from row to row, of their value, are taken for one."""
+"""Relative variation from row to row below which numbers of the slab and of the standard count as one."""
 
 SAME_WALLS = 0.002
-"""Reflectances of walls that do: what is lost at a wall decides, not what is sent back."""
+"""The same, absolute, for reflectances of walls, as their absorptance matters."""
 
 _TWO_BEAMS = re.compile(r"(?i:dual[ -]?beam)|\biad\s(.*\s)?-X\b")
 
@@ -224,7 +224,7 @@ def _compared(
 
 
 def _described(path: Path, header: list[float], columns: dict[str, Floats]) -> Spheres | None:
-    """What header and columns say of spheres; a sphere of no diameter is none."""
+    """Spheres of header and columns; a diameter of 0 means no sphere."""
     counts = [columns[letter] for letter in "SM" if letter in columns] or [np.array(header[6:7])]
     if len(set(np.concatenate(counts))) > 1:
         raise ValueError(f"{path}: the number of spheres varies; restrict the wavelengths")
@@ -259,7 +259,7 @@ def _interval(wavelengths: Any) -> tuple[float, float]:
 
 
 def _words(line: Line) -> list[tuple[Line, str]]:
-    """What stands on a line, without its comment; ``IAD1`` is a word of its own."""
+    """Words of a line, without its comment; ``IAD1`` is a word of its own."""
     text = line.text.partition("#")[0].replace(",", " ")
     return [(line, word) for word in re.sub(rf"^\s*{FIRST}", f"{FIRST} ", text).split()]
 

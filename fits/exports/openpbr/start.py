@@ -1,4 +1,4 @@
-"""What the layers of a stack say of an OpenPBR surface: where the fit of its parameters starts."""
+"""Start values of an OpenPBR surface, from the layers of a stack, for the fit of its parameters."""
 
 from collections.abc import Iterator
 from dataclasses import fields
@@ -37,7 +37,7 @@ USED = {
 """The parameters of each lobe."""
 
 MOSTLY = 0.8
-"""Where a metal lies below a medium: its share at the start, the rest is light that the medium spreads."""
+"""Weight of a metal below a medium at the start; the rest is diffuse light of the medium."""
 
 
 def starts(stacks: tuple[lj.Stack, ...]) -> list[Surface]:
