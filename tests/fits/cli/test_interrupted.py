@@ -236,8 +236,8 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
         kept = len(Store.read(done).keys())
         assert contents(work) == before
     assert 2 < kept < 12
-    solve, solved = starts.bounded_end, []
-    monkeypatch.setattr(starts, "bounded_end", lambda *given: solved.append(given) or solve(*given))
+    solve, solved = starts.bounded_descent, []
+    monkeypatch.setattr(starts, "bounded_descent", lambda *given: solved.append(given) or solve(*given))
     assert main(BOUNDED) == 0
     assert len(solved) == 12 - kept
     assert not list(work.glob(".*"))
