@@ -39,10 +39,11 @@ if TYPE_CHECKING:
     from fits.prediction.evidence import Evidence as Evidence
     from fits.prediction.evidence import evidence as evidence
     from fits.prediction.model_scores import ModelScore as ModelScore
+    from fits.prediction.options import ComparisonOptions as ComparisonOptions
+    from fits.prediction.predict import Prediction as Prediction
+    from fits.prediction.predict import Scores as Scores
     from fits.prediction.predict import predict as predict
-    from fits.prediction.prediction import Prediction as Prediction
-    from fits.prediction.prediction import Scores as Scores
-    from fits.prediction.prediction import scores as scores
+    from fits.prediction.predict import scores as scores
     from fits.problem.discrepancy.parameters import Discrepancy as Discrepancy
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
@@ -77,6 +78,7 @@ _HOMES = {
     "average": "prediction.average",
     "Comparison": "prediction.compare",
     "compare": "prediction.compare",
+    "ComparisonOptions": "prediction.options",
     "Evidence": "prediction.evidence",
     "evidence": "prediction.evidence",
     "ExportReport": "exports.export",
@@ -112,9 +114,9 @@ _HOMES = {
     "Uniform": "problem.parameters",
     "Mode": "sampling.posterior",
     "Posterior": "sampling.posterior",
-    "Prediction": "prediction.prediction",
-    "Scores": "prediction.prediction",
-    "scores": "prediction.prediction",
+    "Prediction": "prediction.predict",
+    "Scores": "prediction.predict",
+    "scores": "prediction.predict",
     "predict": "prediction.predict",
     "sample": "sampling.sample",
     "Candidate": "structure_search.search",

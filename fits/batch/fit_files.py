@@ -30,7 +30,7 @@ from fits.engines import Failure, run
 from fits.engines.failures import one_line
 from fits.names import Objective
 from fits.optimise.multi_start import Solver
-from fits.prediction.compare import LEANING
+from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import make_room
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
@@ -415,16 +415,15 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
         for k in own:
             behind = (rows[k]["loss"] - best["loss"]) / excess
             close = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
-            words[k] = "best" if k == first else "as good" if close and behind < LEANING else f"{behind:+.1f}"
+            close = close and behind < ComparisonOptions().slight_difference
+            words[k] = "best" if k == first else "as good" if close else f"{behind:+.1f}"
     return tuple(row | {"standing": word} for row, word in zip(rows, words, strict=True))
 
 
 def table_csv(rows: Sequence[Row]) -> str:
     """A line each; value and error of every parameter that any of them has, empty where it has none."""
-    first, last = (
-        ("file", "stack", "structure", "result", "standing"),
-        ("measurements", "seconds", "at_bound", "status"),
-    )
+    first = ("file", "stack", "structure", "result", "standing")
+    last = ("measurements", "seconds", "at_bound", "status")
     names = dict.fromkeys(name for row in rows for name in row if name not in last)
     out = io.StringIO()
     writer = csv.DictWriter(out, list(dict.fromkeys((*first, *names, *last))), restval="", lineterminator="\n")

@@ -18,7 +18,7 @@ from fits.data.reading import of_channels
 from fits.data.selection import select
 
 if TYPE_CHECKING:
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
 
 DONE = 0
 

@@ -100,7 +100,7 @@ def _repeats(found: Agreement | None) -> str:
 
 
 def _apart(found: Agreement) -> str:
-    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.most:.2g} %)"
+    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.p95:.2g} %)"
     return words if math.isnan(found.z) else f"{words}, {found.z:.2g} of their standard errors"
 
 
@@ -127,11 +127,11 @@ def _sampling(found: list[Peak]) -> str:
             f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
             "to half of the brightest one."
         )
-    worst = min((one for one in found if one.stands_out), key=lambda one: one.readings)
+    worst = min((one for one in found if one.stands_out), key=lambda one: one.count)
     words = (
-        f"Sampling: the peak about the mirror direction holds {worst.readings} readings above half its height at least "
+        f"Sampling: the peak about the mirror direction holds {worst.count} readings above half its height at least "
         f"(at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
     )
-    if worst.readings < FEWEST:
+    if worst.count < FEWEST:
         return f"{words}: it may be narrower than the steps, and a roughness fitted to it is limited by them."
     return f"{words}: its width is sampled."

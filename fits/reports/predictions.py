@@ -8,12 +8,12 @@ import numpy as np
 
 from fits.data.geometry import azimuth, polar
 from fits.data.scans import incidences
-from fits.prediction.prediction import scores
+from fits.prediction.predict import scores
 from fits.reports.tables import Table
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
-    from fits.prediction.prediction import Prediction, Scores
+    from fits.prediction.predict import Prediction, Scores
 
 UNRELIABLE = (
     "The importance-sampling approximation of the posterior is poor (Pareto k above 0.7): intervals may be too narrow. "

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table as Boxed
 
     from fits.optimise.result import Fit
-    from fits.prediction.compare import Comparison, Row
+    from fits.prediction.compare import ComparedFit, Comparison
     from fits.prediction.model_scores import ModelScore
     from fits.sampling.posterior import Posterior
 
@@ -203,7 +203,7 @@ def incidence_table(structure: ResidualStructure) -> Table:
 
 
 _ORDERS = {
-    "left_out": "the score of what is left out",
+    "elpd": "the elpd of held-out incidences",
     "loo": "leave-one-out",
     "aic": "AIC",
     "chi_square": "chi-square",
@@ -214,7 +214,7 @@ def comparison_table(comparison: "Comparison") -> Table:
     """One row per fit, the best first: how well it explains the data, with how many parameters, and how far behind."""
     compared = comparison.rows
     aic, bic = min(row.aic for row in compared), min(row.bic for row in compared)
-    columns: list[tuple[str, Callable[[Row], str]]] = [
+    columns: list[tuple[str, Callable[[ComparedFit], str]]] = [
         ("fit", lambda row: row.name),
         ("parameters", lambda row: str(row.parameters)),
         ("chi2/dof", lambda row: f"{row.reduced_chi_square:.4g}"),
@@ -246,7 +246,7 @@ def comparison_table(comparison: "Comparison") -> Table:
     return Table("Comparison", tuple(head for head, _ in columns), rows, note)
 
 
-def _seen(row: "Row") -> "ModelScore":
+def _seen(row: "ComparedFit") -> "ModelScore":
     assert row.model_score is not None
     return row.model_score
 

@@ -12,7 +12,7 @@ from fits.reports.plots.data import ANGLE_LABEL, CYCLE, INK, STYLE, chosen, valu
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
 
 FEWEST = 3  # readings in the plane of incidence that make a panel
 

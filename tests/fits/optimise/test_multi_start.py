@@ -87,7 +87,10 @@ def test_a_race_ends_where_all_starts_do(name, monkeypatch):
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
-    ends, every = starts_module.race(problem, points), multi_start(problem, points, "least_squares", lambda *told: None)
+    ends, every = (
+        starts_module.screened_starts(problem, points),
+        multi_start(problem, points, "least_squares", lambda *told: None),
+    )
     assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
     left = [end for end in ends if end.max_steps_reached]
     assert 1 <= len(left) <= len(points) - starts_module.FRONT
