@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from fits.maps.fit_map import fit_map as fit_map
     from fits.maps.fitted_map import FittedMap as FittedMap
     from fits.maps.fitted_map import open_map as open_map
-    from fits.maps.smoothing import Smoothness as Smoothness
+    from fits.maps.options import MapOptions as MapOptions
+    from fits.maps.options import SpatialPrior as SpatialPrior
     from fits.optimise.fit import fit as fit
     from fits.optimise.identifiability import Direction as Direction
     from fits.optimise.options import FitOptions as FitOptions
@@ -40,10 +41,11 @@ if TYPE_CHECKING:
     from fits.prediction.evidence import Evidence as Evidence
     from fits.prediction.evidence import evidence as evidence
     from fits.prediction.model_scores import ModelScore as ModelScore
+    from fits.prediction.options import ComparisonOptions as ComparisonOptions
+    from fits.prediction.predict import Prediction as Prediction
+    from fits.prediction.predict import Scores as Scores
     from fits.prediction.predict import predict as predict
-    from fits.prediction.prediction import Prediction as Prediction
-    from fits.prediction.prediction import Scores as Scores
-    from fits.prediction.prediction import scores as scores
+    from fits.prediction.predict import scores as scores
     from fits.problem.discrepancy.parameters import Discrepancy as Discrepancy
     from fits.problem.instrument import Instrument as Instrument
     from fits.problem.joint import Joint as Joint
@@ -79,6 +81,7 @@ _HOMES = {
     "average": "prediction.average",
     "Comparison": "prediction.compare",
     "compare": "prediction.compare",
+    "ComparisonOptions": "prediction.options",
     "Evidence": "prediction.evidence",
     "evidence": "prediction.evidence",
     "ExportReport": "exports.export",
@@ -88,7 +91,8 @@ _HOMES = {
     "fit_map": "maps.fit_map",
     "FittedMap": "maps.fitted_map",
     "open_map": "maps.fitted_map",
-    "Smoothness": "maps.smoothing",
+    "MapOptions": "maps.options",
+    "SpatialPrior": "maps.options",
     "ModelScore": "prediction.model_scores",
     "read": "data.formats",
     "ReadOptions": "data.reading",
@@ -115,9 +119,9 @@ _HOMES = {
     "Uniform": "problem.parameters",
     "Mode": "sampling.posterior",
     "Posterior": "sampling.posterior",
-    "Prediction": "prediction.prediction",
-    "Scores": "prediction.prediction",
-    "scores": "prediction.prediction",
+    "Prediction": "prediction.predict",
+    "Scores": "prediction.predict",
+    "scores": "prediction.predict",
     "predict": "prediction.predict",
     "sample": "sampling.sample",
     "Candidate": "structure_search.search",

@@ -6,8 +6,12 @@ Arguments broadcast against each other; a reflectance has their common shape and
 import jax.numpy as jnp
 from jax import Array
 
-from layerjax._numerics import at_least, safe_div, safe_sqrt
+from layerjax._numerics import at_least, at_most, horner, safe_div, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
+
+ROUNDED_ROOT = (308 / 1536, 1080 / 1536, 924 / 1536, -432 / 1536, -660 / 1536, 120 / 1536, 196 / 1536)
+"""Coefficients of r^0 ... r^6 of what stands for the root of r on (-1, 1): with its value and two derivatives at 1, all
+three 0 at -1, and with its mean."""
 
 
 def schlick(cosine: Array, f0: Array | float) -> Array:
@@ -23,26 +27,42 @@ def schlick(cosine: Array, f0: Array | float) -> Array:
     return f0 + (1.0 - f0) * fifth
 
 
-def dielectric(cosine: Array, ior: Array) -> Array:
+def dielectric(cosine: Array, ior: Array, blur: Array | None = None) -> Array:
     """Reflectance between two dielectrics, 1 under total internal reflection.
 
     Args:
         cosine: cosine between the direction of incidence and the facet normal, in [0, 1].
         ior: index on the far side over index on the side of incidence, > 0.
+        blur: of the squared cosine of refraction, half the width about 0 over which the critical angle is rounded off,
+            or less, so that grazing light keeps its reflectance.
 
     The two amplitudes are formed without a difference of squares, so that ior = 1 gives exactly 0 at every angle.
-    Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it).
+    Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it), unless that
+    is rounded off.
     """
-    squared = squared_cosine_of_refraction(cosine, ior)
-    transmits = squared > 0
-    refracted = jnp.sqrt(jnp.where(transmits, squared, 0.25))
+    refracted, transmits = cosine_of_refraction(cosine, ior, blur)
+    refracted = jnp.where(transmits, refracted, 0.5)
     c = jnp.where(transmits, cosine, 0.5)
-    tiny = jnp.finfo(squared.dtype).tiny
+    tiny = jnp.finfo(refracted.dtype).tiny
     perpendicular = (c - ior * refracted) / (c + ior * refracted + tiny)
     parallel = (ior * c - refracted) / (ior * c + refracted + tiny)
     reflectance = 0.5 * (perpendicular * perpendicular + parallel * parallel)
     matched = (ior == 1.0) & ~transmits  # grazing light on no interface at all
     return jnp.where(transmits, reflectance, jnp.where(matched, 0.0, 1.0))
+
+
+def cosine_of_refraction(cosine: Array, ior: Array, blur: Array | None = None) -> tuple[Array, Array]:
+    """Cosine of refraction at a smooth interface, and whether there is such light; arguments as of `dielectric`."""
+    squared = squared_cosine_of_refraction(cosine, ior)
+    transmits = squared > 0
+    refracted = jnp.sqrt(jnp.where(transmits, squared, 1.0))
+    if blur is None:
+        return refracted, transmits
+    blur = at_most(blur, 0.5 * at_least((1.0 - ior) * (1.0 + ior), 0.0) / (ior * ior))
+    near = jnp.abs(squared) < blur
+    width = jnp.where(near, blur, 1.0)
+    rounded = jnp.sqrt(width) * horner(ROUNDED_ROOT, jnp.where(near, squared, 0.0) / width)
+    return jnp.where(near, rounded, refracted), transmits | near
 
 
 def conductor(cosine: Array, ior: Array, k: Array) -> Array:

@@ -30,7 +30,7 @@ from fits.engines import Failure, run
 from fits.engines.failures import one_line
 from fits.names import Objective
 from fits.optimise.multi_start import Solver
-from fits.prediction.compare import LEANING
+from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import make_room
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
@@ -417,7 +417,13 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
         for k in own:
             behind = (rows[k]["loss"] - best["loss"]) / excess
             alike = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
-            words[k] = "best" if k == first else "as good" if alike and behind < LEANING else f"{behind:+.1f}"
+            words[k] = (
+                "best"
+                if k == first
+                else "as good"
+                if alike and behind < ComparisonOptions().slight_difference
+                else f"{behind:+.1f}"
+            )
     return tuple(row | {"standing": word} for row, word in zip(rows, words, strict=True))
 
 

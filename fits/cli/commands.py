@@ -15,8 +15,8 @@ from fits._files import write_bytes, write_text
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
 from fits.cli.many import search as search
-from fits.cli.map_reports import report_map
 from fits.cli.maps import fit_map as fit_map
+from fits.cli.maps import is_map, report_map
 from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
@@ -29,12 +29,11 @@ from fits.data.measurements import Measurements
 from fits.data.reading import select_channels
 from fits.data.selection import select
 from fits.data.totals import Totals
-from fits.maps.fitted_map import is_store
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 DONE, DOUBTFUL = 0, 1
@@ -174,7 +173,7 @@ def _write_prediction(found: "Prediction", arguments: Namespace) -> None:
 
 def report(arguments: Namespace) -> int:
     """Write the report of a saved fit again, beside that of others if given; or that of a fitted map."""
-    if is_store(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
+    if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
     from fits.reports import html, results

@@ -1,50 +1,52 @@
-"""Whole maps on the command line: fitted texel by texel into a store."""
+"""Whole maps on the command line: fitted texel by texel into a store, and reported."""
 
 import sys
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from fits.cli.interrupts import hint
+from fits.cli.places import refuse_existing
 from fits.cli.setting import use_jax
-from fits.maps.inputs import readings
-from fits.maps.smoothing import Smoothness
 from fits.progress import show_progress
 
-if TYPE_CHECKING:
-    from fits.maps.summary import Summary
-
 DONE, DOUBTFUL = 0, 1
-ENOUGH = 0.99
-"""Share of the fitted texels that have converged where a map is to be relied on."""
-
-TABULATE = {"auto": None, "always": True, "never": False}
+EMULATOR = {"auto": None, "always": True, "never": False}
 
 
 def fit_map(arguments: Namespace) -> int:
-    """Fit a stack to every texel of a map, or go on with it, and print what was found."""
+    """Fit a stack to every texel of a map, or resume it, and print what was found."""
     _require_store(arguments.out)
-    # before anything slow is imported: what is wrong with the files is told
-    readings(arguments.data, arguments.geometry, sigma=arguments.sigma, mask=arguments.mask)
-    smooth = _smoothness(arguments)
-    use_jax()
-    from fits.problem.stack_file import read_problem
-
-    given = read_problem(arguments.stack)
-    from fits.maps.fit_map import fit_map as run_map
-    from fits.maps.report import tables
-    from fits.maps.summary import summarised
+    from fits.maps.inputs import map_data
+    from fits.maps.options import MapOptions, SpatialPrior
     from fits.problem.compilation import cores
+
+    # before anything slow: what is wrong with the files is told
+    map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
+    prior = None
+    if arguments.spatial_prior is None and arguments.spatial_scale is not None:
+        raise ValueError("--spatial-scale is given without --spatial-prior")
+    if arguments.spatial_prior is not None:
+        if not arguments.spatial_scale:
+            raise ValueError(
+                f"--spatial-prior {arguments.spatial_prior} needs --spatial-scale, such as 0.05 of the bounds"
+            )
+        scales = dict(arguments.spatial_scale)
+        if len(scales) < len(arguments.spatial_scale) or ("" in scales and len(scales) > 1):
+            raise ValueError("--spatial-scale: must be one number for all parameters, or one for each name")
+        prior = SpatialPrior(arguments.spatial_prior, scales.get("", scales), arguments.spatial_rounds)
+    use_jax()
+    from fits.maps.fit_map import fit_map as run
+    from fits.maps.fitted_map import summarise
+    from fits.maps.report import tables
+    from fits.problem.stack_file import read_problem
     from fits.reports.tables import print_table
 
+    given = read_problem(arguments.stack)
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
-    local = arguments.scheduler is None
-    more: dict[str, Any] = {"posterior": arguments.posterior} if arguments.posterior else {}
-    more |= {} if smooth is None else {"smooth": smooth}
-    kept = f"what was fitted is in {arguments.out}; the same command again goes on with it"
+    kept = f"what was fitted is in {arguments.out}; the same command resumes it"
     with show_progress() as progress, hint(kept):
-        found = run_map(
+        map = run(
             given.stack,
             arguments.geometry,
             arguments.data,
@@ -52,50 +54,61 @@ def fit_map(arguments: Namespace) -> int:
             noise=noise,
             client=arguments.scheduler,
             transport=given.transport,
-            scale=given.scale,
-            objective=given.objective,
-            instrument=given.instrument,
             sigma=arguments.sigma,
             mask=arguments.mask,
-            starts=arguments.starts,
-            seed=arguments.seed,
-            sample=arguments.sample,
-            chunk=arguments.chunk,
-            processes=(arguments.processes or cores()) if local else 1,
-            tabulate=TABULATE[arguments.tabulate],
-            **more,
-            force=arguments.force,
-            progress=progress,
+            options=MapOptions(
+                scale=given.scale,
+                objective=given.objective,
+                instrument=given.instrument,
+                starts=arguments.starts,
+                seed=arguments.seed,
+                pilot_texels=arguments.pilot_texels,
+                chunk_size=arguments.chunk_size,
+                emulator=EMULATOR[arguments.emulator],
+                spatial_prior=prior,
+                processes=(arguments.processes or cores()) if arguments.scheduler is None else 1,
+                force=arguments.force,
+                progress=progress,
+            ),
         )
-    told = summarised(found)
-    shared = replace(tables.shared_table(found), title="The same for all texels")
-    for table in (tables.count_table(told), tables.quartile_table(told, found), *([shared] if shared.rows else [])):
+    found, common = summarise(map), replace(tables.common_table(map), title="Common to all texels")
+    for table in (tables.count_table(found), tables.quartile_table(found, map), *([common] if common.rows else [])):
         print_table(table, sys.stdout)
-    if smooth is not None:
-        print(tables.smoothing_words(found))
+    if prior is not None:
+        print(tables.smoothing_words(map))
     print(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
-    return DONE if _reliable(told) else DOUBTFUL
+    whole = found.there == found.texels and found.fitted > 0
+    return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 
 
-def _smoothness(arguments: Namespace) -> Smoothness | None:
-    """What is asked for of neighbouring texels."""
-    if arguments.smooth is None:
-        for name in ("smooth_scale", "smooth_rounds"):
-            if getattr(arguments, name) is not None:
-                raise ValueError(f"--{name.replace('_', '-')} is given without --smooth")
-        return None
-    if not arguments.smooth_scale:
-        raise ValueError(f"--smooth {arguments.smooth} needs --smooth-scale, such as 0.05 of the bounds")
-    scales = dict(arguments.smooth_scale)
-    if len(scales) < len(arguments.smooth_scale) or ("" in scales and len(scales) > 1):
-        raise ValueError("--smooth-scale: must be one number for all parameters, or one for each name")
-    rounds = {} if arguments.smooth_rounds is None else {"rounds": arguments.smooth_rounds}
-    return Smoothness(arguments.smooth, scales.get("", scales), **rounds)
+def report_map(arguments: Namespace) -> int:
+    """Write the report of a map, beside its store if no other place is given, and print its numbers."""
+    if arguments.compare:
+        raise ValueError(f"--compare: {arguments.directory} is a map, which is not compared with others")
+    path = Path(arguments.directory)
+    out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
+    refuse_existing(str(out), arguments.force)
+    from fits.maps.fitted_map import open_map
+
+    map = open_map(arguments.directory)
+    from fits.maps.report import page, tables
+    from fits.maps.report.verdicts import verdict
+    from fits.reports.tables import print_table
+
+    with show_progress() as progress:
+        found = page.report(map, out, arguments.force, progress)
+    print_table(tables.count_table(found), sys.stdout)
+    if found.fitted:
+        print_table(tables.quartile_table(found, map), sys.stdout)
+    for sentence in verdict(found, map)[0]:
+        print(sentence)
+    print(f"Report: {out}")
+    return DONE
 
 
-def _reliable(found: "Summary") -> bool:
-    """Whether every texel is there, some are fitted, and nearly all of those have converged."""
-    return found.there == found.texels and found.fitted > 0 and found.converged >= ENOUGH
+def is_map(place: str) -> bool:
+    """Whether this is a directory of zarr, of whatever content."""
+    return (Path(place) / "zarr.json").is_file()
 
 
 def _require_store(out: str) -> None:

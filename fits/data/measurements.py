@@ -1,6 +1,6 @@
-"""Measured (or simulated) BSDF samples, in one convention whatever the file used.
+"""Measured or simulated BSDF samples, in one convention whatever the file used.
 
-Values are the BSDF in 1/sr without the cosine. Readers convert once, on the way in, and `Source` records what came in.
+Values are the BSDF in 1/sr without the cosine. Readers of files convert to it, and `Source` records the file's own.
 """
 
 from collections.abc import Sequence
@@ -14,18 +14,18 @@ from fits.data.selection import Angles, rows_of
 from fits.names import QUANTITIES, Quantity
 
 LARGEST, SMALLEST_SIGMA = 1e30, 1e-100
-"""Of values in 1/sr in size, and of standard deviations of used samples: residuals over them have finite squares."""
+"""Bounds of |values| and of the standard deviations of used samples, in 1/sr: squared residuals are then finite."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where samples came from and in which convention.
+    """Origin of samples and the convention of their file.
 
     Args:
-        path: the file; empty for what was never in one.
+        path: the file; empty for data that were never in one.
         format: of the file, or "memory", "simulated".
         quantity: what the file held. "brdf": f in 1/sr; "brdf_cos": f |cos theta_o|; "reflectance_factor": pi f.
-        notes: what a reader decided or left out, one sentence each.
+        notes: what a reader decided or skipped, one sentence each.
         attribution: whose data they are, and under which licence.
     """
 
@@ -95,9 +95,9 @@ class Measurements(Pairs):
 
     def __repr__(self) -> str:
         masked = int((~self.mask).sum())
-        left_out = f", {masked:,} of them masked" if masked else ""
+        note = f", {masked:,} of them masked" if masked else ""
         name = self.source.path or f"{self.source.format} data"
-        return f"<Measurements: {len(self):,} readings{left_out}, of {', '.join(self.channels)}, from {name}>"
+        return f"<Measurements: {len(self):,} data points{note}, of {', '.join(self.channels)}, from {name}>"
 
     def used(self) -> "Measurements":
         """Only the samples that take part in fits."""
@@ -108,7 +108,7 @@ class Measurements(Pairs):
         )
 
     def where(self, keep: ArrayLike, note: str | None = None) -> "Measurements":
-        """The same samples, used only where `keep` holds as well.
+        """The same samples, masked where `keep` is False.
 
         Args:
             keep: (N,) bool.
@@ -132,11 +132,11 @@ class Measurements(Pairs):
         in_plane: bool | None = None,
         channels: str | Sequence[str] | None = None,
     ) -> "Measurements":
-        """The used samples that all of these hold for, and these channels of them. Angles in degrees, to 0.5.
+        """The used samples that fulfil all of these, in these channels. Angles in degrees, to 0.5.
 
         Args:
             incidence: polar angles of the light.
-            azimuth: planes of the viewer, from that of incidence; 0 and 180 are the same.
+            azimuth: planes of the viewer, from the plane of incidence; 0 and 180 are the same.
             theta_o: polar angles of the viewer, on either side of the normal.
             in_plane: whether the viewer lies in the plane of incidence.
             channels: their names.
@@ -144,11 +144,11 @@ class Measurements(Pairs):
         Angles are a number, several, or a ``slice(low, high)`` of all between two, ends included.
 
         Raises:
-            ValueError: nothing is given, or what the data do not hold.
+            ValueError: no argument is given, or the data hold no such sample.
         """
         keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
         if not keep.any():
-            raise ValueError("select: no sample of the data is all of this")
+            raise ValueError("select: no sample of the data fulfils all of this")
         return self.where(keep).used().of_channels(own)
 
     def drop(
@@ -160,20 +160,20 @@ class Measurements(Pairs):
         in_plane: bool | None = None,
         channels: str | Sequence[str] | None = None,
     ) -> "Measurements":
-        """The used samples that `select` leaves, in all channels; or the other channels, if only `channels` is given.
+        """The used samples that `select` does not choose, in all channels; or the other channels for channels only.
 
         Raises:
-            ValueError: as `select`, nothing is left, or channels stand beside angles.
+            ValueError: as `select`, no sample remains, or channels are given together with angles.
         """
         keep, own = self._chosen(incidence, azimuth, theta_o, in_plane, channels)
         if channels is None:
             rest = self.where(~keep).used()
         elif any(one is not None for one in (incidence, azimuth, theta_o, in_plane)):
-            raise ValueError("drop: channels stand beside angles; drop one after the other")
+            raise ValueError("drop: channels are given together with angles; drop one after the other")
         else:
             rest = self.used().of_channels([name for name in self.channels if name not in own])
         if not rest.values.size:
-            raise ValueError("drop: nothing of the data is left")
+            raise ValueError("drop: no sample of the data remains")
         return rest
 
     def _chosen(
@@ -184,30 +184,32 @@ class Measurements(Pairs):
         in_plane: bool | None,
         channels: str | Sequence[str] | None,
     ) -> tuple[NDArray[np.bool_], Sequence[str]]:
-        """Rows (N,) that all of it holds for, and names of channels."""
+        """Rows (N,) that fulfil all of it, and names of channels."""
         if all(one is None for one in (incidence, azimuth, theta_o, in_plane, channels)):
-            raise ValueError("select: nothing is given; it takes incidence, azimuth, theta_o, in_plane and channels")
+            raise ValueError(
+                "select: no argument is given; it takes incidence, azimuth, theta_o, in_plane and channels"
+            )
         keep = self.mask & rows_of(self, incidence, azimuth, theta_o, in_plane)
         names = self.channels if channels is None else [channels] if isinstance(channels, str) else channels
         return keep, self.of_channels(names).channels
 
     def of_channels(self, names: Sequence[str]) -> "Measurements":
-        """These channels alone, in the order that they have here. ValueError for one that is not there."""
+        """Only these channels, in the order of the data. ValueError for a channel that the data do not have."""
         for name in names:
             if name not in self.channels:
                 raise ValueError(f"channel {name} is not in the data; there are {', '.join(self.channels)}")
-        places = [place for place, name in enumerate(self.channels) if name in names]
+        columns = [column for column, name in enumerate(self.channels) if name in names]
         return replace(
             self,
-            values=self.values[:, places],
-            sigma=None if self.sigma is None else self.sigma[:, places],
-            channels=tuple(self.channels[place] for place in places),
+            values=self.values[:, columns],
+            sigma=None if self.sigma is None else self.sigma[:, columns],
+            channels=tuple(self.channels[column] for column in columns),
         )
 
     def without_retro(self, degrees: float) -> "Measurements":
         """The same samples, those closer than `degrees` (0 to 180) to retro-reflection masked.
 
-        A detector head shades the beam there. Raises ValueError for an angle out of range.
+        A detector head blocks the beam there. Raises ValueError for an angle out of range.
         """
         _check_angle(degrees, 180.0)
         angle = np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(self.wi - self.wo, axis=-1) / 2, 0, 1)))

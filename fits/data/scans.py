@@ -1,4 +1,4 @@
-"""How measurements lie in angle: their incidences, planes, and scans along a plane."""
+"""Incidences, planes and scans of measurements: how they lie in angle."""
 
 from dataclasses import dataclass
 
@@ -27,32 +27,32 @@ class Incidence:
 def incidences(data: Pairs) -> list[Incidence]:
     """The distinct incident directions, by polar angle then azimuth.
 
-    What lies within `SAME_ANGLE` counts as the same, wherever it lies: an instrument does not come back to an angle to
-    the last digit. So near the normal azimuths are not told apart.
+    Directions within `SAME_ANGLE` count as the same, as an instrument does not return to an angle to the last digit;
+    near the normal all azimuths are therefore one.
     """
     theta = data.theta_i
     phi = np.where(theta < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
     found = []
     for rows in groups(theta):
-        upright = theta[rows].max() < SAME_ANGLE
-        parts = [np.arange(len(rows))] if upright else groups(phi[rows], turn=360.0)
+        normal = theta[rows].max() < SAME_ANGLE
+        parts = [np.arange(len(rows))] if normal else groups(phi[rows], turn=360.0)
         own = [Incidence(_mean(theta[rows[part]]), _mean(phi[rows[part]], 360.0), rows[part]) for part in parts]
         found.extend(sorted(own, key=lambda one: one.phi))
     return found
 
 
 def groups(angles: np.ndarray, turn: float | None = None) -> list[np.ndarray]:
-    """Rows of angles (N,) that are one, groups that each reach less than `SAME_ANGLE` from their smallest, in order.
+    """Rows of equal angles (N,), in order: groups that each span less than `SAME_ANGLE`.
 
-    turn: where angles begin again; then the first group lies behind the widest gap that there is.
+    turn: period of the angles; the first group then follows the widest gap.
     """
     if not len(angles):
         return []
     angles = np.round(angles, 6)  # they come back from unit vectors
     if turn is not None:
         values = np.unique(angles % turn)
-        behind = (np.argmax(np.diff(values, append=values[0] + turn)) + 1) % len(values)
-        angles = np.round((angles - values[behind]) % turn, 6)
+        after_gap = (np.argmax(np.diff(values, append=values[0] + turn)) + 1) % len(values)
+        angles = np.round((angles - values[after_gap]) % turn, 6)
     order = np.argsort(angles, kind="stable")
     ordered, ends, start = angles[order], [], 0
     while start < len(ordered):
@@ -64,7 +64,7 @@ def groups(angles: np.ndarray, turn: float | None = None) -> list[np.ndarray]:
 def relative_azimuth(data: Pairs) -> np.ndarray:
     """Azimuth of the viewer seen from the mirror side, (N,) degrees in (-180, 180]: 0 is forward, 180 backward.
 
-    Light along the normal has no azimuth of its own: it counts as standing at `LIGHT_AZIMUTH`.
+    Light along the normal has no azimuth: it counts as `LIGHT_AZIMUTH`.
     """
     phi_i = np.where(data.theta_i < AT_NORMAL, LIGHT_AZIMUTH, data.phi_i)
     return 180.0 - (phi_i - data.phi_o) % 360.0
@@ -86,7 +86,7 @@ def in_plane(data: Pairs) -> np.ndarray:
 
 
 def planes(data: Pairs) -> np.ndarray:
-    """Plane that the viewer of each sample lies in, degrees in [0, 180) from that of incidence, (N,)."""
+    """Azimuth of the viewer's plane from the plane of incidence, (N,), degrees in [0, 180)."""
     turns = np.round(relative_azimuth(data) % 180.0 / SAME_ANGLE) % round(180.0 / SAME_ANGLE)
     return np.where(in_plane(data), 0.0, SAME_ANGLE * turns)
 
@@ -104,7 +104,7 @@ def scans(data: Pairs) -> list[np.ndarray]:
 
 
 def _mean(angles: np.ndarray, turn: float | None = None) -> float:
-    """To 0.01 degrees, of angles that lie close to each other; between 0 and a turn, where they begin again there."""
+    """Mean of angles that lie close to each other, to 0.01 degrees, modulo `turn`."""
     if turn is None:
         return round(float(np.mean(angles)), 2)
     apart = (angles - angles[0] + 0.5 * turn) % turn - 0.5 * turn

@@ -1,4 +1,4 @@
-"""Parts of measurements by what a user thinks in: incidences, planes, viewing angles, or a share in blocks."""
+"""Selections of measurements: by incidence, plane or viewing angle, or a share in blocks."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,10 +10,11 @@ from fits.data.geometry import Pairs
 from fits.data.scans import SAME_ANGLE, in_plane, incidences, planes, scans, signed_angle
 
 BLOCK = 10.0
-"""Of a share, in degrees along a scan: neighbouring readings are alike, and tell nothing of each other."""
+"""Length of the blocks of a share, in degrees along a scan: neighbouring measurements are correlated, so that single
+ones would be no test of a prediction."""
 
 LISTED = 12
-"""So many angles of the data are named in an error; of more the first and the last."""
+"""The most angles of the data that an error lists; of more it names the first and the last."""
 
 Rows = NDArray[np.bool_]
 Angles = float | Sequence[float] | slice
@@ -22,7 +23,7 @@ Angles = float | Sequence[float] | slice
 def rows_of(
     data: Pairs, incidence: Angles | None, azimuth: Angles | None, theta_o: Angles | None, plane: bool | None
 ) -> Rows:
-    """Samples (N,) that all of these hold for, see `Measurements.select`; plane: in that of incidence."""
+    """Samples (N,) that fulfil all of these, see `Measurements.select`; plane: whether in the plane of incidence."""
     chosen = np.ones(len(data), bool)
     if incidence is not None:
         chosen &= _at(_incidence_of(data), "incidence", incidence)
@@ -36,15 +37,15 @@ def rows_of(
 
 
 def select(data: Pairs, words: str) -> Rows:
-    """Samples (N,) that are meant by one of these, all angles in degrees.
+    """Samples (N,) of one of these selections, all angles in degrees.
 
     - ``incidence=30,70``: polar angles of the light;
     - ``plane=0,90``: planes of the viewer, 0 is that of incidence;
     - ``angle=-20:20,60``: polar angles of the viewer, or ranges of them, negative on the side of the light;
-    - ``share=0.2``: so much of every scan, in blocks of 10 degrees.
+    - ``share=0.2``: that share of every scan, in blocks of 10 degrees.
 
     Raises:
-        ValueError: something else, or what the data do not hold.
+        ValueError: no such selection, or angles that the data do not hold.
     """
     name, equals, text = words.partition("=")
     if not equals or name not in _KINDS:
@@ -61,47 +62,49 @@ def _plane(data: Pairs, name: str, text: str) -> Rows:
 
 
 def _incidence_of(data: Pairs) -> NDArray[np.float64]:
-    """Polar angle of the light, (N,), alike for what counts as one incidence."""
-    there = np.full(len(data), np.nan)
+    """Polar angle of the incidence that each sample belongs to, (N,)."""
+    theta = np.full(len(data), np.nan)
     for incidence in incidences(data):
-        there[incidence.rows] = incidence.theta
-    return there
+        theta[incidence.rows] = incidence.theta
+    return theta
 
 
-def _at(there: NDArray[np.float64], name: str, angles: Angles, turn: float = math.inf) -> Rows:
-    """Where angles (N,) are these, or turned by `turn`."""
+def _at(measured: NDArray[np.float64], name: str, angles: Angles, turn: float = math.inf) -> Rows:
+    """Which of the `measured` angles (N,) are among `angles`, modulo `turn`."""
     if isinstance(angles, slice):
         low = -math.inf if angles.start is None else angles.start - SAME_ANGLE
         high = math.inf if angles.stop is None else angles.stop + SAME_ANGLE
         if angles.step is not None or not low <= high:
             raise ValueError(f"{name} is {angles}; it must be slice(low, high), the first not above the second")
-        return (there >= low) & (there <= high)
-    chosen = np.zeros(len(there), bool)
+        return (measured >= low) & (measured <= high)
+    chosen = np.zeros(len(measured), bool)
     for angle in np.atleast_1d(np.asarray(angles, float)):
-        apart = np.abs(there - angle)
-        near = (apart if math.isinf(turn) else np.minimum(apart % turn, turn - apart % turn)) <= SAME_ANGLE
+        distance = np.abs(measured - angle)
+        if not math.isinf(turn):
+            distance = np.minimum(distance % turn, turn - distance % turn)
+        near = distance <= SAME_ANGLE
         if not near.any():
-            raise ValueError(f"{name} {angle:g} is not in the data; {_known(there)} degrees")
+            raise ValueError(f"{name} {angle:g} is not in the data; {_listed(measured)} degrees")
         chosen |= near
     return chosen
 
 
-def _known(there: NDArray[np.float64]) -> str:
-    every = np.unique(there)
-    if len(every) > LISTED:
-        return f"they go from {every[0]:g} to {every[-1]:g}"
-    return f"there are {', '.join(f'{angle:g}' for angle in every)}"
+def _listed(measured: NDArray[np.float64]) -> str:
+    angles = np.unique(measured)
+    if len(angles) > LISTED:
+        return f"they go from {angles[0]:g} to {angles[-1]:g}"
+    return f"there are {', '.join(f'{angle:g}' for angle in angles)}"
 
 
 def _angle(data: Pairs, name: str, text: str) -> Rows:
     angle, chosen = signed_angle(data), np.zeros(len(data), bool)
     for word in text.split(","):
         low, colon, high = word.partition(":")
-        ends = _number(name, low), _number(name, high if colon else low)
-        if ends[0] > ends[1]:
-            raise ValueError(f"{name} {word.strip()} is empty: its first end must not be above its second")
-        slack = 0.0 if colon else SAME_ANGLE
-        chosen |= (angle >= ends[0] - slack) & (angle <= ends[1] + slack)
+        first, last = _number(name, low), _number(name, high if colon else low)
+        if first > last:
+            raise ValueError(f"{name} {word.strip()} is empty: its first angle must not be above its second")
+        tolerance = 0.0 if colon else SAME_ANGLE
+        chosen |= (angle >= first - tolerance) & (angle <= last + tolerance)
     if not chosen.any():
         raise ValueError(f"{name} {text} is not in the data; they go from {angle.min():g} to {angle.max():g} degrees")
     return chosen
@@ -115,9 +118,9 @@ def _share(data: Pairs, name: str, text: str) -> Rows:
     generator = np.random.default_rng(0)
     for rows in scans(data):
         block = np.floor((angle[rows] - angle[rows].min()) / BLOCK).astype(int)
-        every = np.unique(block)
-        count = min(max(1, round(share * len(every))), len(every) - 1)
-        chosen[rows] = np.isin(block, generator.choice(every, count, replace=False)) if count > 0 else False
+        blocks = np.unique(block)
+        count = min(max(1, round(share * len(blocks))), len(blocks) - 1)
+        chosen[rows] = np.isin(block, generator.choice(blocks, count, replace=False)) if count > 0 else False
     if not chosen.any():
         raise ValueError(f"{name} {text}: no scan of the data is longer than a block of {BLOCK:g} degrees")
     return chosen

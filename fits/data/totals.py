@@ -1,4 +1,4 @@
-"""Shares of light that a sphere, or a detector behind the sample, takes in: totals beside the values of a BSDF."""
+"""Hemispherical reflectance and transmittance and collimated transmittance, as integrating spheres measure them."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,23 +14,23 @@ from fits.data.spheres import Spheres
 
 Kind = Literal["reflectance", "transmittance", "unscattered"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-"""All light that leaves on the side of the light; all that leaves on the other; of this, what no medium scattered."""
+"""Hemispherical reflectance, hemispherical transmittance, and its collimated (unscattered) part."""
 
 BEYOND = 3.0
-"""Standard errors above 1 from which a share, or what is reflected and transmitted together, is warned of."""
+"""Standard errors above 1 from which a value, or the sum of reflectance and transmittance, is warned of."""
 
 
 @dataclass(frozen=True, eq=False)
 class Totals(Measurements):
-    """N shares of light in C channels, each of light along one direction; see `of`.
+    """N hemispherical or collimated values in C channels, each for one incident direction; see `of`.
 
     Args:
-        wi: (N, 3), towards the light, above.
-        wo: (N, 3), where a mirror, or nothing at all, would send it: it tells sides apart and nothing else.
-        values, sigma: (N, C), shares of the light, in [0, 1].
+        wi: (N, 3), towards the light, in the upper hemisphere.
+        wo: (N, 3), specular or undeviated direction, in the hemisphere that the light is measured in.
+        values, sigma: (N, C), shares of the incident light, in [0, 1].
         kinds: N names, of `KINDS`.
-        spheres: that reflectance and transmittance were read by, and whose part in them the model takes on itself; None
-            where they are of the sample alone.
+        spheres: integrating spheres of the measurement, which the model then includes; None for values of the sample
+            itself.
     """
 
     kinds: tuple[Kind, ...] = ()
@@ -46,7 +46,7 @@ class Totals(Measurements):
         if (self.values < 0).any():
             raise ValueError(f"values holds {self.values.min():g}, must be at least 0")
         if (self.wi[:, 2] <= 0).any():
-            raise ValueError("wi lies below; totals are of light from above")
+            raise ValueError("wi lies in the lower hemisphere; totals are of light from the upper one")
 
     @classmethod
     def of(
@@ -60,51 +60,52 @@ class Totals(Measurements):
         channels: Sequence[str] | None = None,
         spheres: Spheres | None = None,
     ) -> "Totals":
-        """Totals at K incidences; those that are None were not read.
+        """Totals at K incidences; None: not measured.
 
         Args:
             incidence: polar angles of the light, in [0, 90) degrees, one or (K,).
-            reflectance, transmittance: all that leaves on either side, what passes straight included: one number, (K,),
-                or (K, C).
-            unscattered: what leaves on the other side and no medium has scattered.
-            sigma: standard deviation of all of them, or of each kind by its name.
+            reflectance, transmittance: hemispherical, with specular and collimated light; a number, (K,) or (K, C).
+            unscattered: collimated transmittance: light that no medium has scattered.
+            sigma: standard deviation of all values, or by the name of their kind.
             channels: C names.
-            spheres: if readings are those of integrating spheres, over a standard, rather than of the sample alone.
+            spheres: integrating spheres, if values are relative to their standard rather than those of the sample.
 
         Raises:
-            ValueError: nothing is given, an angle or value is out of range, or shapes do not go together.
+            ValueError: no value is given, an angle or value is out of range, or shapes do not agree.
 
         Warns:
-            UserWarning: shares that exceed 1, or 1 together, by more than 3 standard deviations; it names them.
+            UserWarning: values, or sums of reflectance and transmittance, exceed 1 by more than 3 standard deviations.
         """
         angles = np.atleast_1d(np.asarray(incidence, float))
         if angles.ndim != 1 or not np.all((angles >= 0) & (angles < 90)):
             raise ValueError(f"incidence is {angles.tolist()}, must be in [0, 90) degrees")
         given = {"reflectance": reflectance, "transmittance": transmittance, "unscattered": unscattered}
-        read = {kind: _columns(kind, value, len(angles)) for kind, value in given.items() if value is not None}
-        if not read:
+        measured = {kind: _columns(kind, value, len(angles)) for kind, value in given.items() if value is not None}
+        if not measured:
             raise ValueError("totals: give reflectance, transmittance or unscattered")
-        count = {part.shape[1] for part in read.values()}
+        count = {part.shape[1] for part in measured.values()}
         if len(count) > 1:
             raise ValueError(f"totals: {sorted(count)} channels are given, must be as many for every kind")
         names = tuple(channels) if channels is not None else channel_names(*count)
-        spread = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in read}
+        spmeasured = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in measured}
         wi = direction(angles, LIGHT_AZIMUTH)
-        kinds = [kind for kind in KINDS if kind in read for _ in angles]
-        found = cls(
-            wi=np.tile(wi, (len(read), 1)),
-            wo=np.concatenate([wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in KINDS if kind in read]),
-            values=np.concatenate([read[kind] for kind in KINDS if kind in read]),
-            sigma=np.concatenate([spread[kind] for kind in KINDS if kind in read]),
+        kinds = [kind for kind in KINDS if kind in measured for _ in angles]
+        totals = cls(
+            wi=np.tile(wi, (len(measured), 1)),
+            wo=np.concatenate(
+                [wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in KINDS if kind in measured]
+            ),
+            values=np.concatenate([measured[kind] for kind in KINDS if kind in measured]),
+            sigma=np.concatenate([spmeasured[kind] for kind in KINDS if kind in measured]),
             mask=np.ones(len(kinds), bool),
             channels=names,
             source=Source("", "memory"),
             kinds=tuple(kinds),
             spheres=spheres,
         )
-        for words in found.beyond():
-            warnings.warn(words, stacklevel=2)
-        return found
+        for message in totals.energy_violations():
+            warnings.warn(message, stacklevel=2)
+        return totals
 
     def used(self) -> "Totals":
         """Only the samples that take part in fits."""
@@ -119,26 +120,26 @@ class Totals(Measurements):
             kinds=tuple(kind for kind, kept in zip(self.kinds, keep, strict=True) if kept),
         )
 
-    def beyond(self) -> list[str]:
-        """What exceeds the light that there was by more than its errors allow, a sentence each."""
+    def energy_violations(self) -> list[str]:
+        """Values that exceed the incident light by more than their errors, a sentence each."""
         sigma = np.zeros_like(self.values) if self.sigma is None else self.sigma
-        words = [
+        messages = [
             f"{self.kinds[row]} at {self.theta_i[row]:g} degrees, {self.channels[column]}, is "
             f"{self.values[row, column]:.4g}: more than 1 by more than {BEYOND:g} standard deviations"
             for row, column in zip(*np.nonzero(self.values > 1.0 + BEYOND * sigma), strict=True)
         ]
-        rows = {kind: [k for k, own in enumerate(self.kinds) if own == kind] for kind in KINDS}
+        rows = {kind: [k for k, one in enumerate(self.kinds) if one == kind] for kind in KINDS}
         for row in rows["reflectance"]:
             for other in rows["transmittance"]:
                 if not np.allclose(self.wi[row], self.wi[other]):
                     continue
                 both, error = self.values[row] + self.values[other], np.hypot(sigma[row], sigma[other])
-                words += [
+                messages += [
                     f"reflectance and transmittance at {self.theta_i[row]:g} degrees, {self.channels[column]}, are "
                     f"{both[column]:.4g} together: more than 1 by more than {BEYOND:g} standard deviations"
                     for column in np.flatnonzero(both > 1.0 + BEYOND * error)
                 ]
-        return words
+        return messages
 
 
 def _columns(name: str, value: ArrayLike, rows: int, columns: int | None = None) -> Floats:

@@ -1,1 +1,1 @@
-"""Whole maps of materials: readings of every texel go in, by blocks; a store with the parameters of each comes out."""
+"""Maps of materials: measurements of every texel go in, by blocks; a store with the parameters of each comes out."""

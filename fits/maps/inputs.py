@@ -1,79 +1,253 @@
-"""Readings of a map by blocks: values of every texel, their directions, standard deviations and a mask of texels.
+"""Measurements of a map: values of every texel, their directions, standard deviations and a mask, read block by block.
 
-A map is an array (..., N, C): texels along the leading axes, N readings of each, C channels; or (..., N) for one
-channel. It may be far larger than memory: it is opened here, and read block by block.
+A map is an array (..., N, C): texels along the leading axes, N measurements of each, C channels; or (..., N) for one
+channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, zarr and xarray all become variables of
+xarray, whose numbers are read when they are asked for.
 """
 
+import base64
+import hashlib
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
+from xarray.backends import BackendArray
+from xarray.core import indexing
 
-from fits.data.geometry import Floats, Geometry
-from fits.maps.directions import Directions, directions
-from fits.maps.sources import Block, Named, Place, Source, beside, opened, source, words
+from fits._files import require_there
+from fits.data.formats.csv import read_directions
+from fits.data.geometry import Floats, Geometry, Pairs, direction
+
+Block = tuple[slice, ...]
+"""Of the leading axes of a map, the first ones of an array; what is left out is taken whole."""
 
 SAMPLE, CHANNEL = "sample", "channel"
-"""Names of the axes of readings and of channels of an xarray DataArray; by them they are found wherever they stand."""
+"""Names of the axes of measurements and of channels in xarray; by them they are found wherever they stand."""
 
-TOGETHER = 2**20  # directions in memory that are checked at a time
+VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
+DIRECTIONS = f"{' and '.join(VECTORS)}, or {', '.join(ANGLES)} in degrees"
+KINDS = ".npy, .h5, .hdf5 or .zarr"
+NORMAL = (0.0, 0.0, 1.0)
+
+UNREADABLE = "?"
+"""In the place of a fingerprint of what cannot be read."""
+
+WHOLE, BLOCK, BLOCKS = 2**26, 2**20, 64
+"""Bytes of an array that is fingerprinted whole, bytes of a block of it, and blocks of a longer one."""
 
 
-@dataclass(frozen=True)
-class Portable:
-    """Where another process finds the readings of a map: paths and names; what is small is there itself, directions and
-    deviations (N,) that all texels share, and a mask that is only in memory."""
+# ---- arrays, wherever they are ----
 
-    values: Place
-    directions: Mapping[str, Place | Floats]
-    sigma: Place | Floats | None
-    mask: Place | NDArray[np.bool_] | None
 
-    def open(self) -> "Readings":
-        """The readings, opened again. Errors as in `readings`."""
-        return readings(self.values, self.directions, sigma=self.sigma, mask=self.mask)
+class _Stored(BackendArray):
+    """Anything that has a shape and takes slices, such as an array of h5py, as xarray reads it."""
+
+    def __init__(self, array: Any):
+        self.array, self.shape, self.dtype = array, tuple(array.shape), array.dtype
+
+    def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
+        support = indexing.IndexingSupport.BASIC
+        return indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
+
+    def _read(self, key: Any) -> Any:
+        if isinstance(self.array, np.memmap) and self.array.filename is not None:
+            needed, there = self.array.offset + self.array.nbytes, os.path.getsize(self.array.filename)
+            if there < needed:  # to read beyond the end would kill the process
+                raise ValueError(f"the file has {there:,} bytes, must have {needed:,} (truncated?)")
+        return np.asarray(self.array[key])
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """The readings of a map, opened and not loaded.
+class Array:
+    """One array with names of its axes; where: as errors call it."""
 
-    shape: of the map. samples: N, of each texel. channels: C. geometry: the directions if all texels have the same.
+    variable: xr.Variable
+    where: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.variable.shape
+
+    @property
+    def dims(self) -> tuple[str, ...]:
+        return tuple(map(str, self.variable.dims))
+
+    def read(self, block: Block = ()) -> Floats:
+        """A block of it, float64, a copy. ValueError, which names file and block: it cannot be read."""
+        try:
+            return np.array(self.variable[(*block, ...)].values, dtype=np.float64)
+        except MemoryError:
+            raise
+        except Exception as error:  # codecs raise what they like
+            part = f"block {words(block)}" if block else "it"
+            raise ValueError(f"{self.where}: {part} cannot be read: {_reason(error)}") from None
+
+    def ordered(self, dims: Sequence[str]) -> "Array":
+        """The same with its named axes in this order, as far as it has them, and others last."""
+        own = [name for name in dims if name in self.dims]
+        return replace(self, variable=self.variable.transpose(*own, *(name for name in self.dims if name not in own)))
+
+    def fingerprint(self, axes: int) -> str:
+        """Hashes of shape, type and content, block by block; "?" for a block that cannot be read.
+
+        Of arrays above 64 MiB (as float64) 64 blocks enter, spread evenly: what changes between them is not seen.
+        axes: how many of them are the map's.
+        """
+        kind = self.variable.dtype
+        found = [_hash(f"{self.shape} {kind.kind}{kind.itemsize}".encode())]
+        for block in _blocks(self.shape, axes):
+            try:
+                part = self.read(block)
+            except ValueError:
+                found.append(UNREADABLE)
+                continue
+            part[np.isnan(part)] = np.nan  # one of the many, and one zero of the two
+            found.append(_hash((part + 0.0).tobytes()))
+        return ",".join(found)
+
+
+def _array(given: Any, where: str) -> Array:
+    """An array of numpy, h5py, zarr or xarray, or what numpy makes one of."""
+    if isinstance(given, Array):
+        return given
+    if isinstance(given, xr.DataArray | xr.Variable):
+        variable = given if isinstance(given, xr.Variable) else given.variable
+    else:
+        if isinstance(given, np.ma.MaskedArray):
+            given = np.ma.filled(given.astype(np.float64), np.nan)
+        array = given if hasattr(given, "dtype") and hasattr(given, "shape") else np.asarray(given)
+        if array.dtype.kind not in "biuf":
+            raise ValueError(f"{where} holds {array.dtype}, must hold real numbers")
+        dims = [f"dim_{axis}" for axis in range(len(array.shape))]
+        variable = xr.Variable(dims, indexing.LazilyIndexedArray(_Stored(array)), _packing(array))
+        variable = xr.conventions.decode_cf_variable(where, variable, decode_times=False)
+    if variable.dtype.kind not in "biuf":
+        raise ValueError(f"{where} holds {variable.dtype}, must hold real numbers")
+    return Array(variable, where)
+
+
+def _packing(array: Any) -> dict[str, float]:
+    """What attributes of a stored array say of its numbers: factor, offset, and the number that stands for nothing."""
+    said = dict(getattr(array, "attrs", {}))
+    if "_ARRAY_DIMENSIONS" in said:  # as xarray writes zarr's format 2
+        said["_FillValue"] = array.fill_value
+    if isinstance(said.get("_FillValue"), str):  # and format 3
+        said["_FillValue"] = np.frombuffer(base64.b64decode(said["_FillValue"]), "<f8")
+    names = ("_FillValue", "scale_factor", "add_offset")
+    return {name: np.ravel(said[name])[0] for name in names if said.get(name) is not None}
+
+
+def _group(given: Any, wanted: str) -> tuple[dict[str, Array], str | None, str]:
+    """Arrays by name, which of them was given (None: that is to be chosen), and what errors call them together."""
+    if isinstance(given, str | os.PathLike):
+        return _in_file(str(given))
+    if isinstance(given, xr.DataArray):
+        return _members(given.coords, f"{wanted}/") | {wanted: _array(given, wanted)}, wanted, wanted
+    if isinstance(given, Mapping) or hasattr(given, "array_keys"):  # Datasets of xarray and groups are such
+        coordinates = _members(given.coords, f"{wanted}/") if isinstance(given, xr.Dataset) else {}
+        return coordinates | _members(given, f"{wanted}/"), None, wanted
+    return {wanted: _array(given, wanted)}, wanted, wanted
+
+
+def _members(group: Any, where: str) -> dict[str, Array]:
+    """The arrays of numbers in a group; whatever else lies there is left out."""
+    items = group.arrays() if hasattr(group, "array_keys") else group.items()
+    return {
+        str(name): _array(one, f"{where}{name}")
+        for name, one in items
+        if not isinstance(one, Mapping) and (not hasattr(one, "dtype") or one.dtype.kind in "biuf")
+    }
+
+
+def _in_file(given: str) -> tuple[dict[str, Array], str | None, str]:
+    """What a file holds, or the group in which an array lies that is named as ``file.h5:/name``."""
+    inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", given, re.IGNORECASE)
+    path, name = (inside[1], inside[2].strip("/")) if inside else (given, "")
+    require_there(path)
+    suffix = Path(path).suffix.lower()
+    is_zarr = suffix == ".zarr" or any((Path(path) / file).is_file() for file in ("zarr.json", ".zarray", ".zgroup"))
+    if os.path.isdir(path) and not is_zarr:
+        raise ValueError(
+            f"{path}: is a folder, a map is one array ({KINDS}); a folder of measurement files is for layerjax fit-many"
+        )
+    if suffix not in (".npy", ".h5", ".hdf5") and not is_zarr:
+        raise ValueError(
+            f"{path}: ends in {suffix!r}, a map is read from {KINDS}; measurements of one material are for layerjax fit"
+        )
+    try:
+        root = _open(path, suffix)
+        found, (folder, _, last) = root[name] if name else root, name.rpartition("/")
+        parent = root[folder or "/"] if name else None
+    except KeyError:
+        raise ValueError(f"{path}: holds no {name!r}") from None
+    except Exception as error:  # codecs raise what they like
+        raise ValueError(f"{path}: cannot be read: {_reason(error)}") from None
+    if not hasattr(found, "dtype"):
+        return _members(found, f"{path}:/{name}/" if name else f"{path}:/"), None, given
+    if not name:
+        return {"": _array(found, given)}, "", given
+    return _members(parent, f"{path}:/{folder}/" if folder else f"{path}:/") | {last: _array(found, given)}, last, given
+
+
+def _open(path: str, suffix: str) -> Any:
+    if suffix == ".npy":
+        with open(path, "rb") as file:
+            if file.read(6) != b"\x93NUMPY":
+                raise ValueError("it is no .npy file")  # numpy takes it for a pickle, and tells how to load it unsafely
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    if suffix in (".h5", ".hdf5"):
+        import h5py
+
+        return h5py.File(path, "r")
+    import zarr
+
+    return zarr.open(path, mode="r")
+
+
+def _chosen(given: Any, wanted: str) -> tuple[Array, dict[str, Array]]:
+    """The array that was given, or that of the wanted name, or the only one; and all that lie beside it."""
+    arrays, name, where = _group(given, wanted)
+    if name is None and wanted not in arrays and len(arrays) != 1:
+        there = f"there are {', '.join([*arrays][:9])}" if arrays else "there is none"
+        raise ValueError(f"{where}: no array {wanted!r}, {there}; PATH:/NAME chooses another")
+    return arrays[name if name is not None else wanted if wanted in arrays else next(iter(arrays))], arrays
+
+
+# ---- the measurements of a map ----
+
+
+@dataclass(frozen=True, eq=False)
+class MapData:
+    """The measurements of a map, opened and not loaded.
+
+    values: (..., N, C) or (..., N). directions: by name, of `VECTORS` or `ANGLES`. shape: of the map. samples: N.
+    channels: C. geometry: the directions, if all texels have the same. given: as `map_data` was called.
     """
 
-    values: Source
-    directions: Directions
-    sigma: Source | None
-    mask: Source | None
+    values: Array
+    directions: Mapping[str, Array]
+    sigma: Array | None
+    mask: Array | None
     shape: tuple[int, ...]
+    samples: int
     channels: int
-
-    @property
-    def samples(self) -> int:
-        return self.directions.samples
-
-    @property
-    def geometry(self) -> Geometry | None:
-        return self.directions.common
+    geometry: Geometry | None
+    given: tuple[Any, Any, Any, Any]
 
     def read(self, block: Block) -> Floats:
-        """The readings of a block, (block shape, N, C), in 1/sr; NaN stays NaN.
-
-        Raises:
-            ValueError: it cannot be read, whatever the reason; it names file and block.
-        """
+        """The values of a block, (block shape, N, C), in 1/sr; NaN stays NaN. ValueError: they cannot be read."""
         return self._filled(self.values, self._whole(block))
 
     def read_sigma(self, block: Block) -> Floats | None:
         """Their standard deviations, (block shape, N, C), NaN where unknown, or of no use in a masked texel; None if
-        there are none.
-
-        Raises:
-            ValueError: as `read`, or one of a texel that is not masked is not above 0.
-        """
+        there are none. ValueError: as `read`, or one of a texel that is not masked is not above 0."""
         if self.sigma is None:
             return None
         block = self._whole(block)
@@ -87,7 +261,7 @@ class Readings:
         return np.where(found > 0.0, found, np.nan)
 
     def read_mask(self, block: Block) -> NDArray[np.bool_]:
-        """Which texels of a block take part, (block shape): all if there is no mask. Errors as `read`."""
+        """Which texels of a block take part, (block shape): all if there is no mask. ValueError: as `read`."""
         block = self._whole(block)
         if self.mask is None:
             return np.ones([one.stop - one.start for one in block], bool)
@@ -102,39 +276,36 @@ class Readings:
         """
         if self.geometry is not None:
             return self.geometry.wi, self.geometry.wo
-        block = self._whole(block)
-        return self.directions.read(block, self.read_mask(block))
+        block, axes = self._whole(block), 2 if "wi" in self.directions else 1
+        own = {name: len(one.shape) > axes for name, one in self.directions.items()}
+        found = {name: one.read(block if own[name] else ()) for name, one in self.directions.items()}
+        return _unit_vectors(found, self.read_mask(block), f" in block {words(block)}")
 
-    def digest(self) -> str:
-        """What tells these readings from others: hashes of shapes, types and content, see `fits.maps.identity.alike`.
-
-        Arrays up to 64 MiB enter whole, of longer ones blocks from all over them: a change between those is not seen,
-        see `fits.maps.sources.Source.digest`. Names and dates of files do not enter: a copy is the same.
-        """
-        rank = len(self.shape)
-        parts = [f"{self.shape} {self.samples} {self.channels}", self.directions.digest()]
+    def fingerprint(self) -> str:
+        """What tells these measurements from others, see `Array.fingerprint`; names and dates of files do not enter."""
+        rank, axes = len(self.shape), 2 if "wi" in self.directions else 1
+        parts = [f"{self.shape} {self.samples} {self.channels}"]
+        parts += [
+            f"{name} {one.fingerprint(rank if len(one.shape) > axes else 0)}"
+            for name, one in sorted(self.directions.items())
+        ]
         for one in (self.values, self.sigma, self.mask):
-            parts.append("" if one is None else one.digest(rank if len(one.shape) > 1 or one is self.mask else 0))
+            parts.append("" if one is None else one.fingerprint(rank if len(one.shape) > 1 or one is self.mask else 0))
         return ",".join(parts)
 
     @property
-    def portable(self) -> Portable | None:
-        """What another process opens them from, cheap to pickle; None if a large part of them is only in memory.
-
-        Raises:
-            ValueError: a small part that is only in memory cannot be read.
-        """
-        own, sigma, mask = self.directions.places(), self.sigma, self.mask
-        if own is None or self.values.place is None:
-            return None
-        if sigma is not None and sigma.place is None and len(sigma.shape) > 1:
-            return None
-        return Portable(
-            self.values.place,
-            own,
-            None if sigma is None else sigma.place or sigma.read(),
-            None if mask is None else mask.place or self.read_mask(()),
-        )
+    def portable(self) -> tuple[Any, Any, Any, Any] | None:
+        """What another process opens them from by `map_data`: paths, and what is small; None if that is not all."""
+        values, geometry, sigma, mask = map(_absolute, self.given)
+        if self.geometry is not None:
+            geometry = (self.geometry.wi, self.geometry.wo)
+        if self.sigma is not None and len(self.sigma.shape) == 1:
+            sigma = self.sigma.read()
+        if self.mask is not None and not isinstance(mask, str):
+            mask = self.read_mask(())
+        large = (values, sigma, *([] if self.geometry is not None or geometry is None else [geometry]))
+        by_name = all(one is None or isinstance(one, str) or (one is sigma and np.ndim(one) == 1) for one in large)
+        return (values, geometry, sigma, mask) if by_name else None
 
     def _whole(self, block: Block) -> Block:
         """The block with all its ends said, within the map."""
@@ -143,7 +314,7 @@ class Readings:
         given = (*block, *[slice(None)] * (len(self.shape) - len(block)))
         return tuple(slice(*one.indices(size)[:2]) for one, size in zip(given, self.shape, strict=True))
 
-    def _filled(self, one: Source, block: Block) -> Floats:
+    def _filled(self, one: Array, block: Block) -> Floats:
         """A block of values or their deviations at its full shape, (block shape, N, C)."""
         over = tuple(part.stop - part.start for part in block)
         if len(one.shape) > 1:
@@ -155,86 +326,167 @@ class Readings:
         return found if found.shape == shape else np.broadcast_to(found, shape).copy()
 
 
-def readings(values: Any, geometry: Any = None, *, sigma: Any = None, mask: Any = None) -> Readings:
-    """Open the readings of a map.
+def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = None) -> MapData:
+    """Open the measurements of a map.
 
-    Each array may be one of numpy (mapped or not), a `zarr.Array`, an `h5py.Dataset`, an `xarray.DataArray`, or a path:
-    of a .npy file, of an HDF5 file or zarr store that holds one array, or one of the argument's name, or
-    ``file.h5:/name``, ``store.zarr:/name``. Axes of a DataArray that are called "sample" and "channel" are found
-    wherever they stand; others are taken in their order.
+    Each array may be one of numpy (mapped or not), h5py, zarr or xarray, or a path: of a .npy file, of an HDF5 file or
+    zarr store that holds one array, or one of the argument's name, or ``file.h5:/name``, ``store.zarr:/name``. Axes of
+    xarray that are called "sample" and "channel" are found wherever they stand; others are taken in their order.
 
     Args:
-        values: (..., N, C), or (..., N) for one channel, BSDF in 1/sr. Where both fit it is (..., N, C). A reading that
+        values: (..., N, C), or (..., N) for one channel, BSDF in 1/sr. Where both fit it is (..., N, C). A value that
             is NaN is left out.
-        geometry: the directions, see `fits.maps.directions.directions`; None: they stand beside the values.
+        geometry: `fits.Geometry` (or measurements, for where they were taken), a pair (wi, wo) of arrays, (N, 3) or
+            (..., N, 3), a csv of directions, or a mapping or file with the arrays `wi`, `wo`, or `theta_i`, `phi_i`,
+            `theta_o`, `phi_o`, (N,) or (..., N), in degrees; None: these stand beside the values.
         sigma: standard deviations in 1/sr, above 0, (..., N, C) or (..., N), where axes of texels may be 1, or (N,).
-            NaN leaves a reading out.
+            NaN leaves a value out.
         mask: (...), truth values or whole numbers: which texels take part, others being 0.
 
     Raises:
         ValueError: an array is not there or no such array, or shapes do not fit together.
     """
-    if isinstance(values, Readings):
+    if isinstance(values, MapData):
         return values
-    found, near = _values(values)
-    along = directions(geometry, near, tuple(name for name in found.dims if name != CHANNEL))
-    shape, channels = _told_apart(found, along.samples)
-    along.require_over(shape)
-    more = {
-        name: None if given is None else source(given, name).ordered(found.dims)
-        for name, given in (("sigma", sigma), ("mask", mask))
-    }
-    _require_fitting(more["sigma"], more["mask"], found, shape)
-    whole = Readings(found, along, **more, shape=shape, channels=channels)
-    if along.in_memory:  # what is wrong with them is told now
-        rows = max(1, TOGETHER // (along.samples * math.prod(shape[1:])))
-        for row in range(0, shape[0], rows):
-            whole.read_directions((slice(row, row + rows),))
-    return whole
-
-
-def _values(given: Any) -> tuple[Source, Named | None]:
-    """The values, with named axes in the order texels, readings, channels, and what lies beside them."""
-    everything = opened(given, "values")
-    found = everything.one("values") if isinstance(everything, Named) else everything
-    near = everything if isinstance(everything, Named) else beside(found)
+    given = values, geometry, sigma, mask
+    found, beside = _chosen(values, "values")
     if 0 in found.shape:
         raise ValueError(f"{found.where} has shape {found.shape}, must hold something along every axis")
     last = [name for name in (SAMPLE, CHANNEL) if name in found.dims]
-    return found.ordered([*(name for name in found.dims if name not in last), *last]), near
+    found = found.ordered([*(name for name in found.dims if name not in last), *last])
+    along, samples, over = _directions(geometry, beside, [name for name in found.dims if name != CHANNEL])
+    shape, channels = _told_apart(found, samples)
+    if over not in ((), shape):
+        raise ValueError(f"geometry has directions of its own for a map of {over}, the measurements are of {shape}")
+    more = {
+        name: None if one is None else _chosen(one, name)[0].ordered(found.dims)
+        for name, one in (("sigma", sigma), ("mask", mask))
+    }
+    _require_fitting(more["sigma"], more["mask"], found, shape)
+    common = None
+    if not over:
+        common = Geometry(*_unit_vectors({name: one.read() for name, one in along.items()}, np.ones((), bool), ""))
+    whole = MapData(found, along, **more, shape=shape, samples=samples, channels=channels, geometry=common, given=given)
+    if common is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is told now
+        whole.read_directions(())
+    return whole
 
 
-def _told_apart(values: Source, samples: int) -> tuple[tuple[int, ...], int]:
+def _directions(given: Any, beside: dict[str, Array], dims: list[str]) -> tuple[dict[str, Array], int, tuple[int, ...]]:
+    """Arrays of directions by name, how many there are, and the shape of the map if texels have their own, else ()."""
+    if (
+        isinstance(given, str | Path)
+        and Path(given).is_file()
+        and Path(given).suffix.lower() not in (".npy", ".h5", ".hdf5")
+    ):
+        given = read_directions(Path(given))
+    if isinstance(given, Pairs):
+        given = (given.wi, given.wo)
+    if isinstance(given, tuple | list):
+        if len(given) != 2:
+            raise ValueError(f"geometry has {len(given)} entries, must be two: wi and wo")
+        given = dict(zip(VECTORS, given, strict=True))
+    arrays, _, where = (beside, None, "what is beside the values") if given is None else _group(given, "geometry")
+    names = next((names for names in (VECTORS, ANGLES) if all(name in arrays for name in names)), None)
+    if names is None:
+        missing = "geometry is not given, and there is nothing beside the values" if given is None else where
+        raise ValueError(f"{missing} has no directions, must hold {DIRECTIONS}")
+    found, axes = {name: arrays[name].ordered(dims) for name in names}, 2 if "wi" in names else 1
+    for name, one in found.items():
+        if len(one.shape) < axes or (axes == 2 and one.shape[-1] != 3):
+            wanted = "(N, 3) or (..., N, 3), the map's axes in front" if axes == 2 else "(N,) or (..., N)"
+            raise ValueError(f"{one.where} ({name}) has shape {one.shape}, must be {wanted}")
+    counts = {one.shape[-axes] for one in found.values()}
+    over = {one.shape[:-axes] for one in found.values()} - {()}
+    if len(counts) > 1 or len(over) > 1 or 0 in counts:
+        told = ", ".join(f"{name} {one.shape}" for name, one in found.items())
+        raise ValueError(f"geometry: shapes {told} do not fit together, N and the map's axes must be the same")
+    return found, counts.pop(), next(iter(over), ())
+
+
+def _unit_vectors(found: Mapping[str, Floats], given: NDArray[np.bool_], where: str) -> tuple[Floats, Floats]:
+    """`wi` and `wo`, (block shape, N, 3), refused where one of a `given` texel is none, along the normal elsewhere."""
+    if "wi" not in found:
+        polar = {}
+        for name in ("theta_i", "theta_o"):
+            out = (found[name] < 0.0) | (found[name] > 180.0)
+            if (wrong := out & given[..., None]).any():
+                first = np.broadcast_to(found[name], wrong.shape)[wrong][0]
+                raise ValueError(f"geometry: {name} is {first:g}, must be in [0, 180] degrees")
+            polar[name] = np.where(out, np.nan, found[name])
+        found = {"wi": direction(polar["theta_i"], found["phi_i"]), "wo": direction(polar["theta_o"], found["phi_o"])}
+    checked = []
+    for name in VECTORS:
+        w = np.broadcast_to(found[name], (*given.shape, *found[name].shape[-2:]))
+        bad = ~(np.abs(np.linalg.norm(w, axis=-1) - 1.0) <= 1e-6)
+        if np.any(wrong := bad & given[..., None]):
+            raise ValueError(f"geometry: {name} is {w[wrong][0].tolist()}{where}, must be finite and of length 1")
+        checked.append(np.where(bad[..., None], NORMAL, w))
+    return checked[0], checked[1]
+
+
+def _told_apart(values: Array, samples: int) -> tuple[tuple[int, ...], int]:
     """The shape of the map, and how many channels it has."""
-    shape, fitting = values.shape, []
-    if len(shape) > 2 and shape[-2] == samples and (CHANNEL in values.dims or SAMPLE not in values.dims):
-        fitting.append((shape[:-2], shape[-1]))
-    if len(shape) > 1 and shape[-1] == samples and CHANNEL not in values.dims:
-        fitting.append((shape[:-1], 1))
-    if not fitting:
-        raise ValueError(
-            f"{values.where} has shape {shape}, the geometry {samples} pairs of directions: values must be "
-            f"(..., {samples}, C), or (..., {samples}) for one channel, with an axis or more of texels"
-        )
-    return fitting[0]
+    shape, named = values.shape, values.dims
+    if len(shape) > 2 and shape[-2] == samples and (CHANNEL in named or SAMPLE not in named):
+        return shape[:-2], shape[-1]
+    if len(shape) > 1 and shape[-1] == samples and CHANNEL not in named:
+        return shape[:-1], 1
+    raise ValueError(
+        f"{values.where} has shape {shape}, the geometry {samples} pairs of directions: values must be "
+        f"(..., {samples}, C), or (..., {samples}) for one channel, with an axis or more of texels"
+    )
 
 
-def _require_fitting(sigma: Source | None, mask: Source | None, values: Source, shape: tuple[int, ...]) -> None:
+def _require_fitting(sigma: Array | None, mask: Array | None, values: Array, shape: tuple[int, ...]) -> None:
     """Refuse deviations and a mask whose shapes are not those of the values and of the map."""
-    alike, alone = values.shape[: len(shape) + 1], values.shape[len(shape) : len(shape) + 1]
-    fitting = [values.shape, alike]
-    if sigma is not None and sigma.shape != alone and not any(_broadcasts(sigma.shape, o, len(shape)) for o in fitting):
-        raise ValueError(
-            f"{sigma.where} has shape {sigma.shape}, sigma must be {values.shape}, {alike}, the same with 1 for axes "
-            f"of texels, or {alone}"
-        )
+    rank = len(shape)
+    alike, alone = values.shape[: rank + 1], values.shape[rank : rank + 1]
+    if sigma is not None and sigma.shape != alone:
+        fits = [
+            len(sigma.shape) == len(full) and sigma.shape[rank:] == full[rank:]
+            and all(one in (1, size) for one, size in zip(sigma.shape, full, strict=True))
+            for full in (values.shape, alike)
+        ]  # fmt: skip
+        if not any(fits):
+            raise ValueError(
+                f"{sigma.where} has shape {sigma.shape}, sigma must be {values.shape}, {alike}, the same with 1 for "
+                f"axes of texels, or {alone}"
+            )
     if mask is not None and mask.shape != shape:
         raise ValueError(f"{mask.where} has shape {mask.shape}, a mask must have that of the map, {shape}")
-    if mask is not None and mask.array.dtype.kind == "f":
-        raise ValueError(f"{mask.where} holds {mask.array.dtype}, a mask must hold truth values or whole numbers")
+    if mask is not None and mask.variable.dtype.kind == "f":
+        raise ValueError(f"{mask.where} holds {mask.variable.dtype}, a mask must hold truth values or whole numbers")
 
 
-def _broadcasts(shape: tuple[int, ...], full: tuple[int, ...], leading: int) -> bool:
-    """Whether an array is of this shape, or has 1 in place of some of the leading axes."""
-    same = len(shape) == len(full) and shape[leading:] == full[leading:]
-    return same and all(one in (1, size) for one, size in zip(shape, full, strict=True))
+def words(block: Block) -> str:
+    """A block as errors name it: [0:32, 64:96]."""
+    return f"[{', '.join(f'{one.start}:{one.stop}' for one in block)}]"
+
+
+def _blocks(shape: tuple[int, ...], axes: int) -> Iterator[Block]:
+    """All of an array, slab by slab, or where it is too long for that some blocks from all over it."""
+    over = shape[:axes]
+    texels, each = math.prod(over), 8 * math.prod(shape[axes:])
+    if not over:
+        yield ()
+    elif texels * each <= WHOLE:
+        rows = max(1, min(BLOCK // max(1, each * math.prod(over[1:])), over[0] // 8))
+        yield from ((slice(row, min(row + rows, over[0])),) for row in range(0, over[0], rows))
+    else:
+        run = max(1, min(64, BLOCK // max(1, each)))
+        for number in range(BLOCKS):
+            *rest, last = np.unravel_index(number * (texels - 1) // (BLOCKS - 1), over)
+            yield (*(slice(int(k), int(k) + 1) for k in rest), slice(int(last), min(int(last) + run, over[-1])))
+
+
+def _absolute(given: Any) -> Any:
+    return os.path.abspath(given) if isinstance(given, str | os.PathLike) else given
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

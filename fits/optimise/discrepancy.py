@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.neighbours import alike, neighbours
+from fits.data.neighbours import correlation, neighbours
 from fits.data.totals import Totals
 from fits.optimise.multi_start import start_points, unit_of
 from fits.optimise.options import DEFAULT, FitOptions
@@ -38,7 +38,7 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
         chi_square=fit.chi_square,
         degrees_of_freedom=fit.degrees_of_freedom,
         log_likelihood=fit.log_likelihood,
-        residual_autocorrelation=alike(*pairs),
+        residual_autocorrelation=correlation(*pairs),
         pairs=pairs[0].size,
     )
 

@@ -1,7 +1,7 @@
-"""What fits foretell of readings that are left out of them: one incidence after the other, or stretches of a scan.
+"""Cross-validation: a fit is repeated without one group of measurements after the other, and predicts them.
 
-Readings of one incidence are alike, so that one of them, left out by itself, is told by its neighbours whatever the
-stack is. What a stack is worth shows where a whole incidence is missing.
+Measurements at one incidence resemble each other, so a single one that is held out is predicted well by its neighbours,
+whatever the stack. Groups are therefore whole incidences; of fewer than three, parts of every scan.
 """
 
 from collections.abc import MutableMapping
@@ -15,8 +15,9 @@ from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
-from fits.prediction.importance import Weighted
-from fits.prediction.predict import foretold
+from fits.prediction.importance import ImportanceDraws
+from fits.prediction.options import ComparisonOptions
+from fits.prediction.predict import posterior_predictive
 from fits.problem.discrepancy.logarithm import size
 from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
@@ -24,24 +25,21 @@ from fits.progress import Progress
 from fits.sampling.modes import other_minima
 from layerjax._checks import require_kind
 
-FEWEST_INCIDENCES = 3
-"""With fewer, stretches of the scans are left out: what is fitted at one incidence says little of another."""
-
-STRETCHES = 5
-"""Of each scan."""
-
 DRAWS = 128
+
+INFINITE_NOISE = 1e8
+"""Noise with which a measurement does not influence a fit, in units of the largest measurement."""
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """How readings were foretold that were left out.
+    """Predictive densities of held-out measurements.
 
-    groups: what was left out together. rows: the rows of each among the used samples. log_density: of each reading by
-    the fit that had not seen its group, (N, C), 0 for those of planes with too few readings to leave some out, which
-    are in no group. converged: whether all of these fits did.
+    groups: names of what was held out together. rows: rows of each group among the used samples. log_density: log
+    predictive density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane
+    has too few to hold some out. converged: whether all of these fits converged.
     """
 
     groups: tuple[str, ...]
@@ -51,22 +49,22 @@ class CrossValidation:
 
     @property
     def elpd(self) -> float:
-        """Sum of the log-densities: the higher, the better are new readings foretold."""
+        """Expected log pointwise predictive density: the sum over measurements; higher is better."""
         return float(np.sum(self.log_density))
 
     @property
-    def by_group(self) -> Floats:
-        """The score of each group, (G,)."""
+    def elpd_by_group(self) -> Floats:
+        """The elpd of each group, (G,)."""
         return np.array([np.sum(self.log_density[rows]) for rows in self.rows])
 
     @property
-    def sizes(self) -> NDArray[np.int64]:
-        """Readings of each group, (G,)."""
+    def group_sizes(self) -> NDArray[np.int64]:
+        """Measurements times channels of each group, (G,)."""
         return np.array([self.log_density[rows].size for rows in self.rows])
 
 
-Done = MutableMapping[str, tuple[Floats, bool]]
-"""By group: the log-density of its readings, (rows, C), and whether the fit without them converged."""
+HeldOut = MutableMapping[str, tuple[Floats, bool]]
+"""By group: log predictive densities of its measurements, (rows, C), and whether the fit without them converged."""
 
 
 def cross_validate(
@@ -74,47 +72,49 @@ def cross_validate(
     *,
     draws: int = DRAWS,
     seed: int = 0,
+    options: ComparisonOptions | None = None,
     progress: Progress | None = None,
-    known: Weighted | None = None,
-    done: Done | None = None,
+    posterior: ImportanceDraws | None = None,
+    done: HeldOut | None = None,
 ) -> CrossValidation:
-    """Fit anew without each incidence, from the best values on, and foretell its readings.
+    """Fit again without each incidence, starting from the best values, and predict its measurements.
 
-    With fewer than three incidences every scan is left out by fifths.
+    With fewer than three incidences a fifth of every scan is held out at a time.
 
     Args:
-        fit: of a likelihood.
+        fit: a fit of a likelihood.
         draws, seed: see `predict`.
-        progress: called with ("left out", groups done, groups, name).
-        known: draws for the posterior of the fit: those without an incidence are looked for about them.
-        done: groups that are there are not computed again; those that are computed are added as they are.
+        options: `min_incidences` and `scan_parts` decide what is held out together.
+        progress: called with ("cross-validation", groups done, groups, name).
+        posterior: draws of the fit's posterior; those without a group are sought about them.
+        done: groups in it are not computed again; each group is added to it once it is computed.
 
     Raises:
-        ValueError: a fit of a named objective, or data of a single group; one of several measurements, or part of it.
+        ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
     """
-    groups, data = require_groups(fit), fit.problem.data.used()
-    like = None if known is None else known.mixture(np.random.RandomState(seed), 2 * draws)
+    groups, data = require_groups(fit, options), fit.problem.data.used()
+    proposal = None if posterior is None else posterior.mixture(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
-    near = [fit.vector, *(np.array([one.values[name] for name in fit.problem.names]) for one in other_minima(fit))]
+    starts = [fit.vector, *(np.array([one.values[name] for name in fit.problem.names]) for one in other_minima(fit))]
     done = {} if done is None else done
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
-            progress("left out", number, len(groups), name)
+            progress("cross-validation", number, len(groups), name)
         if name not in done:
-            chosen = np.zeros(len(data), bool)
-            chosen[rows] = True
-            found = refit(without(fit.problem, chosen), *near)
-            seen = foretold(found, data, draws=draws, seed=seed, like=like).log_density(data.values)[rows]
-            done[name] = seen, found.converged
-        density[rows], good = done[name]
-        converged &= good
+            held_out = np.zeros(len(data), bool)
+            held_out[rows] = True
+            rest = refit(without(fit.problem, held_out), *starts)
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed, proposal=proposal)
+            done[name] = prediction.log_density(data.values)[rows], rest.converged
+        density[rows], group_converged = done[name]
+        converged &= group_converged
     if progress is not None:
-        progress("left out", len(groups), len(groups), "")
+        progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged)
 
 
-def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
-    """Rows of a fit's readings that are left out together, by name.
+def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
+    """Rows of a fit's measurements that are held out together, by name.
 
     Raises:
         ValueError: as `cross_validate`.
@@ -122,42 +122,39 @@ def require_groups(fit: Fit) -> dict[str, NDArray[np.int64]]:
     require_kind("fit", fit, Fit)
     if not fit.is_posterior:
         raise ValueError(
-            f"cross_validate: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings"
+            f"cross_validate: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements"
         )
     fit.require_alone("cross_validate")
     if fit.problem.problems.get("") is not fit.problem:
         raise ValueError("cross_validate: it takes a fit of one measurement by itself, not a joint one")
-    groups = groups_of(fit.problem.data.used())
+    groups = groups_of(fit.problem.data.used(), options)
     if len(groups) < 2:
-        raise ValueError("cross_validate: the readings are all of one incidence, and too few to leave some of them out")
+        raise ValueError("cross_validate: there is one incidence, and too few measurements to hold some of them out")
     return groups
 
 
-def groups_of(data: Measurements) -> dict[str, NDArray[np.int64]]:
-    """Rows that are left out together, by name."""
-    every = incidences(data)
-    if len(every) >= FEWEST_INCIDENCES:
-        return {one.label: one.rows for one in every}
-    pieces = [np.array_split(rows, STRETCHES) for rows in scans(data)]
-    stretches = [np.concatenate([piece[number] for piece in pieces]) for number in range(STRETCHES)] if pieces else []
-    return {f"stretch {number}": rows for number, rows in enumerate(stretches, 1) if rows.size}
+def groups_of(data: Measurements, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
+    """Rows that are held out together, by name."""
+    options = options or ComparisonOptions()
+    by_incidence = incidences(data)
+    if len(by_incidence) >= options.min_incidences:
+        return {one.label: one.rows for one in by_incidence}
+    parts = [np.array_split(rows, options.scan_parts) for rows in scans(data)]
+    together = [np.concatenate(same) for same in zip(*parts, strict=True)]
+    return {f"part {number} of each scan": rows for number, rows in enumerate(together, 1) if rows.size}
 
 
-ENORMOUS = 1e8
-"""Noise that leaves a reading without influence, in units of the largest one."""
+def without(problem: Problem, held_out: ArrayLike) -> Problem:
+    """The problem whose used samples `held_out`, (N,) bool, have no influence, as their noise is infinite.
 
-
-def without(problem: Problem, rows: ArrayLike) -> Problem:
-    """The problem, whose used samples in `rows` (N,) bool count for nothing: their noise is without bounds.
-
-    Residuals of these rows are 0; their number counts still.
+    Their residuals are 0; they still count as residuals.
     """
-    model, left = problem.model, jnp.asarray(rows)[:, None]
-    enormous = ENORMOUS * jnp.max(jnp.abs(model.values) + model.lowest)
+    model, rows = problem.model, jnp.asarray(held_out)[:, None]
+    infinite = INFINITE_NOISE * jnp.max(jnp.abs(model.values) + model.lowest)
     model = replace(
         model,
-        variance=jnp.where(left, enormous**2, model.variance),
-        lowest=jnp.where(left, enormous, model.lowest),
+        variance=jnp.where(rows, infinite**2, model.variance),
+        lowest=jnp.where(rows, infinite, model.lowest),
     )
     if model.process is not None and model.process.gram is not None:
         parts = model.build(jnp.asarray(problem.start))

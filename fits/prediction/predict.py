@@ -1,24 +1,33 @@
-"""What is measured elsewhere: the stack with its uncertainty, the model discrepancy, and the noise of a measurement."""
+"""Prediction: the BSDF of a fit and a new measurement of it, along other directions, with intervals and scores.
+
+For each of D draws of the posterior the stack has a value along every direction, the model discrepancy a mean and a
+standard deviation conditional on the fitted data, and a measurement independent noise. The posterior predictive is the
+mixture of these D distributions: Gaussian, or Student's t, of the BSDF or of its `logarithm`.
+"""
 
 import math
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.special import logsumexp
 
 import layerjax as lj
 from fits.data.geometry import Geometry, polar
 from fits.data.measurements import Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
-from fits.prediction.importance import UNRELIABLE, weighted
-from fits.prediction.prediction import Floats, Prediction, banded, require_level
+from fits.prediction.importance import MAX_PARETO_K, importance_draws
 from fits.problem.discrepancy.inducing_points import places
 from fits.problem.discrepancy.logarithm import logarithm, size
-from fits.problem.discrepancy.logarithm import softness as soft
+from fits.problem.discrepancy.logarithm import softness as softness_of
 from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
@@ -29,16 +38,227 @@ from layerjax.mixture import stacks_of
 if TYPE_CHECKING:
     from fits.sampling.mixture import Mixture
 
-LEAST_DRAWS = 400
-"""Of the approximation that draws of a posterior are chosen from."""
+LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+"""Quantiles that are computed by default: the ends of the central 50 % and 95 % intervals, and the median."""
+
+COVERAGES = (0.5, 0.95)
+"""Central intervals whose coverage is scored."""
 
 DRAWS = 256
-"""Vectors of parameters that a prediction is made with."""
+"""Draws of the posterior that a prediction is made with."""
 
-LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
+MIN_PROPOSALS = 400
+"""The fewest weighted draws that those of a fit's posterior are resampled from."""
+
+DRAWS_PER_VECTOR = 8
+"""Values that are drawn of the distribution of each draw of the posterior, for means and quantiles."""
+
+BISECTIONS = 50
+"""Halvings of the interval that a quantile of the mixture lies in."""
+
+SMALLEST_SD = 1e-12
+"""The least standard deviation of the discrepancy, where the data determine it: its distribution keeps a density."""
+
+Floats = NDArray[np.float64]
 
 
-class Mixed(Protocol):
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Mean and standard deviation of M values in C channels, (M, C), and quantiles, (levels, M, C), in 1/sr."""
+
+    mean: Floats
+    sd: Floats
+    quantiles: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Predicted BSDF at M pairs of directions in C channels.
+
+    Attributes:
+        wi, wo: directions, (M, 3).
+        channels: C names.
+        levels: levels of the quantiles.
+        values: the stack's own value for each of D draws of the posterior, (D, M, C), in 1/sr.
+        means, scales: location and scale of a measurement for each draw, (D, M, C), in 1/sr; with a discrepancy, of its
+            `logarithm`.
+        softness: softness of that logarithm, (M, C) or (D, M, C), in 1/sr; None where values themselves are meant.
+        discrepancy_sd: standard deviation of the discrepancy about `means`, (D, M, C), of the logarithm; None without a
+            discrepancy.
+        degrees_of_freedom: degrees of freedom of Student's t; infinite for a Gaussian.
+        seed: seed of the draws that `bsdf` and `predictive` summarise.
+        pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
+            `fits.evidence`); NaN for draws of a chain.
+        measurements: the measurements that were predicted; None for a `Geometry`.
+    """
+
+    wi: Floats
+    wo: Floats
+    channels: tuple[str, ...]
+    levels: tuple[float, ...]
+    values: Floats
+    means: Floats
+    scales: Floats
+    softness: Floats | None
+    discrepancy_sd: Floats | None
+    degrees_of_freedom: float
+    seed: int = 0
+    pareto_k: float = math.nan
+    measurements: Measurements | None = None
+
+    @property
+    def mean(self) -> Floats:
+        """Mean of the BSDF, (M, C), in 1/sr."""
+        return self.bsdf.mean
+
+    @property
+    def sd(self) -> Floats:
+        """Standard deviation of the BSDF, (M, C), in 1/sr."""
+        return self.bsdf.sd
+
+    @cached_property
+    def latent(self) -> Summary:
+        """The stack alone, without the discrepancy."""
+        return self._summary(self.values)
+
+    @property
+    def bsdf(self) -> Summary:
+        """The BSDF: the stack's value with the model discrepancy. This is the best estimate."""
+        return self._summaries[0]
+
+    @property
+    def predictive(self) -> Summary:
+        """A new measurement: the BSDF with noise (posterior predictive)."""
+        return self._summaries[1]
+
+    @cached_property
+    def _summaries(self) -> tuple[Summary, Summary]:
+        generator, shape = np.random.default_rng(self.seed), (DRAWS_PER_VECTOR, *self.means.shape)
+        gaussian = math.isinf(self.degrees_of_freedom)
+        noise = generator.standard_normal(shape) if gaussian else generator.standard_t(self.degrees_of_freedom, shape)
+        predictive = self._summary(self._inverse(self.means + self.scales * noise))
+        if self.discrepancy_sd is None:
+            return self.latent, predictive
+        bsdf = self.means + self.discrepancy_sd * generator.standard_normal(shape)
+        return self._summary(self._inverse(bsdf)), predictive
+
+    def _summary(self, values: Floats) -> Summary:
+        values = values.reshape(-1, *values.shape[-2:])
+        return Summary(values.mean(axis=0), values.std(axis=0), np.quantile(values, self.levels, axis=0))
+
+    def quantile(self, level: float) -> Floats:
+        """Quantile of the BSDF, (M, C), in 1/sr; level in (0, 1)."""
+        require_level(level)
+        if self.discrepancy_sd is None:
+            return np.quantile(self.values, level, axis=0)
+        return self._mixture_quantile(level, np.maximum(self.discrepancy_sd, SMALLEST_SD), stats.norm())
+
+    def predictive_quantile(self, level: float) -> Floats:
+        """Quantile of a new measurement, (M, C), in 1/sr; level in (0, 1)."""
+        require_level(level)
+        return self._mixture_quantile(level, self.scales, self._noise)
+
+    def _mixture_quantile(self, level: float, scales: Floats, distribution: "stats.rv_frozen") -> Floats:
+        quantiles = self._inverse(self.means + scales * distribution.ppf(level))
+        low, high = quantiles.min(axis=0), quantiles.max(axis=0)  # a mixture's lies between those of its components
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            is_low = distribution.cdf(self._standardised(middle, scales)).mean(axis=0) < level
+            low, high = np.where(is_low, middle, low), np.where(is_low, high, middle)
+        return 0.5 * (low + high)
+
+    @property
+    def scores(self) -> "Scores":
+        """Scores of the predicted measurements. ValueError if a `Geometry` was predicted."""
+        if self.measurements is None:
+            raise ValueError("scores: a Geometry was predicted; predict Measurements to score them")
+        return scores(self, self.measurements)
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the draws represent the whole posterior; otherwise sample it by a chain."""
+        return not self.pareto_k >= MAX_PARETO_K
+
+    def log_density(self, values: Floats) -> Floats:
+        """Log predictive density of each of the measured `values`, (M, C)."""
+        density = self._noise.logpdf(self._standardised(values, self.scales)) - np.log(self.scales)
+        if self.softness is not None:
+            density = density - np.log(np.asarray(size(values, self.softness)))
+        return logsumexp(density, axis=0) - math.log(len(density))
+
+    def cdf(self, values: Floats) -> Floats:
+        """Predictive probability of a measurement below each of `values`, (M, C)."""
+        return self._noise.cdf(self._standardised(values, self.scales)).mean(axis=0)
+
+    @property
+    def median(self) -> Floats:
+        """Median prediction of a measurement over the draws, (M, C), in 1/sr."""
+        return np.median(self._inverse(self.means), axis=0)
+
+    def _standardised(self, values: Floats, scales: Floats) -> Floats:
+        transformed = values if self.softness is None else np.asarray(logarithm(values, self.softness))
+        return (transformed - self.means) / scales
+
+    def _inverse(self, transformed: Floats) -> Floats:
+        return transformed if self.softness is None else self.softness * np.sinh(transformed)
+
+    @property
+    def _noise(self) -> "stats.rv_frozen":
+        return stats.norm() if math.isinf(self.degrees_of_freedom) else stats.t(self.degrees_of_freedom)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of predicted measurements.
+
+    count: measurements times channels. median_error, p95_error: median and 95th percentile of
+    |prediction / measurement - 1|, the prediction being the median; model_error: the median for the stack's own value.
+    coverage: share of measurements in the central 50 % and 95 % intervals. elpd: mean log predictive density of a
+    measurement.
+    """
+
+    count: int
+    median_error: float
+    p95_error: float
+    model_error: float
+    coverage: Mapping[float, float]
+    elpd: float
+
+
+def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.bool_] | None = None) -> Scores:
+    """Score the used measurements, at the predicted directions; only those in `rows`, (M,), if given.
+
+    Raises:
+        ValueError: no measurement to score, or other directions than those that were predicted.
+    """
+    used = measurements.used()
+    if used.wi.shape != prediction.wi.shape or not np.allclose(used.wo, prediction.wo) & np.allclose(
+        used.wi, prediction.wi
+    ):
+        raise ValueError("scores: the measurements have other directions than the prediction")
+    chosen = np.ones(len(used), bool) if rows is None else rows
+    if not chosen.any():
+        raise ValueError("scores: there is no measurement to score")
+    values, rank = used.values[chosen], prediction.cdf(used.values)[chosen]
+    magnitude = np.maximum(np.abs(values), np.finfo(float).tiny)
+    predicted = (prediction.median[chosen], prediction.latent.mean[chosen])
+    error, model_error = (np.abs(one - values) / magnitude for one in predicted)
+    return Scores(
+        count=values.size,
+        median_error=float(np.median(error)),
+        p95_error=float(np.quantile(error, 0.95)),
+        model_error=float(np.median(model_error)),
+        coverage={level: float(np.mean(np.abs(2.0 * rank - 1.0) < level)) for level in COVERAGES},
+        elpd=float(np.mean(prediction.log_density(used.values)[chosen])),
+    )
+
+
+def require_level(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level is {level}; it must be in (0, 1)")
+
+
+class Predictor(Protocol):
     """Several fits that predict as one: see `fits.average`."""
 
     def predict(
@@ -47,82 +267,89 @@ class Mixed(Protocol):
 
 
 def predict(
-    of: Fit | Posterior | Mixed,
+    fitted: Fit | Posterior | Predictor,
     at: Geometry | Measurements,
     *,
     levels: tuple[float, ...] = LEVELS,
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Prediction:
-    """The BSDF that the fit expects elsewhere, and what a new measurement of it would give.
+    """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        of: a posterior, or a fit, of whose posterior draws are made by weights (see `fits.prediction.importance`); or
-            an average of some.
-        at: pairs of directions, above, or below a stack that light passes; of `Measurements` their used samples, with
-            their own sigma.
-        levels: of the quantiles, in (0, 1).
-        draws: vectors of parameters, at least 2.
-        seed: of these, and of the noise.
+        fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`); or an average.
+        at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
+            their used samples, with their own sigma.
+        levels: levels of the quantiles, in (0, 1).
+        draws: draws of the posterior, at least 2.
+        seed: random seed of draws and noise.
 
-    Readings whose sigma is not known have the median sigma of those that were fitted, relative to the model.
+    Measurements whose sigma is not known have the median sigma of the fitted ones, relative to the model.
 
     Raises:
-        ValueError: a level or number of draws out of range, a fit of a named objective, readings in other channels,
-            directions below an opaque stack, or such that the transport cannot answer.
+        ValueError: a level or number of draws out of range, a fit of a named objective, measurements in other channels,
+            directions below an opaque stack, or directions that the transport does not support.
     """
     for level in levels:
         require_level(level)
     if draws < 2:
         raise ValueError(f"draws is {draws}; it must be at least 2")
     require_kind("at", at, Geometry, Measurements)
-    if not isinstance(of, Fit | Posterior):
-        if isinstance(of, type) or not hasattr(of, "predict"):
-            raise ValueError(f"of: {in_short(of)} is not a Fit, a Posterior or an Average")
-        return of.predict(at, levels=levels, draws=draws, seed=seed)
-    return foretold(of, at, levels=levels, draws=draws, seed=seed)
+    if not isinstance(fitted, Fit | Posterior):
+        if isinstance(fitted, type) or not hasattr(fitted, "predict"):
+            raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")
+        return fitted.predict(at, levels=levels, draws=draws, seed=seed)
+    return posterior_predictive(fitted, at, levels=levels, draws=draws, seed=seed)
 
 
-def foretold(
-    of: Fit | Posterior,
+def posterior_predictive(
+    fitted: Fit | Posterior,
     at: Geometry | Measurements,
     *,
     draws: int,
     seed: int,
     levels: tuple[float, ...] = LEVELS,
-    like: "Mixture | None" = None,
+    proposal: "Mixture | None" = None,
 ) -> Prediction:
-    """`predict`, by an approximation of a posterior that the fit's is like, where there is one (see `weighted`)."""
-    fit = of.fit if isinstance(of, Posterior) else of
+    """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
+    fit = fitted.fit if isinstance(fitted, Posterior) else fitted
     if not fit.is_posterior:
-        raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model, it says nothing of readings")
-    generator = np.random.default_rng(seed)
-    data = _measurements(fit, at)
-    vectors, pareto_k = _vectors(of, draws, generator, like)
+        raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements")
+    data, channels, noise = _measurements(fit, at), fit.problem.data.channels, fit.problem.noise
+    vectors, pareto_k = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
-    values = np.broadcast_to(values, (*values.shape[:2], len(fit.problem.data.channels)))
-    sigma = _own_sigma(fit, values, data.sigma)
-    parts = _readings(fit, vectors, values, data, sigma)
-    noise = fit.problem.noise
-    freedom = noise.degrees_of_freedom if noise.tails == "student" else math.inf
-    found = banded(data.wi, data.wo, fit.problem.data.channels, levels, values, *parts, freedom, seed)
-    return replace(found, pareto_k=pareto_k, readings=at.used() if isinstance(at, Measurements) else None)
+    values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
+    means, scales, softness, discrepancy_sd = _mixture(fit, vectors, values, data)
+    return Prediction(
+        wi=data.wi,
+        wo=data.wo,
+        channels=channels,
+        levels=levels,
+        values=values,
+        means=means,
+        scales=scales,
+        softness=softness,
+        discrepancy_sd=discrepancy_sd,
+        degrees_of_freedom=noise.degrees_of_freedom if noise.tails == "student" else math.inf,
+        seed=seed,
+        pareto_k=pareto_k,
+        measurements=at.used() if isinstance(at, Measurements) else None,
+    )
 
 
 def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
     if isinstance(fit.problem.data, Totals) or isinstance(at, Totals):
-        raise ValueError("predict: totals are not predicted; it takes a fit of values along directions, and such")
+        raise ValueError("predict: Totals are not predicted; it takes a fit of BSDF values, and directions")
+    channels = fit.problem.data.channels
     if isinstance(at, Measurements):
-        if len(at.channels) != len(fit.problem.data.channels):
+        if len(at.channels) != len(channels):
             raise ValueError(
-                f"predict: the readings have the channels {', '.join(at.channels)}, "
-                f"the fit {', '.join(fit.problem.data.channels)}"
+                f"predict: the measurements have the channels {', '.join(at.channels)}, the fit {', '.join(channels)}"
             )
         return at.used()
     _require_visible(fit, at)
-    count, channels = len(at), fit.problem.data.channels
-    nothing = np.zeros((count, len(channels)))
-    return Measurements(at.wi, at.wo, nothing, None, np.ones(count, bool), channels, Source("", "memory"))
+    values = np.zeros((len(at), len(channels)))
+    return Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels, Source("", "memory"))
 
 
 def _require_visible(fit: Fit, at: Geometry) -> None:
@@ -139,38 +366,61 @@ def _require_visible(fit: Fit, at: Geometry) -> None:
             )
 
 
-def _vectors(
-    of: Fit | Posterior, draws: int, generator: np.random.Generator, like: "Mixture | None" = None
+def _posterior_draws(
+    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Mixture | None" = None
 ) -> tuple[Floats, float]:
-    """Draws (D, P) of the posterior, and the shape of their weights."""
-    if isinstance(of, Fit) and of.within is not None and of.dataset is not None:
-        vectors, shape = _vectors(of.within, draws, generator)  # what others say of its parameters counts too
-        return vectors[:, list(of.within.problem.places(of.dataset))], shape
-    if isinstance(of, Posterior):
-        return generator.choice(of.samples, draws, axis=0, replace=len(of.samples) < draws), math.nan
+    """Draws (D, P) of the posterior, and the Pareto k of their weights."""
+    if isinstance(fitted, Fit) and fitted.within is not None and fitted.dataset is not None:
+        # the other data sets of a joint fit constrain the parameters as well
+        vectors, pareto_k = _posterior_draws(fitted.within, draws, generator)
+        return vectors[:, list(fitted.within.problem.places(fitted.dataset))], pareto_k
+    if isinstance(fitted, Posterior):
+        return generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws), math.nan
     random = np.random.RandomState(generator.integers(2**31))
-    found = weighted(of, max(LEAST_DRAWS, 2 * draws), random, good=UNRELIABLE, like=like)
-    positions = jnp.asarray(found.resampled(random, draws))
-    return np.asarray(jax.vmap(of.problem.model.box.constrain)(positions), float), found.shape
+    weighted = importance_draws(
+        fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
+    )
+    positions = jnp.asarray(weighted.resample(random, draws))
+    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(positions), float), weighted.pareto_k
+
+
+def _mixture(
+    fit: Fit, vectors: Floats, values: Floats, data: Measurements
+) -> tuple[Floats, Floats, Floats | None, Floats | None]:
+    """Means, scales, softness and standard deviations of the discrepancy (see `Prediction`), where draws `vectors` of
+    the posterior have these values of the stack, (D, M, C)."""
+    sigma = _stated_sigma(fit, values, data.sigma)
+    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_noise_levels, vectors))
+    relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
+    if fit.problem.model.process is None:
+        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
+    conditional = fit.problem.call(_discrepancy_at, vectors, places(data.wi, data.wo))
+    discrepancy, discrepancy_sd = (np.asarray(part) for part in conditional)
+    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
+    means = np.asarray(logarithm(values, softness)) + discrepancy
+    bsdf = softness * np.sinh(means)
+    noise = np.sqrt(sigma**2 + (relative * bsdf) ** 2 + floor**2) / np.asarray(size(bsdf, softness))
+    return means, np.hypot(discrepancy_sd, noise), softness, discrepancy_sd
 
 
 def with_discrepancy(fit: Fit, wi: Floats, wo: Floats, values: Floats) -> Floats:
     """The BSDF of the best fit along other directions, (M, 3) each, where the stack alone has these values, (M, C)."""
     if fit.problem.model.process is None:
         return values
-    _, floor = (np.asarray(part, float) for part in fit.problem.call(_levels, fit.vector[None]))
-    softness = _softness(fit, np.hypot(_own_sigma(fit, values[None], None), floor))
-    lack = np.asarray(fit.problem.call(Model.discrepancy_at, fit.vector, fit.predicted, places(wi, wo))[0])
-    return softness * np.sinh(np.asarray(logarithm(values, softness)) + lack)
+    _, floor = (np.asarray(part, float) for part in fit.problem.call(_noise_levels, fit.vector[None]))
+    softness = _softness(fit, np.hypot(_stated_sigma(fit, values[None], None), floor))
+    discrepancy = np.asarray(fit.problem.call(Model.discrepancy_at, fit.vector, fit.predicted, places(wi, wo))[0])
+    return softness * np.sinh(np.asarray(logarithm(values, softness)) + discrepancy)
 
 
 def _softness(fit: Fit, additive: Floats) -> Floats:
     typical = np.full(additive.shape, np.median(np.abs(fit.problem.data.used().values)))
-    return soft(typical, additive)
+    return softness_of(typical, additive)
 
 
-def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
-    """The measurement's own, (M, C), where it has one; that of what was fitted, relative to the model, elsewhere."""
+def _stated_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
+    """The measurements' stated sigma, (M, C), if there is one; otherwise that of the fitted data, relative to
+    the model."""
     used = fit.problem.data.used()
     if used.sigma is None or not fit.problem.noise.use_sigma:
         return np.zeros(values.shape[1:])
@@ -180,24 +430,7 @@ def _own_sigma(fit: Fit, values: Floats, sigma: Floats | None) -> Floats:
     return relative * np.median(np.abs(values), axis=0)
 
 
-def _readings(
-    fit: Fit, vectors: Floats, values: Floats, data: Measurements, sigma: Floats
-) -> tuple[Floats, Floats, Floats | None, Floats | None]:
-    """Means, scales, softness and what is unknown of the discrepancy (see `Prediction`), with these values of the
-    model, (D, M, C)."""
-    relative, floor = (np.asarray(part, float)[:, None, None] for part in fit.problem.call(_levels, vectors))
-    relative = np.hypot(relative, gain_unknown(fit.problem.instrument, data.wi, polar_angles(fit.problem.data)))
-    if fit.problem.model.process is None:
-        return values, np.sqrt(sigma**2 + (relative * values) ** 2 + floor**2), None, None
-    lack, unknown = (np.asarray(part) for part in fit.problem.call(_lack_at, vectors, places(data.wi, data.wo)))
-    softness = _softness(fit, np.hypot(sigma, np.median(floor)))
-    means = np.asarray(logarithm(values, softness)) + lack
-    corrected = softness * np.sinh(means)
-    noise = np.sqrt(sigma**2 + (relative * corrected) ** 2 + floor**2) / np.asarray(size(corrected, softness))
-    return means, np.hypot(unknown, noise), softness, unknown
-
-
-def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
+def _noise_levels(model: Model, vectors: Array) -> tuple[Array, Array]:
     def one(vector: Array) -> tuple[Array, Array]:
         parts = model.build(vector)
         return parts.relative, parts.floor
@@ -205,5 +438,5 @@ def _levels(model: Model, vectors: Array) -> tuple[Array, Array]:
     return jax.vmap(one)(vectors)
 
 
-def _lack_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
+def _discrepancy_at(model: Model, vectors: Array, where: Array) -> tuple[Array, Array]:
     return jax.lax.map(lambda vector: model.discrepancy_at(vector, model.predict(vector), where), vectors)

@@ -65,7 +65,7 @@ class Totalling(eqx.Module):
         above, below = slice(-2 * DIFFUSE, -DIFFUSE), slice(-DIFFUSE, None)
         mean = [jnp.tensordot(share, part[side], 1) for part in (near, far) for side in (above, below)]
         count = len(self.asked)
-        return self.spheres.readings(Shares(near[:count], far[:count], *mean))
+        return self.spheres.measured(Shares(near[:count], far[:count], *mean))
 
 
 def _both(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) -> tuple[Array, Array]:

@@ -151,7 +151,7 @@ def _repeats(found: Agreement | None) -> str:
 
 
 def _difference(found: Agreement) -> str:
-    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.most:.2g} %)"
+    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.p95:.2g} %)"
     return words if math.isnan(found.z) else f"{words}, {found.z:.2g} of their standard errors"
 
 
@@ -178,11 +178,11 @@ def _sampling(found: list[Peak], options: ReportOptions) -> str:
             f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
             "to half of the brightest one."
         )
-    worst = min((one for one in found if one.stands_out), key=lambda one: one.readings)
+    worst = min((one for one in found if one.stands_out), key=lambda one: one.count)
     words = (
-        f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.readings} or "
+        f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.count} or "
         f"more (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
     )
-    if worst.readings < options.peak_points:
+    if worst.count < options.peak_points:
         return f"{words}: the peak may be narrower than the steps, which then limit a fitted roughness."
     return f"{words}: its width is sampled."

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.data.neighbours import alike, neighbours
+from fits.data.neighbours import correlation, neighbours
 from fits.data.scans import incidences
 from fits.problem.model import Density
 
@@ -124,7 +124,7 @@ def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualS
         if values.size:
             groups.append(ResidualGroup(incidence.theta, values.size, float(values.mean()), _rms(values)))
     first, second = neighbours(data, residuals)
-    lag_one = alike(first, second)
+    lag_one = correlation(first, second)
     return ResidualStructure(
         count=finite.size,
         mean=float(finite.mean()),

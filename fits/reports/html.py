@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from fits.optimise.result import Fit
     from fits.prediction.compare import Comparison
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 Results = Mapping[str, "Fit | Posterior"]

@@ -16,7 +16,7 @@ from fits.data.scans import incidences
 from fits.data.totals import Totals
 from fits.optimise.limits import instrument_limits
 from fits.optimise.result import OUTCOMES
-from fits.prediction.prediction import scores
+from fits.prediction.predict import scores
 from fits.reports.diagnostics import ResidualStructure
 from fits.reports.verdicts import identifiability, numerical_error
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from rich.table import Table as Boxed
 
     from fits.optimise.result import Fit
-    from fits.prediction.compare import Comparison, Row
+    from fits.prediction.compare import ComparedFit, Comparison
     from fits.prediction.model_scores import ModelScore
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 
@@ -290,14 +290,14 @@ def incidence_table(structure: ResidualStructure) -> Table:
     )
 
 
-_ORDERS = {"left_out": "cross-validated elpd", "loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}
+_ORDERS = {"elpd": "cross-validated elpd", "loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}
 
 
 def comparison_table(comparison: "Comparison") -> Table:
     """One row per fit, the best first: goodness of fit, number of parameters, and predictive score."""
     compared = comparison.rows
     aic, bic = min(row.aic for row in compared), min(row.bic for row in compared)
-    columns: list[tuple[str, Callable[[Row], str]]] = [
+    columns: list[tuple[str, Callable[[ComparedFit], str]]] = [
         ("fit", lambda row: row.name),
         ("parameters", lambda row: str(row.parameters)),
         ("chi2/dof", lambda row: f"{row.reduced_chi_square:.4g}"),
@@ -329,7 +329,7 @@ def comparison_table(comparison: "Comparison") -> Table:
     return Table("Comparison", tuple(head for head, _ in columns), rows, note)
 
 
-def _score(row: "Row") -> "ModelScore":
+def _score(row: "ComparedFit") -> "ModelScore":
     assert row.model_score is not None
     return row.model_score
 

@@ -42,7 +42,7 @@ class Parallels(NamedTuple):
 
     sine, cosine: of theta_d less theta. facing, across: cosine and sine of theta_d. squeeze: of tan(psi/2), for the
     density of normals; end: of what is squeezed, where the normal, or the light mirrored at it, reaches the horizon;
-    start: where refracted light comes above it (None: 0, not told).
+    start: where refracted light comes above it (None: 0, of reflected light).
     level: the density of normals (vMF: 1) times the visible area, without what psi changes.
     """
 
@@ -99,7 +99,7 @@ def parallels(
         last = VMF_REACH / jnp.sqrt(1.0 + 2.0 * vmf.concentration(alpha) * swing)
         end = at_most(end, 0.5 * last * (1.0 + last * last))
     start = None
-    if distribution == "vmf" and way == "refracted":
+    if way == "refracted":
         total = ratio < 1.0  # else all of the light comes through
         n = jnp.where(total, ratio, 0.5)
         # of normals, mz at most: mu / (c - n cos(theta_t)), without the difference
@@ -159,8 +159,7 @@ def polar_angles(
 ) -> tuple[Array, Array]:
     """theta_d - theta and its measure, (nodes, panels * points).
 
-    ratio: index on the far side over that on the side of w. points: a panel; there are three, for GGX normals and
-    "refracted" two.
+    ratio: index on the far side over that on the side of w. points: a panel; there are three.
     """
     theta = jnp.arctan2(sine, cosine)[:, None]
     total = ratio < 1.0  # reflection beyond the critical angle
@@ -171,11 +170,10 @@ def polar_angles(
         inner = at_most(critical, end)
     else:
         cut, end = quarter - theta, at_most(critical, quarter) * jnp.ones_like(theta)
-        inner = _grazing(cosine, sine, ratio, end) if distribution == "vmf" else end
+        inner = _grazing(cosine, sine, ratio, end)
     cut = at_most(cut, end)
     low, high = jnp.where(cut < inner, cut, inner), jnp.where(cut < inner, inner, cut)
-    two = way == "refracted" and distribution == "ggx"
-    edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end][: 3 if two else 4], axis=1)
+    edges = jnp.concatenate([jnp.zeros_like(theta), low, high, end], axis=1)
     places = _place((edges - theta) / alpha, distribution)
     first, width = places[:, :-1, None], (places[:, 1:] - places[:, :-1])[..., None]
     x, w = (jnp.asarray(array, theta.dtype) for array in gauss_legendre(points))

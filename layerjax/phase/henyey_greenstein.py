@@ -10,8 +10,8 @@ from layerjax.directions import Vector, add, combine, dot
 from layerjax.phase.contract import PhaseFunction, deflected
 from layerjax.quadrature import Rule, henyey_greenstein_inverse, henyey_greenstein_rule
 
-ASSUMED_PEAK = 0.9
-"""|g| of a peak on either side, where nothing is known while tracing."""
+ASSUMED_FORWARD, ASSUMED_BACKWARD = 0.9, 0.75
+"""|g| of a peak on either side, where nothing is known while tracing; materials rarely have the second."""
 
 
 class HenyeyGreenstein(PhaseFunction):
@@ -66,6 +66,6 @@ class HenyeyGreenstein(PhaseFunction):
 
 def _width(g: Parameter, side: float) -> Parameter:
     """Of the peak on the side that the sign tells: where p has fallen to about a third."""
-    values = known_values(g)
-    peaked = np.maximum(ASSUMED_PEAK if values is None else side * values, 1e-9)
+    values, assumed = known_values(g), ASSUMED_FORWARD if side > 0.0 else ASSUMED_BACKWARD
+    peaked = np.maximum(assumed if values is None else side * values, 1e-9)
     return np.minimum((1.0 - peaked) / np.sqrt(peaked), 1.0)

@@ -7,7 +7,7 @@ from scipy import stats
 import layerjax as lj
 from benchmarks.suite import maps
 from benchmarks.suite.maps import NAMES, ROUGHNESS, THICKNESS, Painted, emblem, painted
-from fits.maps.inputs import readings
+from fits.maps.inputs import map_data
 from fits.problem.parameters import split
 
 SHAPE = (13, 11)
@@ -23,7 +23,7 @@ def flakes() -> Painted:
 
 def test_readings_are_those_of_the_truth(flakes: Painted) -> None:
     assert flakes.values.shape == (*SHAPE, 64, 1)
-    found = readings(flakes.values, flakes.geometry)
+    found = map_data(flakes.values, flakes.geometry)
     assert (found.shape, found.samples, found.channels) == (SHAPE, 64, 1)
     exact = painted(SHAPE, lj.SingleScattering(), material="flakes", noise=0.0)
     for place in ((0, 0), (6, 5), (12, 10)):

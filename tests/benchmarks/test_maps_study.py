@@ -92,7 +92,7 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
         "a chunk of 64 texels beside its solution",
         "memory of a worker",
         "a million texels",
-        "the sample",
+        "the pilot",
     }
     assert [engine["tasks"] for engine in content["engines"]] == [8, 8]
     assert "left out" in text

@@ -242,6 +242,9 @@ def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> lis
 
     def compare(key: str, old: Any, new: Any, tolerance: float, unit: Any = None) -> None:
         if isinstance(old, dict):
+            if sorted(old) != sorted(new):
+                said.append(f"{name}: {key}: of {sorted(new)}, was of {sorted(old)}")
+                return
             for one in old:
                 compare(f"{key} of {one}", old[one], new[one], tolerance, None if unit is None else unit[one])
             return

@@ -20,7 +20,7 @@ FUNCTIONS = {
     "Problem": {"stack": STACK, "data": DATA, "transport": "auto", "noise": fits.Noise(), "instrument": None},
     "search": {"data": DATA, "library": None, "noise": None},
     "simulate": {"stack": PLAIN, "geometry": VIEW, "transport": "auto", "noise": 0.1, "floor": 0.1},
-    "predict": {"of": FIT, "at": VIEW},
+    "predict": {"fitted": FIT, "at": VIEW},
     "sample": {"fit": FIT},
     "cross_validate": {"fit": FIT},
     "evidence": {"fit": FIT},
@@ -31,7 +31,14 @@ FUNCTIONS = {
     "report": {"fit": FIT},
     "slices": {"incidence": 10.0, "outgoing": 10.0, "azimuth": 0.0},
     "Noise": {"relative": 0.1, "floor": 0.1, "degrees_of_freedom": 4.0},
-    "Free": {"start": 0.5, "low": 0.0, "high": 1.0, "prior": None, "smooth": None, "shared": False},
+    "Free": {
+        "start": 0.5,
+        "low": 0.0,
+        "high": 1.0,
+        "prior": None,
+        "random_walk_sd": None,
+        "same_for_all_texels": False,
+    },
 }
 
 MORE = {"save_fit": {"directory": "there"}, "export": {"path": "there.csv", "to": "csv"}, "report": {"path": "there"}}

@@ -1,4 +1,4 @@
-"""A small map of random readings, and files that hold arrays."""
+"""A small map of random values, and files that hold arrays."""
 
 from pathlib import Path
 from typing import Any

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from fits.maps.fitted_map import FittedMap, open_map
-from fits.maps.store import FLAGS, NO_START, create, left, write_chunk
+from fits.maps.store import FLAGS, NO_START, blocks_of, create
 
 NAMES = ("layers[0].thickness", "layers[0].phase.alpha", "base.albedo")
 UNITS = dict(zip(NAMES, ("optical depth", "1", "1"), strict=True))
 FREEDOM = 61
-"""Degrees of freedom: 64 readings less the parameters."""
+"""Degrees of freedom: 64 measurements less the parameters."""
 
 GOOD = FLAGS["fitted"] | FLAGS["converged"]
 ATTRIBUTES = {
@@ -20,9 +20,9 @@ ATTRIBUTES = {
     "noise": "Noise(relative=0.02)",
     "samples": 64,
     "channels": ["value"],
-    "shared": {"layers[0].f0": {"value": 0.04321, "error": 0.00012, "unit": "1", "converged": True}},
+    "common": {"layers[0].f0": {"value": 0.04321, "error": 0.00012, "unit": "1", "converged": True}},
     "pilot": {"texels": 64, "reduced_chi_square": 1.01, "poor_above": 1.6},
-    "settings": {"starts": 8, "seed": 0},
+    "options": {"starts": 8, "seed": 0},
     "numerical": {},
 }
 
@@ -42,7 +42,7 @@ def numbers(shape: tuple[int, ...], numerical: bool = False, seed: int = 0) -> d
         "reduced_chi_square": rng.chisquare(FREEDOM, shape) / FREEDOM,
         "start": rng.integers(-1, 4, shape).astype(np.int16),
         "at_bound": np.zeros(shape, np.uint32),
-        "readings": np.full(shape, 64, np.uint32),
+        "measurements": np.full(shape, 64, np.uint32),
         "flags": np.full(shape, GOOD, np.uint16),
     }
     return found | ({"numerical_error": 0.02 + 0.01 * rng.random(shape)} if numerical else {})
@@ -53,7 +53,7 @@ def without(found: dict[str, np.ndarray], where: np.ndarray, flag: str) -> None:
     for values in found.values():
         if values.dtype.kind == "f":
             values[where] = np.nan
-    found["start"][where], found["readings"][where], found["flags"][where] = NO_START, 0, FLAGS[flag]
+    found["start"][where], found["measurements"][where], found["flags"][where] = NO_START, 0, FLAGS[flag]
 
 
 def bounded(found: dict[str, np.ndarray], where: np.ndarray, place: int) -> None:
@@ -68,16 +68,15 @@ def stored(
 ) -> FittedMap:
     """A store of these arrays, of which the first `chunks` chunks are written; more: attributes."""
     shape = found["flags"].shape
-    attributes = ATTRIBUTES | more
-    group = create(
+    store = create(
         path,
         names=NAMES,
         units=UNITS,
         shape=shape,
-        chunk=chunk,
-        attributes=attributes,
+        chunk=tuple(map(min, chunk, shape)),
+        attributes=ATTRIBUTES | more,
         numerical="numerical_error" in found,
     )
-    for block in left(group)[:chunks]:
-        write_chunk(group, block, {name: values[block] for name, values in found.items()})
+    for block in list(blocks_of(shape, store.chunk))[:chunks]:
+        store.write(block, {name: values[block] for name, values in found.items()})
     return open_map(path)

@@ -1,5 +1,6 @@
 """A small map of a coat over a diffuse base that is fitted in no time, in memory and as the files of a user."""
 
+from dataclasses import fields
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
 from fits.maps.fitted_map import FittedMap
+from fits.maps.options import MapOptions
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
 NAMES = ("layers[0].thickness", "base.albedo")
@@ -23,7 +25,7 @@ phase = { kind = "HenyeyGreenstein", g = 0.3 }
 kind = "Lambertian"
 albedo = { start = 0.4, low = 0.0, high = 1.0 }
 """
-OPTIONS = {"--noise": "0.02", "--chunk": "16", "--sample": "8", "--starts": "2"}
+OPTIONS = {"--noise": "0.02", "--chunk-size": "16", "--pilot-texels": "8", "--starts": "2"}
 
 
 def coat(thickness, albedo):
@@ -46,21 +48,28 @@ def truth(shape: tuple[int, ...]) -> np.ndarray:
     return np.stack([0.2 + 0.8 * along, 0.8 - 0.6 * along], axis=-1)
 
 
-def values(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
-    """Readings with noise, (..., 16, 1)."""
-    view = geometry()
+def seen(numbers: np.ndarray, view: Geometry, seed: int = 0) -> np.ndarray:
+    """Values with noise of texels with these numbers (..., 2): (..., N, 1)."""
 
-    def one(numbers):
-        return lj.evaluate(coat(*numbers), jnp.asarray(view.wi), jnp.asarray(view.wo), transport=TRANSPORT)
+    def one(pair):
+        return lj.evaluate(coat(*pair), jnp.asarray(view.wi), jnp.asarray(view.wo), transport=TRANSPORT)
 
-    exact = np.asarray(jax.jit(jax.vmap(one))(truth(shape).reshape(-1, 2))).reshape(*shape, -1, 1)
+    exact = np.asarray(jax.jit(jax.vmap(one))(numbers.reshape(-1, 2))).reshape(*numbers.shape[:-1], -1, 1)
     return exact * (1.0 + NOISE.relative * np.random.default_rng(seed).standard_normal(exact.shape))
 
 
-def fitted(out: Path, given: np.ndarray, **options) -> FittedMap:
-    """The map of readings, from a sample of eight in chunks of 16."""
-    usual = {"noise": NOISE, "transport": TRANSPORT, "chunk": 16, "sample": 8, "starts": 2}
-    return fits.fit_map(FREE, geometry(), given, out, **usual | options)
+def values(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    """Values of the whole map with noise, (..., 16, 1)."""
+    return seen(truth(shape), geometry(), seed)
+
+
+def fitted(out: Path, given: np.ndarray, stack=FREE, view=None, **options) -> FittedMap:
+    """The map of values, from a pilot of eight in chunks of 16; options: of `fits.fit_map` or of its `MapOptions`."""
+    names = {one.name for one in fields(MapOptions)}
+    arguments = {"noise": NOISE, "transport": TRANSPORT} | {k: v for k, v in options.items() if k not in names}
+    chosen = {"chunk_size": 16, "pilot_texels": 8, "starts": 2} | {k: v for k, v in options.items() if k in names}
+    view = geometry() if view is None else view
+    return fits.fit_map(stack, view, given, out, options=MapOptions(**chosen), **arguments)
 
 
 def write_files(folder: Path, shape: tuple[int, ...]) -> None:

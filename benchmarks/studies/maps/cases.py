@@ -8,18 +8,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import zarr
 from numpy.typing import NDArray
 
 import fits
 import layerjax as lj
 from benchmarks.measuring.writing import Bar
 from benchmarks.suite.maps import Material, painted
-from fits.maps.chunk_files import block_at, grid
-from fits.maps.fit_map import tile
-from fits.maps.inputs import readings
-from fits.maps.job import Job, Task
-from fits.maps.prepared import load
+from fits.maps.chunk import Job, Task
+from fits.maps.inputs import map_data
+from fits.maps.options import MapOptions
+from fits.maps.pilot import load
+from fits.maps.store import Store, blocks_of
 
 Floats = NDArray[np.float64]
 
@@ -43,13 +42,13 @@ class Case:
 CASES = (
     Case("flakes on a diffuse base, `SingleScattering`", "flakes", lj.SingleScattering(), bar=Bar(15, 40, rate=True)),
     Case("coat over metal, `Statistical`", "metal", lj.Statistical(), bar=Bar(10, 30, rate=True)),
-    Case("coat over diffuse, `AddingDoubling` in a table", "coat", "auto", rate=Bar(200, 1000, rate=True)),
+    Case("coat over diffuse, `AddingDoubling` by an emulator", "coat", "auto", rate=Bar(200, 1000, rate=True)),
 )
 
 
 @dataclass(frozen=True)
 class Given:
-    """A map whose readings are in a file, and where its store is to be. truth: of each parameter, (H, W)."""
+    """A map whose measurements are in a file, and where its store is to be. truth: of each parameter, (H, W)."""
 
     stack: lj.Stack
     geometry: fits.Geometry
@@ -77,7 +76,7 @@ def stored(
     values: Floats,
     truth: Mapping[str, Floats],
 ) -> Iterator[Given]:
-    """A map with its readings (H, W, N, C) in a file that goes with the block."""
+    """A map with its measurements (H, W, N, C) in a file that goes with the block."""
     with tempfile.TemporaryDirectory(prefix="layerjax-maps-") as folder:
         path = Path(folder) / "values.npy"
         np.save(path, values)
@@ -86,10 +85,9 @@ def stored(
 
 def job_of(one: Given, chunk: int) -> tuple[Job, list[Task]]:
     """The work of a map that has been fitted, as its workers had it, and the tasks of all chunks."""
-    found = readings(one.values, one.geometry)
-    rest = {"transport": one.transport, "scale": None, "objective": "likelihood", "instrument": None}
-    prepared = load(zarr.open_group(one.store, mode="r"), found, one.stack, one.noise, chunk, **rest)
-    error, least = prepared.numerical_error, prepared.least
-    job = Job(str(one.store), prepared.problem, prepared.starts, least, chunk, error, found.portable)
-    sides = tile(found.shape, chunk)
-    return job, [Task(block_at(place, found.shape, sides)) for place in grid(found.shape, sides)]
+    data, store, options = map_data(one.values, one.geometry), Store(one.store), MapOptions(chunk_size=chunk)
+    pilot = load(store, data, one.stack, one.noise, one.transport, options)
+    assert pilot is not None
+    error = pilot.numerical_error
+    job = Job(str(one.store), pilot.problem, pilot.starts, pilot.floor, options, error, data.portable)
+    return job, [Task(block) for block in blocks_of(store.shape, store.chunk)]

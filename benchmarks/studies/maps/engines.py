@@ -23,8 +23,8 @@ from benchmarks.suite.maps import readings
 from fits.engines import run as run_tasks
 from fits.engines.processes import run_processes
 from fits.engines.worker import take_after
-from fits.maps import searching
-from fits.maps.job import Task
+from fits.maps import search
+from fits.maps.chunk import Task
 
 PAIR, CLUSTER = Bar(1.8, 1.95, rate=True), Bar(0.9, 0.97, rate=True)
 OVERHEAD, MEMORY = Bar(50.0, 10.0), Bar(1.5, 0.7)
@@ -60,12 +60,12 @@ def run(case: Case, rows: Sequence[Row], size: Size, report: Report) -> list[Fig
     for row in rows:
         start = max(0.0, row.whole - row.texels / row.rate)
         note = (
-            f"the sample, {figure(start)} s until workers are at work, and chunks; {figure(row.whole)} s of it measured"
+            f"the pilot, {figure(start)} s until workers are at work, and chunks; {figure(row.whole)} s of it measured"
         )
         seconds = row.pilot + start + MILLION / row.rate
         figures.append(_figure(f"a million texels: {row.name}", seconds, "s", None, note))
         note = f"{figure(row.first)} s with what is compiled, in a map of one chunk"
-        figures.append(_figure(f"the sample: {row.name}", row.pilot, "s", None, note))
+        figures.append(_figure(f"the pilot: {row.name}", row.pilot, "s", None, note))
     return figures
 
 
@@ -159,7 +159,15 @@ def overhead(size: Size) -> list[Figure]:
     values = exact * (1.0 + 0.02 * np.random.default_rng(1).standard_normal((side, side, len(exact))))
     whole, solved = [], []
     with stored(stack, geometry, noise, nothing, values[..., None], {}) as one:
-        fits.fit_map(stack, geometry, one.values, one.store, noise, transport=nothing, chunk=size.chunk)
+        fits.fit_map(
+            stack,
+            geometry,
+            one.values,
+            one.store,
+            noise,
+            transport=nothing,
+            options=fits.MapOptions(chunk_size=size.chunk),
+        )
         job, (task, *_) = job_of(one, size.chunk)
         for _ in range(WARM + 5 * size.rounds):
             with _solving() as spent:
@@ -186,7 +194,7 @@ def _solving() -> Iterator[list[float]]:
 
     with ExitStack() as stack:
         for name in ("solve", "solve_near"):
-            stack.enter_context(patch.object(searching, name, measured(getattr(searching, name))))
+            stack.enter_context(patch.object(search, name, measured(getattr(search, name))))
         yield spent
 
 

@@ -17,9 +17,9 @@ from benchmarks.studies.maps.cases import Case, Given, given, job_of
 from benchmarks.studies.maps.work import Texelwise, Timed, costs_at, rows_of, timed
 from fits.engines import Failure
 from fits.engines import run as run_tasks
+from fits.maps.chunk import Job, Task
 from fits.maps.fitted_map import FittedMap
-from fits.maps.job import Job, Task
-from fits.maps.searching import all_predicted
+from fits.maps.search import predict_all
 
 Floats = NDArray[np.float64]
 Report = Callable[[str], None]
@@ -37,8 +37,8 @@ class Size:
     """How much is measured.
 
     side: of the maps, in texels. chunk: texels. scipy: texels that it fits at a time, and times. checked: texels whose
-    table is compared with a finer solution. rounds: of runs with other numbers of workers; repeats: of a map in each.
-    tasks: empty ones.
+    emulator is compared with a finer solution. rounds: of runs with other numbers of workers; repeats: of a map in
+    each. tasks: empty ones.
     """
 
     side: int = 256
@@ -60,7 +60,7 @@ class Row:
     rate, scipy: fits a second of `PROCESSES` processes that take turns with both; ratio: of the two. pilot: seconds of
     all that comes before the first chunk; first: of the same and compilation, in a map of one chunk. whole: seconds of
     the chunks of the map, workers' start in it. above: share of texels whose cost is above scipy's beyond rounding,
-    below: well below it. width: of pulls, the one furthest from 1. table: largest numerical error of a table at the
+    below: well below it. width: of pulls, the one furthest from 1. emulator: largest numerical error of one at the
     optimum, in standard deviations, beside a finer solver. peak: bytes of a worker that compiles.
     """
 
@@ -81,7 +81,7 @@ class Row:
     below: float | None
     width: float
     chi_square: float
-    table: float | None
+    emulator: float | None
     words: str
     peak: int
 
@@ -101,7 +101,7 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
     side = min(size.side, int(size.chunk**0.5))
     first, _, _ = fitted(one, size, np.load(one.values, mmap_mode="r")[:side, :side])
     pilot, whole, found = fitted(one, size)
-    report(f"{case.name}: {found.values[found.names[0]].size:,} texels, sample {pilot:.0f} s, all others {whole:.0f} s")
+    report(f"{case.name}: {found.values[found.names[0]].size:,} texels, pilot {pilot:.0f} s, all others {whole:.0f} s")
     job, tasks = job_of(one, size.chunk)
     turns = by_turns(tasks, size if with_peers else replace(size, scipy=(0, size.scipy[1])))
     done = [*finished(run_tasks(timed, job, turns, processes=PROCESSES))]
@@ -128,8 +128,8 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
         below=float(np.mean(differences < -OTHER)) if len(differences) else None,
         width=pull_width(found, one),
         chi_square=float(np.nanmean(found.reduced_chi_square)),
-        table=table_error(job, found, size.checked),
-        words=str(found.attributes["numerical"].get("table", "")),
+        emulator=emulator_error(job, found, size.checked),
+        words=str(found.attributes["numerical"].get("emulator", "")),
         peak=cold_peak(job, tasks),
     )
 
@@ -176,9 +176,7 @@ def fitted(
         one.store if values is None else one.store.with_name("first.zarr"),
         one.noise,
         transport=one.transport,
-        chunk=size.chunk,
-        processes=processes,
-        progress=progress,
+        options=fits.MapOptions(chunk_size=size.chunk, processes=processes, progress=progress),
     )
     return told[0] - began, time.perf_counter() - told[0], found
 
@@ -246,7 +244,7 @@ def vectors_of(found: FittedMap, task: Texelwise) -> Floats:
 def pull_width(found: FittedMap, one: Given) -> float:
     """Half of what the middle 68 % of the pulls span, of the parameter that is furthest from 1.
 
-    Of texels whose readings say something of every parameter, within its bounds.
+    Of texels whose data say something of every parameter, within its bounds.
     """
     good = found.has("converged") & ~found.has("at_bound") & ~found.has("unidentified")
     widths = []
@@ -257,17 +255,17 @@ def pull_width(found: FittedMap, one: Given) -> float:
     return float(max(widths, key=lambda width: abs(width - 1.0)))
 
 
-def table_error(job: Job, found: FittedMap, checked: int) -> float | None:
+def emulator_error(job: Job, found: FittedMap, checked: int) -> float | None:
     """Of the model at the optimum, beside the transport at the next finer resolution, in standard deviations."""
     transport = job.problem.transport
     if not isinstance(transport, lj.AddingDoubling):
         return None
     at = np.linspace(0, found.flags.size - 1, checked).astype(int)
     vectors = np.stack([found.values[name].ravel()[at] for name in found.names], axis=1)
-    mine = all_predicted(job.problem, vectors)
-    fine = all_predicted(replace(job.problem, transport=transport.finer()), vectors)
+    mine = predict_all(job.problem, vectors)
+    fine = predict_all(replace(job.problem, transport=transport.finer()), vectors)
     noise = job.problem.noise
-    sigma = np.hypot(float(noise.relative or 0.0) * fine, job.least)  # type: ignore[arg-type]
+    sigma = np.hypot(float(noise.relative or 0.0) * fine, job.floor)  # type: ignore[arg-type]
     return float(np.max(np.abs(mine - fine) / sigma))
 
 
@@ -287,13 +285,13 @@ def markdown(rows: Sequence[Row]) -> str:
             "-" if r.below is None else f"{100 * r.below:.1f} %",
             figure(r.width),
             figure(r.chi_square),
-            figure(r.table),
+            figure(r.emulator),
         )
         for r in rows
     ]
     words = ("map", "converged", "poor", "compared", "above scipy's", "below", "pulls", "chi-square", "error, sd")
-    tables = "".join(f"- {r.name}: {r.words}.\n" for r in rows if r.words)
-    return f"{table(header, rates)}\n{table(words, good)}\n{tables}"
+    words_of_emulators = "".join(f"- {r.name}: {r.words}.\n" for r in rows if r.words)
+    return f"{table(header, rates)}\n{table(words, good)}\n{words_of_emulators}"
 
 
 def as_json(rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -69,7 +69,7 @@ def on_paper(row: Row, chunk: int, handed: float | None, texels: int = TEXELS) -
 
 def _engine(name: str, results: Iterable[tuple[int, Any]]) -> Engine:
     """From the end of the first task, by when there is a worker, to that of the last."""
-    ended = sorted(task.start_outcomes for task in (task for _, task in finished(results)))
+    ended = sorted(task.ended for task in (task for _, task in finished(results)))
     seconds, count = max(ended[-1] - ended[0], 1e-9), len(ended) - 1
     return Engine(name, len(ended), count / seconds, 1e3 * seconds / count)
 

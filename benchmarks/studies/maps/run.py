@@ -16,20 +16,20 @@ TEXT = """\
 # Fits of maps
 
 {environment}
-Painted maps of {side} x {side} texels, 64 readings each in one channel with noise of 2 %, {free} free numbers a texel,
-fitted by `fits.fit_map` in chunks of {chunk:,} texels. Everything is warm: what compiles comes before, programs are
-kept on disk, and of each worker the first chunk does not count.
+Painted maps of {side} x {side} texels, 64 measurements each in one channel with noise of 2 %, {free} free numbers a
+texel, fitted by `fits.fit_map` in chunks of {chunk:,} texels. Everything is warm: what compiles comes before, programs
+are kept on disk, and of each worker the first chunk does not count.
 
 ## Texels a second
 
-Chunks as `fit_map` does them, readings and writing among them, and fits of single texels by scipy's `least_squares`
+Chunks as `fit_map` does them, reading and writing among them, and fits of single texels by scipy's `least_squares`
 (trust region in the unit box, the same compiled residuals and Jacobian, from where `fit_map` begins) by turns in the
-same {processes} processes, a core each. Where there is a table scipy has it too. *compared*: texels that scipy fitted;
-of these *above scipy's* is the share whose cost is above its by more than {rounding:g}, *below* that of costs lower by
-more than {other:g} (another minimum). *pulls*: half of what the middle 68 % of (fit - truth) / error span, of the
-parameter furthest from 1, over texels with all parameters resolved and within bounds. *chi-square*: reduced, mean.
+same {processes} processes, a core each. Where there is an emulator scipy has it too. *compared*: texels that scipy
+fitted; of these *above scipy's* is the share whose cost is above its by more than {rounding:g}, *below* that of costs
+lower by more than {other:g} (another minimum). *pulls*: half of what the middle 68 % of (fit - truth) / error span, of
+the parameter furthest from 1, over texels with all parameters identified within bounds. *chi-square*: reduced, mean.
 *error, sd*: of the model at the optimum beside the solver at the next finer resolution, in standard deviations of a
-reading, the largest of {checked} texels.
+measurement, the largest of {checked} texels.
 
 {fits}
 ## Workers
@@ -45,7 +45,7 @@ all programs. {missing}
 Empty tasks through the engines on this machine, where {processes} workers share its cores with the scheduler: a
 scheduler with a machine of its own is no slower. dask has them one at a time; of chunks shorter than {enough:g} s it
 has as many together as take that long. *scheduler full at*: so many cores ask for chunks as fast as it hands them out.
-Times of 4 million texels (2048 x 2048, 2.1 GB of readings): the sample, which one machine fits first, and chunks by
+Times of 4 million texels (2048 x 2048, 2.1 GB of values): the pilot, which one machine fits first, and chunks by
 these rates; cores as fast as these, and a disk that keeps up.
 
 {paper}"""

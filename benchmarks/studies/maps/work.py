@@ -16,10 +16,10 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from fits.maps.job import Job, Task, fit_chunk, part_of
-from fits.maps.solving import nearest
-from fits.maps.store import FLAGS, write_chunk
-from fits.maps.texels import Texels, model_of, texels
+from fits.maps.chunk import Job, Task, fit_chunk, read_part
+from fits.maps.descent import Texels, make_texels, model_of
+from fits.maps.search import likeliest
+from fits.maps.store import FLAGS
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -81,9 +81,9 @@ def timed(job: Job, task: Task | Texelwise | Meeting) -> Timed:
 
 
 def redo(job: Job, task: Task) -> int:
-    """A chunk as `fits.maps.job.work` does it, also where it is done already; how many texels were fitted."""
-    results = fit_chunk(job, part_of(job.readings, task.block))
-    write_chunk(job.store, task.block, results)
+    """A chunk as `fits.maps.chunk.work` does it, also where it is done already; how many texels were fitted."""
+    results = fit_chunk(job, read_part(job.data, task.block))
+    job.store.write(task.block, results)
     return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
 
@@ -107,15 +107,14 @@ def empty(shared: Any, task: Any) -> Timed:
 
 
 def rows_of(job: Job, task: Texelwise) -> Texels:
-    """The readings of those texels."""
-    values = part_of(job.readings, task.task.block).values
-    return texels(values.reshape(-1, *values.shape[-2:])[list(task.places)], None, job.least)
+    """The measurements of those texels."""
+    values = read_part(job.data, task.task.block).values
+    return make_texels(values.reshape(-1, *values.shape[-2:])[list(task.places)], None, job.floor)
 
 
 def first_starts(job: Job, rows: Texels) -> Floats:
     """Where `fits.fit_map` begins, in the unit box."""
-    assert job.starts.predicted is not None
-    chosen = nearest(job.problem, job.starts.vectors, job.starts.predicted, rows, 1, job.size)[:, 0]
+    chosen = likeliest(job.problem, job.starts, rows, job.options.chunk_size, 1)[:, 0]
     return np.clip(job.starts.units[chosen], INSIDE, 1.0 - INSIDE)
 
 

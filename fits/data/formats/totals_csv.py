@@ -92,7 +92,7 @@ def read(path: Path) -> Totals:
         kinds=tuple(kinds),
     )
     notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
-    return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.beyond())))
+    return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.energy_violations())))
 
 
 def write(totals: Totals, path: str | Path, force: bool = False) -> None:

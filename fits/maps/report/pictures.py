@@ -28,7 +28,7 @@ INNER = (1.0, 99.0)  # percentiles between which colours and axes run
 LOW_END = 0.25  # of their span
 WIDTH = 4.8  # inches
 RATIO = "χ² / degree of freedom"
-ABSENT, OPEN = "#d4d4d4", "#ffffff"
+ABSENT, NO_NUMBER = "#d4d4d4", "#ffffff"
 
 
 class Scale(NamedTuple):
@@ -55,11 +55,11 @@ class State(NamedTuple):
 STATES = (
     State("not there yet", "#ffffff", lacking=sum(FLAGS.values())),
     State("masked", ABSENT, FLAGS["masked"]),
-    State("too few readings", GREY, FLAGS["too_few_readings"]),
+    State("too few measurements", GREY, FLAGS["too_few_measurements"]),
     State("failed", "#000000", FLAGS["failed"]),
     State("not converged", "#D55E00", FLAGS["fitted"], FLAGS["converged"]),
     State("poor", "#E69F00", FLAGS["poor"]),
-    State("not resolved", "#CC79A7", FLAGS["unidentified"]),
+    State("unidentified", "#CC79A7", FLAGS["unidentified"]),
     State("at a bound", "#56B4E9", FLAGS["at_bound"]),
     State("fine, started again", "#009E73", FLAGS["restarted"]),
     State("fine", "#cfe8dc"),
@@ -93,41 +93,6 @@ def face(shape: Sequence[int]) -> Face:
     return Face((*leading, *trailing), tuple(steps.values()), ", ".join(words))
 
 
-def value_picture(
-    values: Floats,
-    fitted: np.ndarray,
-    shown: Face,
-    title: str,
-    label: str,
-    colours: str,
-    beside: Floats | None = None,
-) -> Figure:
-    """One number of every texel, such as a parameter or its error.
-
-    Args:
-        values: of the whole map.
-        fitted: texels that are fitted; the others are grey, and those without a finite number white.
-        shown: what is drawn of it.
-        title, label: what stands above, and what the numbers are, with their unit.
-        colours: name of a colour map of matplotlib.
-        beside: of the picture that this one stands beside, whose colours it has.
-    """
-    scale = scale_of((values if beside is None else beside)[fitted])
-    return _picture(shown.of(np.where(fitted, values, np.nan)), shown.of(fitted), shown, scale, title, label, colours)
-
-
-def chi_square_picture(ratio: Floats, fitted: np.ndarray, shown: Face) -> Figure:
-    """Chi-square per degree of freedom: white where it is 1, orange above and violet below, on a logarithmic scale."""
-    positive = ratio[fitted & np.isfinite(ratio) & (ratio > 0.0)]
-    widest = 2.0
-    if positive.size:
-        widest = max(widest, float(np.exp(np.abs(np.log(np.percentile(positive, INNER))).max())))
-    values = np.where(fitted & (ratio > 0.0), ratio, np.nan)
-    scale = Scale(1.0 / widest, widest, logarithmic=True)
-    title = "chi-square per degree of freedom"
-    return _picture(shown.of(values), shown.of(fitted), shown, scale, title, RATIO, "PuOr_r")
-
-
 def scale_of(values: Floats) -> Scale:
     """Over the middle 98 %; logarithmic where these span more than a factor of ten, most of them at its low end."""
     finite = values[np.isfinite(values)]
@@ -143,38 +108,91 @@ def scale_of(values: Floats) -> Scale:
     return Scale(low, high, logarithmic=low > 0.0 and high > LOG_ABOVE * low and skewed)
 
 
-def _picture(
-    values: Floats, fitted: np.ndarray, shown: Face, scale: Scale, title: str, label: str, colours: str
+# ---- over the map ----
+
+
+def value_picture(
+    values: Floats, fitted: np.ndarray, shown: Face, title: str, label: str, colours: str, scale: Scale | None = None
 ) -> Figure:
-    with mpl.rc_context(STYLE | {"axes.grid": values.ndim == 1}):
-        figure = Figure(figsize=_size(values.shape), layout="constrained")
-        axes = figure.subplots()
-        axes.set_title(title)
-        if values.ndim == 1:
-            _line(axes, values, fitted, shown, scale, label)
+    """One number of every texel, such as a parameter or its error.
+
+    Args:
+        values: of the whole map.
+        fitted: texels that are fitted; the others are grey, and those without a finite number white.
+        shown: what is drawn of it.
+        title, label: what stands above, and what the numbers are, with their unit.
+        colours: name of a colour map of matplotlib.
+        scale: of the colours; None: of the values.
+    """
+    scale = scale or scale_of(values[fitted])
+    drawn, there = shown.of(np.where(fitted, values, np.nan)), shown.of(fitted)
+    with mpl.rc_context(STYLE | {"axes.grid": drawn.ndim == 1}):
+        figure, axes = _figure(drawn.shape, title)
+        if drawn.ndim == 1:
+            _line(axes, drawn, there, shown.steps[0], scale, label)
             return figure
-        missing = fitted & ~np.isfinite(values)
-        ground = mpl.colors.ListedColormap([ABSENT, OPEN])
-        placed = _placed(values.shape, shown.steps)
+        missing = there & ~np.isfinite(drawn)
+        placed, ground = _placed(drawn.shape, shown.steps), mpl.colors.ListedColormap([ABSENT, NO_NUMBER])
         axes.imshow(missing, cmap=ground, vmin=0, vmax=1, interpolation="nearest", **placed)
-        image = axes.imshow(values, cmap=colours, norm=scale.norm, **placed)
-        _index_axes(axes)
-        finite = values[np.isfinite(values)]
-        below, above = bool(np.any(finite < scale.low)), bool(np.any(finite > scale.high))
+        image = axes.imshow(drawn, cmap=colours, norm=scale.norm, **placed)
+        below, above = (bool(np.any(out)) for out in (drawn < scale.low, drawn > scale.high))
         extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
         bar = figure.colorbar(image, ax=axes, label=label, extend=extend)
         if scale.logarithmic:
             _plain_ticks(bar.ax.yaxis, scale)
-        absent = [] if fitted.all() else [(ABSENT, "not fitted")]
-        _legend(figure, [*absent, *([(OPEN, "none: at a bound, or open")] if missing.any() else [])])
+        absent = [] if there.all() else [(ABSENT, "not fitted")]
+        _legend(figure, [*absent, *([(NO_NUMBER, "none: at a bound, or unidentified")] if missing.any() else [])])
     return figure
 
 
-def _size(shape: tuple[int, ...]) -> tuple[float, float]:
-    """Of a figure, in inches, for a map drawn true to its sides."""
-    if len(shape) == 1:
-        return WIDTH, 2.4
-    return WIDTH, float(np.clip(0.78 * WIDTH * shape[0] / shape[1] + 0.7, 1.8, 7.0))
+def chi_square_picture(ratio: Floats, fitted: np.ndarray, shown: Face) -> Figure:
+    """Chi-square per degree of freedom: white where it is 1, orange above and violet below, on a logarithmic scale."""
+    positive = ratio[fitted & np.isfinite(ratio) & (ratio > 0.0)]
+    widest = 2.0
+    if positive.size:
+        widest = max(widest, float(np.exp(np.abs(np.log(np.percentile(positive, INNER))).max())))
+    scale = Scale(1.0 / widest, widest, logarithmic=True)
+    values = np.where(ratio > 0.0, ratio, np.nan)
+    return value_picture(values, fitted, shown, "chi-square per degree of freedom", RATIO, "PuOr_r", scale)
+
+
+def states_of(flags: np.ndarray) -> np.ndarray:
+    """Which of `STATES` every texel is shown as."""
+    bits = flags.astype(int)
+    applies = [((bits & one.having) == one.having) & ((bits & one.lacking) == 0) for one in STATES]
+    return np.argmax(applies, axis=0)
+
+
+def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
+    """The gravest flag of every texel, with counts over the whole map."""
+    states = states_of(flags)
+    counts = np.bincount(states.ravel(), minlength=len(STATES))
+    drawn = shown.of(states)
+    image, steps = (drawn, shown.steps) if drawn.ndim == 2 else (drawn[None], (1, *shown.steps))
+    colours = mpl.colors.ListedColormap([state.colour for state in STATES])
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
+        figure, axes = _figure(drawn.shape, "flags of the texels", legend=0.5)
+        ends = {"vmin": -0.5, "vmax": len(STATES) - 0.5}
+        axes.imshow(image, cmap=colours, interpolation="nearest", **ends, **_placed(image.shape, steps))
+        if drawn.ndim == 1:
+            axes.set(xlabel="texel", ylabel="", yticks=[])
+        words = [f"{state.words}: {count:,}" for state, count in zip(STATES, counts, strict=True)]
+        _legend(figure, [(STATES[place].colour, words[place]) for place in np.flatnonzero(counts)])
+    return figure
+
+
+def _figure(shape: tuple[int, ...], title: str, legend: float = 0.0) -> tuple[Figure, Axes]:
+    """A figure for a map drawn true to its sides, or for a line."""
+    height = 2.4
+    if len(shape) == 2:
+        height = float(np.clip(0.78 * WIDTH * shape[0] / shape[1] + 0.7, 1.8, 7.0)) + legend
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set(title=title, xlabel="column", ylabel="row")
+    if len(shape) == 2:
+        axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
+    return figure, axes
 
 
 def _placed(shape: tuple[int, ...], steps: tuple[int, ...]) -> dict[str, Any]:
@@ -184,10 +202,20 @@ def _placed(shape: tuple[int, ...], steps: tuple[int, ...]) -> dict[str, Any]:
     return {"extent": (-0.5, columns - 0.5, rows - 0.5, -0.5), "aspect": "equal" if true else "auto"}
 
 
-def _index_axes(axes: Axes) -> None:
-    axes.set(xlabel="column", ylabel="row")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
+def _line(axes: Axes, values: Floats, fitted: np.ndarray, step: int, scale: Scale, label: str) -> None:
+    """Values against the index; what is not fitted is shaded."""
+    index, half = np.arange(len(values)) * step, 0.5 * step
+    axes.plot(index, values, "o-" if len(values) <= 200 else "-", markersize=2.5, linewidth=0.8, color=CYCLE[0])
+    if scale.logarithmic:
+        axes.set_yscale("log")
+        axes.set_ylim(scale.low / 1.1, scale.high * 1.1)
+        _plain_ticks(axes.yaxis, scale)
+    else:
+        margin = 0.05 * (scale.high - scale.low)
+        axes.set_ylim(scale.low - margin, scale.high + margin)
+    for place in index[~fitted]:
+        axes.axvspan(place - half, place + half, color=ABSENT, linewidth=0.0)
+    axes.set(xlabel="texel", ylabel=label, xlim=(-half, index[-1] + half))
 
 
 def _plain_ticks(axis: Axis, scale: Scale) -> None:
@@ -198,68 +226,14 @@ def _plain_ticks(axis: Axis, scale: Scale) -> None:
     axis.set_minor_formatter(mpl.ticker.NullFormatter())
 
 
-def _line(axes: Axes, values: Floats, fitted: np.ndarray, shown: Face, scale: Scale, label: str) -> None:
-    """Values against the index; what is not fitted is shaded."""
-    index = np.arange(len(values)) * shown.steps[0]
-    axes.plot(index, values, "o-" if len(values) <= 200 else "-", markersize=2.5, linewidth=0.8, color=CYCLE[0])
-    margin = 0.05 * (scale.high - scale.low)
-    if scale.logarithmic:
-        axes.set_yscale("log")
-        axes.set_ylim(scale.low / 1.1, scale.high * 1.1)
-        _plain_ticks(axes.yaxis, scale)
-    else:
-        axes.set_ylim(scale.low - margin, scale.high + margin)
-    half = 0.5 * shown.steps[0]
-    axes.fill_between(
-        np.repeat(index, 2) + np.tile([-half, half], len(index)),
-        0.0,
-        1.0,
-        where=np.repeat(~fitted, 2),
-        transform=axes.get_xaxis_transform(),
-        color=ABSENT,
-        linewidth=0.0,
-    )
-    axes.set(xlabel="texel", ylabel=label, xlim=(-half, index[-1] + half))
-    axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(6, integer=True))
-
-
-def states_of(flags: np.ndarray) -> np.ndarray:
-    """Which of `STATES` every texel is shown as."""
-    bits = flags.astype(int)
-    found = np.full(bits.shape, len(STATES) - 1, np.uint8)
-    for place in reversed(range(len(STATES) - 1)):
-        state = STATES[place]
-        found[((bits & state.having) == state.having) & ((bits & state.lacking) == 0)] = place
-    return found
-
-
-def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
-    """What became of every texel, the gravest of what is said of it; with counts over the whole map."""
-    states = states_of(flags)
-    counts = np.bincount(states.ravel(), minlength=len(STATES))
-    drawn = shown.of(states)
-    image = drawn[None] if drawn.ndim == 1 else drawn
-    colours = mpl.colors.ListedColormap([state.colour for state in STATES])
-    with mpl.rc_context(STYLE | {"axes.grid": False}):
-        height = 1.9 if drawn.ndim == 1 else _size(drawn.shape)[1] + 0.5
-        figure = Figure(figsize=(WIDTH, height), layout="constrained")
-        axes = figure.subplots()
-        placed = _placed(image.shape, shown.steps if drawn.ndim == 2 else (1, *shown.steps))
-        axes.imshow(image, cmap=colours, vmin=-0.5, vmax=len(STATES) - 0.5, interpolation="nearest", **placed)
-        axes.set_title("what became of the texels")
-        _index_axes(axes)
-        if drawn.ndim == 1:
-            axes.set(xlabel="texel", ylabel="", yticks=[])
-        words = [f"{state.words}: {count:,}" for state, count in zip(STATES, counts, strict=True)]
-        _legend(figure, [(STATES[place].colour, words[place]) for place in np.flatnonzero(counts)])
-    return figure
-
-
 def _legend(figure: Figure, entries: Sequence[tuple[str, str]]) -> None:
     """Patches of colour and what they mean, below the axes."""
     if entries:
         handles = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.5, label=words) for colour, words in entries]
         figure.legend(handles=handles, loc="outside lower center", ncols=2 if len(entries) > 1 else 1)
+
+
+# ---- histograms ----
 
 
 def histogram_picture(values: Floats, title: str, label: str) -> Figure:
@@ -276,39 +250,10 @@ def histogram_picture(values: Floats, title: str, label: str) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, finite: Floats, title: str, density: bool = False) -> tuple[float, float]:
-    """Bars over a range of values, and that range."""
-    scale, number = scale_of(finite), int(np.clip(np.sqrt(finite.size), 8, 60))
-    low, high = scale.low, scale.high
-    if scale.logarithmic:
-        low, high = low * (low / high) ** 0.1, high * (high / low) ** 0.1
-    else:
-        low, high = low - 0.1 * (high - low), high + 0.1 * (high - low)
-    if finite.min() < finite.max():
-        low, high = max(low, float(finite.min())), min(high, float(finite.max()))
-    edges = np.geomspace(low, high, number + 1) if scale.logarithmic else np.linspace(low, high, number + 1)
-    inside = finite[(finite >= edges[0]) & (finite <= edges[-1])]
-    # shares are of all texels, also of those outside
-    weights = np.full(inside.size, 1.0 / finite.size) if density else np.ones(inside.size)
-    counts, _ = np.histogram(inside, edges, weights=weights)
-    axes.stairs(counts / np.diff(edges) if density else counts, edges, fill=True, color=CYCLE[5])
-    middle = float(np.median(finite))
-    axes.axvline(middle, color=INK, linewidth=1.0)
-    if scale.logarithmic:
-        axes.set_xscale("log")
-        _plain_ticks(axes.xaxis, scale)
-    outside = finite.size - inside.size
-    axes.set_title(f"{title}: median {middle:.4g}" + (f"; {outside:,} outside" if outside else ""))
-    axes.margins(x=0.02)
-    return low, high
-
-
 def chi_square_histogram(ratio: Floats, freedom: np.ndarray) -> Figure:
     """Chi-square per degree of freedom of fitted texels, and what independent noise of the stated size makes of it.
 
-    Args:
-        ratio: of texels.
-        freedom: degrees of freedom of each.
+    freedom: degrees of freedom of each texel.
     """
     finite = np.isfinite(ratio) & (ratio > 0.0) & (freedom > 0)
     with mpl.rc_context(STYLE):
@@ -332,3 +277,26 @@ def expected_density(ratio: Floats, freedom: np.ndarray) -> Floats:
     each, counts = np.unique(freedom, return_counts=True)
     density = stats.chi2.pdf(ratio[:, None] * each, each) * each
     return np.asarray(density @ (counts / counts.sum()))
+
+
+def _bars(axes: Axes, finite: Floats, title: str, density: bool = False) -> tuple[float, float]:
+    """Bars over a range of values, and that range; shares are of all texels, also of those outside."""
+    scale, number = scale_of(finite), int(np.clip(np.sqrt(finite.size), 8, 60))
+    low, high = scale.low, scale.high
+    if scale.logarithmic:
+        low, high = low * (low / high) ** 0.1, high * (high / low) ** 0.1
+    else:
+        low, high = low - 0.1 * (high - low), high + 0.1 * (high - low)
+    if finite.min() < finite.max():
+        low, high = max(low, float(finite.min())), min(high, float(finite.max()))
+    edges = np.geomspace(low, high, number + 1) if scale.logarithmic else np.linspace(low, high, number + 1)
+    counts, _ = np.histogram(finite, edges)
+    outside, middle = finite.size - int(counts.sum()), float(np.median(finite))
+    axes.stairs(counts / (finite.size * np.diff(edges)) if density else counts, edges, fill=True, color=CYCLE[5])
+    axes.axvline(middle, color=INK, linewidth=1.0)
+    if scale.logarithmic:
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis, scale)
+    axes.set_title(f"{title}: median {middle:.4g}" + (f"; {outside:,} outside" if outside else ""))
+    axes.margins(x=0.02)
+    return low, high

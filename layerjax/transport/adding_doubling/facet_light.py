@@ -14,7 +14,7 @@ from jax import Array
 from layerjax import fresnel
 from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_sqrt
-from layerjax.directions import Vector, dot, normalize, reflect, refract, sanitised
+from layerjax.directions import Vector, combine, dot, normalize, reflect, sanitised
 from layerjax.normals import facets
 from layerjax.normals.facet_rule import Parallels, Way, parallels, polar_angles, seen_facets
 from layerjax.quadrature import gauss_legendre
@@ -26,6 +26,9 @@ ENERGY_POINTS = (12, 8)
 LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
 """Points of the dense quadrature of visible normals in either direction, at least (`refracted_densely`): of a single
 interface, and where there are several, between which light goes on."""
+
+CRITICAL = 7.5
+"""Times the distance between facets: half the width over which the critical angle of refraction is rounded off."""
 
 
 class Normals(NamedTuple):
@@ -79,11 +82,17 @@ def of_facets(
 
 
 def _through(
-    wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals
+    wi: Vector, m: Vector, facing: Array, weight: Array, ratio: Array, normals: Normals, blur: Array | None = None
 ) -> tuple[Vector, Array]:
-    """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection."""
-    level = fresnel.dielectric(facing, ratio)
-    down, exists = refract(wi, m, ratio)
+    """Where facets refract light to, z counted on the far side, and how much: nothing under total reflection.
+
+    blur: see `fresnel.dielectric`.
+    """
+    level = fresnel.dielectric(facing, ratio, blur)
+    refracted, exists = fresnel.cosine_of_refraction(facing, ratio, blur)
+    down = combine(facing / ratio - refracted, m, -1.0 / ratio, wi)
+    if blur is not None:
+        down = normalize(down)
     # under total reflection what `refract` gives is no direction, and one stands in
     wo: Vector = (
         jnp.where(exists, down[0], 0.6),
@@ -100,7 +109,15 @@ def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, m
         # about the direction, not the normal: what a mirror sends back through them asks for more than their own caps
         return refracted_rays(near, ratio, normals, (3 * polar_count(grid) // 2, 3 * azimuth_count(grid, modes) // 2))
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
-    return _through(wi, m, dot(wi, m), weight, ratio, normals)
+    # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
+    steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
+    return _through(wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(grid, normals) * steepness)
+
+
+def facet_spacing(grid: Grid, normals: Normals) -> Array:
+    """Angle between facets of the dense quadrature, about."""
+    alpha = jnp.asarray(normals.alpha)
+    return alpha / (1.0 + 2.0 * alpha) / polar_count(grid)
 
 
 def polar_count(grid: Grid) -> int:

@@ -155,7 +155,7 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
         ior: index of the region in which the directions are.
         cosine: their |cos theta|.
         sine2: their sin(theta)^2.
-        blur: half the width in s^2 of what is around an edge, of the order of the distance between directions.
+        blur: half the width in s^2 of what is around each edge, of the order of the distance between directions.
     """
     own = ior * ior
     squared = own * sine2
@@ -179,10 +179,13 @@ def _around(grid: Grid, own: Array, k: int, blur: Array) -> Array:
     """Half the width of what is around the upper edge of a panel; 0 where there is none in the region."""
     if k + 1 == grid.edges.shape[0]:
         return jnp.zeros_like(own)
-    edge, after = grid.edges[k], jnp.where(grid.edges[k + 1] < own, grid.edges[k + 1], own)
-    before = grid.edges[k - 1] if k else jnp.zeros_like(edge)
+    edge, after, before = grid.edges[k], own, jnp.zeros_like(own)
+    for other in range(grid.edges.shape[0] - 2, k, -1):  # panels of equal indices have no extent
+        after = jnp.where((edge < grid.edges[other]) & (grid.edges[other] < own), grid.edges[other], after)
+    for other in range(k):
+        before = jnp.where(grid.edges[other] < edge, grid.edges[other], before)
     return jnp.where(
-        edge < own - grid.apart, at_most(at_most(blur, NEAR * (edge - before)), NEAR * (after - edge)), 0.0
+        edge < own - grid.apart, at_most(at_most(blur[k], NEAR * (edge - before)), NEAR * (after - edge)), 0.0
     )
 
 

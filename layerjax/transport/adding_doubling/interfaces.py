@@ -12,16 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from layerjax import fresnel
 from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
-from layerjax.directions import Vector
+from layerjax.directions import Vector, half_vector
 from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
-from layerjax.surfaces.interface import interface_reflection
+from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_light import (
     Normals,
     facet_energies,
-    polar_count,
+    facet_spacing,
     reflected_energy,
     refracted_densely,
     refracted_rays,
@@ -29,7 +30,7 @@ from layerjax.transport.adding_doubling.facet_light import (
 from layerjax.transport.adding_doubling.grid import Grid, Region, joined, spread
 from layerjax.transport.adding_doubling.inverse import inverse
 from layerjax.transport.adding_doubling.operators import Layer, Parts
-from layerjax.transport.adding_doubling.sampling import cosines, modes_at_nodes, scaled_to_energy
+from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scaled_to_energy
 
 STRONG = 5.0
 """One over what an interface reflects of which all may be put right; of less, a share in proportion."""
@@ -46,9 +47,12 @@ ROUNDED = 0.01
 RESOLVED = 0.2
 """Times the distance between nodes: a lobe of this width, alpha times their number, is half resolved by them."""
 
-BLUR = 5.6
-"""Of alpha / (1 + 2 alpha) over the facets from pole to rim, half the width in s^2 over which rays move from one panel
-to another: as far apart as they are next to each other, or a few times that."""
+BLUR, BLUR_BETWEEN = 5.6, 2.5
+"""Half the width in s^2 over which rays move from one panel to another, as far apart as they are next to each other, or
+a few times that: of a single interface times the distance between facets; of several times that between rays."""
+
+CRITICAL = 2.0
+"""Times the distance between azimuths: half the width over which the critical angle is rounded off."""
 
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
@@ -108,7 +112,7 @@ def _operators(
     inside, up, lost_inside = facet_energies(far, near, normals)
     unresolved = _unresolved(grid, normals)
     through = _deposit(
-        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, normals)
+        grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
     )
     through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
     leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
@@ -147,7 +151,7 @@ def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes:
         rays = refracted_rays(asked, ratio, normals, points)
     else:
         rays = refracted_densely(grid, asked, inner, normals, modes)
-    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, normals))
+    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, asked, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(asked.weight), inner)
     return [Parts(operator) for operator in (None, through, back, _face(inner, inside, 1.0 / ratio, normals, modes))]
@@ -157,16 +161,17 @@ def _unresolved(grid: Grid, normals: Normals) -> Array:
     return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
 
 
-def _blur(grid: Grid, normals: Normals) -> Array:
+def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     """See `spread`: none where nodes do not resolve the lobe, for refraction sends them to nodes there.
 
-    None between several interfaces either: light that is kept there by total reflection meets the edge again and again,
-    and a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
+    Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
+    again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    alpha = jnp.asarray(normals.alpha)
-    if grid.interfaces > 1:
-        return jnp.zeros_like(alpha)
-    return BLUR / polar_count(grid) * alpha / (1.0 + 2.0 * alpha) * (1.0 - _unresolved(grid, normals))
+    apart = facet_spacing(grid, normals) * (1.0 - _unresolved(grid, normals))
+    if grid.interfaces == 1:
+        return BLUR * apart * jnp.ones_like(grid.edges)
+    steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
+    return BLUR_BETWEEN * apart * jnp.abs(1.0 - near.ior / far.ior) * steepness
 
 
 def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int) -> Array:
@@ -175,8 +180,24 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
     energy = at_most(energy, 1.0 - LEAK * float(jnp.finfo(energy.dtype).eps))
-    (kernel,) = modes_at_nodes(lambda wi, wo: [interface_reflection(wi, wo, ior, *normals)], region, region, modes)
-    return scaled_to_energy(region, kernel, energy)
+
+    def reflection(wi: Vector, wo: Vector) -> list[Array]:
+        h, cosine = half_vector(wi, wo, same_side=True)
+        level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes)))
+        return [level * mirror_lobe(h, wi, wo, *normals)]
+
+    return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes)[0], energy)
+
+
+def _critical_blur(wi: Vector, wo: Vector, ior: Array, apart: float) -> Array:
+    """See `fresnel.dielectric`: as wide as a few azimuths are apart.
+
+    With the root at the critical angle between them, values would change by steps as the index does, and derivatives
+    would be those of no difference of values.
+    """
+    along, across = wi[0] * wo[0], wi[0] * wo[1]
+    step = apart * jnp.sqrt(across * across + (apart * along) ** 2) / (2.0 * ior * ior)
+    return CRITICAL * step
 
 
 def _adjoint(flux: Array, leaving: Array, far: Region) -> Array:

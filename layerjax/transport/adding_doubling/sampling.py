@@ -30,6 +30,11 @@ BALANCING = 5
 """Rounds of `balance`; what is left after them goes straight on."""
 
 
+def azimuths(modes: int) -> int:
+    """Over half a turn, at which a kernel is sampled."""
+    return max(2 * modes, LEAST_SAMPLES)
+
+
 def modes_at_nodes(
     function: Callable[[Vector, Vector], Sequence[Array]], into: Region, out: Region, modes: int
 ) -> list[Array]:
@@ -37,7 +42,7 @@ def modes_at_nodes(
 
     phi is the azimuth between the directions of travel. wi and wo are given above the horizon.
     """
-    samples = max(2 * modes, LEAST_SAMPLES)
+    samples = azimuths(modes)
     phi = (np.arange(samples) + 0.5) * np.pi / samples
     dtype = into.cosine.dtype
     cosines = jnp.asarray(np.cos(np.outer(phi, np.arange(modes))) / samples, dtype)

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,7 +14,7 @@ import layerjax as lj
 from fits.cli.parser import main
 from fits.data.geometry import slices
 from fits.maps.fitted_map import FittedMap, open_map
-from fits.maps.smoothing import Smoothness
+from fits.maps.options import MapOptions, SpatialPrior
 from fits.maps.store import FLAGS
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
@@ -44,7 +45,7 @@ class Called:
 
     def __call__(self, stack: Any, geometry: Any, values: Any, out: Any, **options: Any) -> Any:
         self.given = {"stack": stack, "geometry": geometry, "values": values, "out": out} | options
-        options["progress"]("texels", 5, 10)
+        options["options"].progress("texels", 5, 10)
         return self.then()
 
 
@@ -74,26 +75,27 @@ def test_defaults_and_options_arrive(place: Path, monkeypatch: pytest.MonkeyPatc
     given = dict(called.given)
     assert isinstance(given.pop("stack"), lj.Stack)
     assert isinstance(given.pop("transport"), lj.SingleScattering)
-    assert callable(given.pop("progress"))
+    options = given.pop("options")
+    assert callable(options.progress)
+    assert replace(options, progress=None) == MapOptions(processes=cores())
     places = {"geometry": "view.csv", "values": "map.npy", "out": "coat.zarr", "sigma": None, "mask": None}
-    said = {"noise": Noise(), "scale": None, "objective": "likelihood", "instrument": None}
-    counts = {"starts": 8, "seed": 0, "sample": 64, "chunk": 1024, "processes": cores()}
-    assert given == {**places, **said, **counts, "client": None, "tabulate": None, "force": False}
-    more = "--sigma sigma.npy --mask mask.npy --noise 0.02 --starts 3 --seed 5 --sample 9 --chunk 100 --processes 3"
-    assert main([*WORDS, *more.split(), "--tabulate", "never", "--posterior", "200", "--force"]) == 0
-    changed = {name: value for name, value in called.given.items() if value != given.get(name)}
-    changed = {name: value for name, value in changed.items() if name not in ("stack", "transport", "progress")}
-    files = {"sigma": "sigma.npy", "mask": "mask.npy"}
-    counts = {"starts": 3, "seed": 5, "sample": 9, "chunk": 100, "processes": 3, "posterior": 200}
-    assert changed == {**files, **counts, "noise": Noise(relative=0.02), "tabulate": False, "force": True}
-    assert main([*WORDS, "--scheduler", "tcp://10.0.0.1:8786", "--tabulate", "always"]) == 0
-    assert (called.given["client"], called.given["processes"]) == ("tcp://10.0.0.1:8786", 1)
-    assert called.given["tabulate"] is True
-    assert main([*WORDS, "--smooth", "gaussian", "--smooth-scale", "0.1"]) == 0
-    assert called.given["smooth"] == Smoothness("gaussian", 0.1)
-    some = ["--smooth-scale", "base.albedo=0.1", "scale=1", "--smooth-rounds", "3"]
-    assert main([*WORDS, "--smooth", "total_variation", *some]) == 0
-    assert called.given["smooth"] == Smoothness("total_variation", {"base.albedo": 0.1, "scale": 1.0}, 3)
+    assert given == {**places, "noise": Noise(), "client": None}
+    more = (
+        "--sigma sigma.npy --mask mask.npy --noise 0.02 --starts 3 --seed 5 --pilot-texels 9 --chunk-size 100 --force"
+    )
+    some = "--processes 3 --emulator never --spatial-prior gaussian --spatial-scale 0.1"
+    assert main([*WORDS, *more.split(), *some.split()]) == 0
+    counts = {"starts": 3, "seed": 5, "pilot_texels": 9, "chunk_size": 100, "processes": 3}
+    prior = SpatialPrior("gaussian", 0.1)
+    wanted = MapOptions(**counts, emulator=False, force=True, spatial_prior=prior)
+    assert replace(called.given["options"], progress=None) == wanted
+    files = {"sigma": "sigma.npy", "mask": "mask.npy", "noise": Noise(relative=0.02)}
+    assert {name: called.given[name] for name in files} == files
+    words = "--scheduler tcp://10.0.0.1:8786 --emulator always --spatial-prior total_variation --spatial-rounds 3"
+    assert main([*WORDS, *words.split(), "--spatial-scale", "base.albedo=0.1", "scale=1"]) == 0
+    prior = SpatialPrior("total_variation", {"base.albedo": 0.1, "scale": 1.0}, 3)
+    assert called.given["client"] == "tcp://10.0.0.1:8786"
+    assert replace(called.given["options"], progress=None) == MapOptions(emulator=True, spatial_prior=prior)
 
 
 def test_a_map_is_fitted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,7 +107,7 @@ def test_a_map_is_fitted(place: Path, capsys: pytest.CaptureFixture[str]) -> Non
     exact = np.moveaxis(np.asarray(lj.evaluate(stack, wi, wo, lj.SingleScattering())), 0, 2)
     hdf5_file(place / "map.h5", {"values": exact, "wi": view.wi, "wo": view.wo})
     words = ["fit-map", "map.h5", "--stack", "coat.toml", "--out", "coat.zarr", "--noise", "0.02"]
-    words += ["--processes", "1", "--sample", "3", "--starts", "4", "--tabulate", "never"]
+    words += ["--processes", "1", "--pilot-texels", "3", "--starts", "4", "--emulator", "never"]
     assert main(words) == 0
     fitted = open_map("coat.zarr")
     # readings without noise: how near a solver stops to the optimum is far below an error
@@ -120,13 +122,14 @@ def test_the_stack_file_says_the_rest(place: Path, monkeypatch: pytest.MonkeyPat
     made = found(place)
     called = _in_place(monkeypatch, lambda: made)
     text = (place / "coat.toml").read_text()
-    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\nshared = true\n"
+    more = "[noise]\nrelative = 0.1\ntails = 'student'\n[scale]\nstart = 1\nlow = 0.8\nhigh = 1.2\n"
+    more += "same_for_all_texels = true\n"
     (place / "coat.toml").write_text(text + more + "[instrument]\ndetector_aperture = 2.0\n")
     assert main([*WORDS, "--noise", "0.03"]) == 0
     assert called.given is not None
     assert called.given["noise"] == Noise(relative=0.03, tails="student")
-    assert called.given["scale"].shared
-    assert called.given["instrument"].detector == 2.0
+    assert called.given["options"].scale.same_for_all_texels
+    assert called.given["options"].instrument.detector_aperture == 2.0
 
 
 def test_what_was_found_is_printed(
@@ -170,7 +173,7 @@ def test_an_interrupt_says_that_the_store_is_good(
     _in_place(monkeypatch, interrupted)
     assert main(WORDS) == 130
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last == ("layerjax: interrupted: what was fitted is in coat.zarr; the same command again goes on with it")
+    assert last == ("layerjax: interrupted: what was fitted is in coat.zarr; the same command resumes it")
 
 
 @pytest.mark.parametrize(
@@ -198,14 +201,16 @@ def test_bad_input_is_named(
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        ("--smooth gaussian", "--smooth gaussian needs --smooth-scale"),
-        ("--smooth-scale 0.1", "--smooth-scale is given without --smooth"),
-        ("--smooth-rounds 3", "--smooth-rounds is given without --smooth"),
-        ("--smooth gaussian --smooth-scale 0.1 scale=0.1", "one number for all parameters, or one for each name"),
-        ("--smooth gaussian --smooth-scale scale=0", "Smoothness.scale['scale'] is 0.0; it must be a number from"),
+        ("--spatial-prior gaussian", "--spatial-prior gaussian needs --spatial-scale"),
+        ("--spatial-scale 0.1", "--spatial-scale is given without --spatial-prior"),
+        (
+            "--spatial-prior gaussian --spatial-scale 0.1 scale=0.1",
+            "one number for all parameters, or one for each name",
+        ),
+        ("--spatial-prior gaussian --spatial-scale scale=0", "SpatialPrior.scale['scale'] is 0.0; it must be a number"),
     ],
 )
-def test_smoothness_that_cannot_be_is_named(
+def test_spatial_priors_that_cannot_be_are_named(
     place: Path, capsys: pytest.CaptureFixture[str], more: str, message: str
 ) -> None:
     assert message in refused([*WORDS, *more.split()], capsys, place)
@@ -214,20 +219,19 @@ def test_smoothness_that_cannot_be_is_named(
 @pytest.mark.parametrize(
     "more",
     [
-        ["--smooth", "wide"],
-        ["--smooth", "gaussian", "--smooth-scale", "scale=x"],
-        ["--starts", "0"],
-        ["--sample", "0"],
-        ["--chunk", "-1"],
-        ["--processes", "0"],
-        ["--posterior", "-1"],
-        ["--noise", "nan"],
-        ["--tabulate", "maybe"],
-        ["--processes", "2", "--scheduler", "tcp://x:1"],
+        "--spatial-prior wide",
+        "--spatial-prior gaussian --spatial-scale scale=x",
+        "--starts 0",
+        "--pilot-texels 0",
+        "--chunk-size -1",
+        "--processes 0",
+        "--noise nan",
+        "--emulator maybe",
+        "--processes 2 --scheduler tcp://x:1",
     ],
 )
-def test_bad_usage_exits_with_2(place: Path, capsys: pytest.CaptureFixture[str], more: list[str]) -> None:
+def test_bad_usage_exits_with_2(place: Path, capsys: pytest.CaptureFixture[str], more: str) -> None:
     with pytest.raises(SystemExit) as stop:
-        main([*WORDS, *more])
+        main([*WORDS, *more.split()])
     assert stop.value.code == 2
     assert capsys.readouterr().err.count("\n") == 1

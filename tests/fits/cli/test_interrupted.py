@@ -212,8 +212,8 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
         kept = len(Store.read(done).keys())
         assert contents(work) == before
     assert 2 < kept < 200
-    solve, solved = starts.rough_end, []
-    monkeypatch.setattr(starts, "rough_end", lambda *given, **how: solved.append(how) or solve(*given, **how))
+    solve, solved = starts.rough_descent, []
+    monkeypatch.setattr(starts, "rough_descent", lambda *given, **how: solved.append(how) or solve(*given, **how))
     assert main(MANY_STARTS) == 0
     assert solved.count({}) == 200 - kept
     assert not list(work.glob(".*"))

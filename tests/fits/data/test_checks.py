@@ -29,7 +29,7 @@ def test_reciprocal_readings_are() -> None:
     found = reciprocity(data(lambda i, o, between: 0.1 + 0.01 * np.cos(np.radians(i + o)) + 0.02 * between))
     # of each two incidences a pair at every azimuth in steps of 10
     assert found.count == 6 * 36
-    assert found.most < 1e-9
+    assert found.p95 < 1e-9
 
 
 def test_how_far_readings_are_from_reciprocal_is_told() -> None:
@@ -40,7 +40,7 @@ def test_how_far_readings_are_from_reciprocal_is_told() -> None:
     means = [0.5 * (a + b) for a in ANGLES for b in ANGLES if a < b]
     expected = [0.001 * gap / (1.0 + 0.001 * mean) for gap, mean in zip(gaps, means, strict=True)]
     assert found.median == pytest.approx(np.median(expected), rel=1e-6)
-    assert found.signed > 0.0  # steeper light is brighter
+    assert found.bias > 0.0  # steeper light is brighter
     squares = [
         (0.1 * gap) ** 2 / ((1.0 + 0.001 * (mean - 0.5 * gap)) ** 2 + (1.0 + 0.001 * (mean + 0.5 * gap)) ** 2)
         for gap, mean in zip(gaps, means, strict=True)
@@ -62,7 +62,7 @@ def test_energy_is_the_integral() -> None:
 
 
 def test_sides_are_compared() -> None:
-    assert symmetry(data(lambda i, o, between: 1.0 + between)).most < 1e-9
+    assert symmetry(data(lambda i, o, between: 1.0 + between)).p95 < 1e-9
     whole = data(lambda i, o, between: np.ones_like(i))
     brushed = replace(whole, values=1.0 + 0.1 * np.sign(np.round(whole.wo[:, 1:2], 9)))
     assert symmetry(brushed).median == pytest.approx(0.2)
@@ -91,7 +91,7 @@ def test_readings_in_the_peak_are_counted(width: float, readings: int) -> None:
     signed = np.degrees(np.arctan2(scan.wo[:, 0], scan.wo[:, 2]))
     peaked = data(lambda i, o, between: 0.1 + (np.abs(signed - 30.0) < 0.5 * width - 0.25), scan)
     (found,) = peaks(peaked)
-    assert (found.theta, found.step, found.readings) == (30.0, pytest.approx(1.0), readings)
+    assert (found.theta, found.step, found.count) == (30.0, pytest.approx(1.0), readings)
     assert ("may be narrower than the steps" in data_statements(peaked)[3]) == (readings < 3)
 
 
@@ -102,7 +102,7 @@ def test_what_the_shipped_readings_say() -> None:
     assert all(0.06 < one.share[0] / one.covered < 0.11 for one in energies(steel))
     paint = fits.read(SHIPPED / "aeroglaze_650nm_inplane.csv")
     assert energies(paint) == []
-    assert min(one.readings for one in peaks(paint)) >= 3
+    assert min(one.count for one in peaks(paint)) >= 3
     assert len(data_statements(paint)) == 5
     assert not any(
         words.startswith(("Sides", "Angles")) for words in (*data_statements(paint), *data_statements(steel))

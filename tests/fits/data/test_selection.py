@@ -57,7 +57,7 @@ def test_a_share_is_of_whole_blocks_of_every_scan(share: float) -> None:
         ("incidence=", "incidence is ''; it must be a number"),
         ("plane=90", "plane 90 is not in the data; there are 0, 60 degrees"),
         ("angle=85:89", "angle 85:89 is not in the data; they go from -80 to 80 degrees"),
-        ("angle=20:-20", "angle 20:-20 is empty: its first end must not be above its second"),
+        ("angle=20:-20", "angle 20:-20 is empty: its first angle must not be above its second"),
         ("share=1.5", "share is 1.5; it must be above 0 and below 1"),
         ("incidences=30", "'incidences=30' is no selection; it must be one of incidence=..., plane=..., angle=..."),
         ("30", "'30' is no selection"),
@@ -119,9 +119,9 @@ def test_channels_are_selected() -> None:
     np.testing.assert_array_equal(colours.drop(channels="green").values, [[0.0, 2.0], [3.0, 5.0]])
     for given, message in (
         ({"channels": "grey"}, "channel grey is not in the data; there are red, green, blue"),
-        ({"channels": "red", "incidence": 10}, "drop: channels stand beside angles"),
-        ({"channels": ["red", "green", "blue"]}, "drop: nothing of the data is left"),
-        ({"incidence": 10}, "drop: nothing of the data is left"),
+        ({"channels": "red", "incidence": 10}, "drop: channels are given together with angles"),
+        ({"channels": ["red", "green", "blue"]}, "drop: no sample of the data remains"),
+        ({"incidence": 10}, "drop: no sample of the data remains"),
     ):
         with pytest.raises(ValueError, match=message):
             colours.drop(**given)
@@ -130,12 +130,12 @@ def test_channels_are_selected() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({}, "select: nothing is given; it takes incidence, azimuth, theta_o, in_plane and channels"),
+        ({}, "select: no argument is given; it takes incidence, azimuth, theta_o, in_plane and channels"),
         ({"incidence": 35}, "incidence 35 is not in the data; there are 10, 30, 50 degrees"),
         ({"azimuth": 90}, "azimuth 90 is not in the data; there are 0, 60 degrees"),
         ({"theta_o": [20, 85]}, "theta_o 85 is not in the data; they go from 0 to 80 degrees"),
         ({"theta_o": slice(60, 20)}, r"theta_o is slice\(60, 20, None\); it must be slice\(low, high\)"),
-        ({"theta_o": slice(81, 85)}, "select: no sample of the data is all of this"),
+        ({"theta_o": slice(81, 85)}, "select: no sample of the data fulfils all of this"),
     ],
 )
 def test_bad_selections_are_refused(given, message: str) -> None:

@@ -32,7 +32,7 @@ def detected(spheres: tuple[Sphere, Sphere | None], of: Shares) -> np.ndarray:
         port, wall, other = 2 * k, 2 * k + 1, 2 * (1 - k)
         reflected = (of.diffuse_reflected, of.diffuse_reflected_behind)[k]
         passed = (of.diffuse_transmitted, of.diffuse_transmitted_up)[k]
-        areas = {name: sphere.share(name) for name in ("sample", "entrance", "detector")}
+        areas = {name: sphere.area_fraction(name) for name in ("sample", "entrance", "detector")}
         moves[wall, port] = (1.0 - areas["entrance"]) * sphere.wall
         moves[wall, wall] = (1.0 - sum(areas.values())) * sphere.wall
         moves[port, wall] = areas["sample"] * reflected + areas["detector"] * sphere.detector_reflectance
@@ -52,7 +52,7 @@ def test_two_spheres_exchange_light() -> None:
     passed = Shares(0.0, 1.0, 0.0, 0.0, 1.0, 1.0)
     both = (FRONT, BEHIND)
     expected = detected(both, OF) / [detected(both, plate)[0] / 0.98, detected(both, passed)[1]]
-    np.testing.assert_allclose(spheres.readings(OF), expected, rtol=1e-12)
+    np.testing.assert_allclose(spheres.measured(OF), expected, rtol=1e-12)
 
 
 def test_one_sphere_at_a_time() -> None:
@@ -61,9 +61,9 @@ def test_one_sphere_at_a_time() -> None:
     alone = OF._replace(diffuse_transmitted=0.0, diffuse_transmitted_up=0.0)
     both = (FRONT, BEHIND)
     expected = detected(both, alone) / [detected(both, plate)[0] / 0.9, detected(both, nothing)[1]]
-    np.testing.assert_allclose(spheres.readings(OF), expected, rtol=1e-12)
-    np.testing.assert_allclose(Spheres(FRONT, None, 0.9).readings(OF), [expected[0], OF.transmitted])
-    np.testing.assert_allclose(Spheres().readings(OF), [OF.reflected, OF.transmitted])
+    np.testing.assert_allclose(spheres.measured(OF), expected, rtol=1e-12)
+    np.testing.assert_allclose(Spheres(FRONT, None, 0.9).measured(OF), [expected[0], OF.transmitted])
+    np.testing.assert_allclose(Spheres().measured(OF), [OF.reflected, OF.transmitted])
 
 
 def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
@@ -72,7 +72,7 @@ def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
     totals = Totals.of(0.0, reflectance=0.1, transmittance=0.5, spheres=spheres)
     problem = Problem(lj.Stack([lj.Medium(Free(depth, 0.1, 2.0), 0.0)]), totals, lj.SingleScattering())
     passed = 2.0 * special.expn(3, depth)
-    expected = spheres.readings(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
+    expected = spheres.measured(Shares(0.0, np.exp(-depth), 0.0, 0.0, passed, passed))
     np.testing.assert_allclose(np.ravel(problem.predict([depth])), expected, rtol=1e-4)
 
 
@@ -81,7 +81,7 @@ def test_what_is_opaque_reflects_diffuse_light() -> None:
     totals = Totals.of(8.0, reflectance=0.5, spheres=spheres)
     problem = Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), totals, lj.SingleScattering())
     for albedo in (0.0, 0.3, 1.0):
-        expected, _ = spheres.readings(Shares(albedo, 0.0, albedo, 0.0, 0.0, 0.0))
+        expected, _ = spheres.measured(Shares(albedo, 0.0, albedo, 0.0, 0.0, 0.0))
         np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
 
 
@@ -140,11 +140,11 @@ def test_headers_say_which_spheres(tmp_path) -> None:
     ("make", "message"),
     [
         (lambda: Sphere(0.0, 0.0), "Sphere.diameter is 0.0, must be above 0"),
-        (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports leave nothing of the wall"),
+        (lambda: Sphere(100.0, 99.999, 95.0, 95.0), "the ports cover the whole wall"),
         (lambda: Sphere(100.0, 10.0, wall=1.0), r"Sphere.wall is 1.0, must be in \[0, 1\)"),
         (lambda: Sphere(100.0, 10.0, detector_reflectance=-0.1), "Sphere.detector_reflectance is -0.1"),
         (lambda: Spheres(FRONT, standard=0.0), r"Spheres.standard is 0.0, must be in \(0, 1\]"),
-        (lambda: Spheres(FRONT, together=True), "Spheres.together: there is but one sphere"),
+        (lambda: Spheres(FRONT, together=True), "Spheres.together: there is only one sphere"),
     ],
 )
 def test_bad_spheres(make, message: str) -> None:
@@ -154,5 +154,5 @@ def test_bad_spheres(make, message: str) -> None:
 
 def test_readings_are_functions_of_arrays() -> None:
     many = Shares(*(jnp.full(3, share) for share in OF))
-    found = Spheres(FRONT, BEHIND, together=True).readings(many)
+    found = Spheres(FRONT, BEHIND, together=True).measured(many)
     assert [part.shape for part in found] == [(3,), (3,)]

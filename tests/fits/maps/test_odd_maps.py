@@ -1,4 +1,4 @@
-"""Maps of all shapes and precisions, readings that no texel can have, models that break: each costs itself alone."""
+"""Maps of all shapes and precisions, values that no texel can have, models that break: each costs itself alone."""
 
 from dataclasses import replace
 
@@ -44,8 +44,8 @@ def test_maps_of_every_rank_are_the_same(tmp_path, given, whole, shape):
     assert apart(found, whole) < CLOSE
 
 
-def test_a_single_texel_and_readings_without_channels(tmp_path, given, whole):
-    found = fitted(tmp_path / "one.zarr", given[:1, :1, :, 0], sample=64)
+def test_a_single_texel_and_values_without_channels(tmp_path, given, whole):
+    found = fitted(tmp_path / "one.zarr", given[:1, :1, :, 0], pilot_texels=64)
     assert found.shape == (1, 1)
     for name in NAMES:
         assert abs(found.values[name][0, 0] - whole.values[name][0, 0]) < CLOSE * whole.errors[name][0, 0]
@@ -53,17 +53,17 @@ def test_a_single_texel_and_readings_without_channels(tmp_path, given, whole):
 
 def test_a_chunk_larger_than_the_map_is_the_map(tmp_path, given, whole):
     """And no program is made for a million texels, nor is another size another fit."""
-    found = fitted(tmp_path / "map.zarr", given, chunk=10**9, sample=10**6)
+    found = fitted(tmp_path / "map.zarr", given, chunk_size=10**9, pilot_texels=10**6)
     assert found.chunk == SHAPE
     assert apart(found, whole) < CLOSE
-    assert fitted(found.path, given, chunk=10**8, sample=10**6).done == 1.0
+    assert fitted(found.path, given, chunk_size=10**8, pilot_texels=10**6).done == 1.0
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16, ">f8"])
-def test_readings_of_other_types(tmp_path, given, whole, kind):
+def test_values_of_other_types(tmp_path, given, whole, kind):
     rounding = {"2": 1e-3, "4": 1e-7, "8": 1e-16}[str(np.dtype(kind).itemsize)]
     found = fitted(tmp_path / "map.zarr", given.astype(kind))
-    # all readings rounded the same way, in units of their noise of 2 %: sixteen of them weigh four times as much
+    # all values rounded the same way, in units of their noise of 2 %: sixteen of them weigh four times as much
     assert apart(found, whole) < CLOSE + 4.0 * 4.0 * rounding / NOISE.relative
 
 
@@ -71,8 +71,7 @@ def test_channels_have_numbers_of_their_own(tmp_path, given, whole):
     three = np.concatenate([given, given, 1.2 * given], axis=-1)
     albedo = fits.Free([0.4, 0.4, 0.4], 0.0, 1.0)
     stack = lj.Stack([lj.Medium(fits.Free(0.5, 0.05, 3.0), 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(albedo))
-    options = {"noise": NOISE, "transport": TRANSPORT, "chunk": 16, "sample": 8, "starts": 2}
-    found = fits.fit_map(stack, geometry(), three, tmp_path / "map.zarr", **options)
+    found = fitted(tmp_path / "map.zarr", three, stack)
     assert found.names == ("layers[0].thickness", "base.albedo[0]", "base.albedo[1]", "base.albedo[2]")
     assert found.has("converged").all()
     same = np.abs(found.values["base.albedo[0]"] - found.values["base.albedo[1]"]) / found.errors["base.albedo[0]"]
@@ -85,7 +84,7 @@ def awkward(given: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
     changed, flags = given.copy(), {}
     row = {
         "poor": [1e30, 0.0, -given[0, 2], 1e-300],
-        "too_few_readings": [np.nan, np.inf],
+        "too_few_measurements": [np.nan, np.inf],
         "failed": [1e300, -1e308],
     }
     for flag, numbers in row.items():
@@ -95,7 +94,7 @@ def awkward(given: np.ndarray) -> tuple[np.ndarray, dict[int, str]]:
     return changed, flags
 
 
-def test_readings_that_cannot_be_cost_their_texel_alone(tmp_path, given, whole):
+def test_values_that_cannot_be_cost_their_texel_alone(tmp_path, given, whole):
     changed, flags = awkward(given)
     found = fitted(tmp_path / "map.zarr", changed)
     for column, flag in flags.items():
@@ -124,7 +123,7 @@ def test_in_single_precision_errors_are_those_of_double(tmp_path, given, whole):
         np.testing.assert_allclose(found.errors[name], whole.errors[name], rtol=0.03)
 
 
-def test_readings_beyond_single_precision_are_left_out_there(tmp_path, given):
+def test_values_beyond_single_precision_are_left_out_there(tmp_path, given):
     changed = given.copy()
     changed[0, 0, 3] = 1e300
     jax.config.update("jax_enable_x64", False)
@@ -132,7 +131,7 @@ def test_readings_beyond_single_precision_are_left_out_there(tmp_path, given):
         found = fitted(tmp_path / "map.zarr", changed)
     finally:
         jax.config.update("jax_enable_x64", True)
-    assert found.readings[0, 0] == 15
+    assert found.measurements[0, 0] == 15
     assert found.has("converged").all()
 
 
@@ -166,8 +165,12 @@ def test_a_model_that_breaks_costs_what_lies_beyond(tmp_path, given, whole, tran
 
 
 def test_a_model_that_is_never_finite_is_said_at_once(tmp_path, given):
-    with pytest.raises(ValueError, match="no texel of the sample has a finite fit"):
-        fitted(tmp_path / "map.zarr", given, transport=lambda stack, wi, wo: jnp.nan * lj.evaluate(stack, wi, wo))
+    with pytest.raises(ValueError, match="no texel of the pilot has a finite fit"):
+        fitted(
+            tmp_path / "map.zarr",
+            given,
+            transport=lambda stack, wi, wo: jnp.nan * lj.evaluate(stack, wi, wo, TRANSPORT),
+        )
     assert not (tmp_path / "map.zarr").exists()
 
 
@@ -175,9 +178,9 @@ def test_what_leaves_nothing_to_fit_is_named(tmp_path, given):
     out, mask = tmp_path / "map.zarr", np.zeros(SHAPE, bool)
     with pytest.raises(ValueError, match="mask: no texel takes part, it is 0 everywhere"):
         fitted(out, given, mask=mask)
-    with pytest.raises(ValueError, match="no reading of a texel that takes part is a finite number"):
+    with pytest.raises(ValueError, match="no measurement of a texel that takes part is a finite number"):
         fitted(out, np.full_like(given, np.nan))
-    with pytest.raises(ValueError, match="no texel has as many readings as there are free parameters, 2"):
+    with pytest.raises(ValueError, match="no texel has as many measurements as there are free parameters, 2"):
         fits.fit_map(FREE, (geometry().wi[:1], geometry().wo[:1]), given[:, :, :1], out, NOISE, transport=TRANSPORT)
     for sigma, words in ((0.0, "sigma is 0 in block"), (-1.0, "sigma is -1 in block")):
         with pytest.raises(ValueError, match=words):
@@ -202,6 +205,6 @@ def test_noise_that_does_not_use_sigma_is_without_it(tmp_path, given, whole):
 def test_the_only_texel_that_can_be_fitted_is_found(tmp_path, given, whole):
     alone = np.full_like(given, np.nan)
     alone[5, 3] = given[5, 3]
-    found = fitted(tmp_path / "map.zarr", alone, sample=1)
+    found = fitted(tmp_path / "map.zarr", alone, pilot_texels=1)
     assert found.has("converged").sum() == 1
     assert abs(found.values[NAMES[0]][5, 3] - whole.values[NAMES[0]][5, 3]) < CLOSE * whole.errors[NAMES[0]][5, 3]

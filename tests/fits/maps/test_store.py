@@ -1,35 +1,46 @@
-"""The store of a map: what was written is read again, also by zarr and xarray alone; nothing is there half."""
+"""The store of a map: what was written is read again, also by zarr and xarray alone; nothing counts that is half there;
+and what is where a store is to be is resumed, refused by name, or thrown away if that is asked for."""
 
 import errno
+import functools
 import json
+import multiprocessing
 import os
-import re
 import shutil
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
 
 import fits
-from fits.maps import chunk_files
+import layerjax as lj
+from fits.engines.processes import AGAIN
 from fits.maps.fitted_map import open_map
-from fits.maps.store import FLAGS, NO_START, arrays_of, clean, create, left, write_chunk
+from fits.maps.store import FLAGS, NO_START, PARTIAL, Store, arrays_of, blocks_of, create, described
+from fits.store import fingerprint
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored
+from tests.helpers.quick_maps import assert_same, coat, fitted, values
 
 SHAPE, CHUNK = (7, 10), (4, 4)
-BLOCKS = [(slice(a, b), slice(c, d)) for a, b in ((0, 4), (4, 7)) for c, d in ((0, 4), (4, 8), (8, 10))]
+BLOCKS = list(blocks_of(SHAPE, CHUNK))
+FILE = Path("values") / NAMES[0] / "c" / "1" / "0"
 
 
-def empty(path: Path, **changed: Any) -> zarr.Group:
+def empty(path: Path, **changed: Any) -> Store:
     given = {"names": NAMES, "units": UNITS, "shape": SHAPE, "chunk": CHUNK, "attributes": ATTRIBUTES}
     return create(path, **{**given, "numerical": False, **changed})
 
 
 def part(found: dict[str, np.ndarray], block: tuple[slice, ...]) -> dict[str, np.ndarray]:
     return {name: values[block] for name, values in found.items()}
+
+
+# ---- what is written ----
 
 
 @pytest.mark.parametrize(
@@ -41,13 +52,14 @@ def test_what_is_written_is_read(shape: tuple[int, ...], chunk: tuple[int, ...],
     for name in NAMES:
         np.testing.assert_array_equal(map.values[name], found[f"values/{name}"])
         np.testing.assert_array_equal(map.errors[name], found[f"errors/{name}"])
-    for name in ("reduced_chi_square", "flags", "start", "at_bound", "readings", "numerical_error"):
+    for name in ("reduced_chi_square", "flags", "start", "at_bound", "measurements", "numerical_error"):
         np.testing.assert_array_equal(getattr(map, name), found[name])
         assert getattr(map, name).dtype == found[name].dtype
     assert (map.names, map.units, map.shape, map.done) == (NAMES, UNITS, shape, 1.0)
     assert map.attributes["noise"] == ATTRIBUTES["noise"]
-    assert left(zarr.open_group(map.path)) == []
+    assert Store(map.path).unfinished() == []
     assert fits.open_map(map.path).has("converged").all()
+    assert (map.option("starts"), map.option("converged_share")) == (8, 0.99)
 
 
 def test_zarr_and_xarray_read_it_without_us(tmp_path: Path) -> None:
@@ -68,14 +80,13 @@ def test_zarr_and_xarray_read_it_without_us(tmp_path: Path) -> None:
 
 
 def test_a_store_that_grows_is_nan_where_it_is_not_there(tmp_path: Path) -> None:
-    found, group = numbers(SHAPE), empty(tmp_path / "a.zarr")
+    found, store = numbers(SHAPE), empty(tmp_path / "a.zarr")
     map = open_map(tmp_path / "a.zarr")
-    assert left(group) == BLOCKS
+    assert store.unfinished() == BLOCKS
     assert map.done == 0.0
-    assert np.isnan(map.values["base.albedo"]).all()
     for block in BLOCKS[1:3]:
-        write_chunk(group, block, part(found, block))
-    assert left(group) == [BLOCKS[0], *BLOCKS[3:]]
+        store.write(block, part(found, block))
+    assert store.unfinished() == [BLOCKS[0], *BLOCKS[3:]]
     assert map.done == pytest.approx(4 * 6 / 70)
     there = np.zeros(SHAPE, bool)
     there[:4, 4:] = True
@@ -88,111 +99,70 @@ def test_bytes_are_the_same_for_the_same_numbers(tmp_path: Path) -> None:
     for name in ("a", "b"):
         stored(tmp_path / f"{name}.zarr", numbers(SHAPE), CHUNK)
     first, second = contents(tmp_path / "a.zarr"), contents(tmp_path / "b.zarr")
-    assert len(first) == 1 + 2 + 11 + 6 * 11  # the root, groups of values and errors, arrays, chunks
     assert {name.replace("a.zarr", "b.zarr"): content for name, content in first.items()} == second
 
 
-def test_what_fails_in_the_midst_leaves_nothing_of_the_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "a.zarr"
-    found, group = numbers(SHAPE), empty(path)
-    write_chunk(group, BLOCKS[0], part(found, BLOCKS[0]))
-    before, replaced, replace = contents(path), [], os.replace
+def test_a_full_disk_in_the_midst_of_a_chunk_is_named_and_the_chunk_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, store = numbers(SHAPE), empty(tmp_path / "a.zarr")
+    store.write(BLOCKS[0], part(found, BLOCKS[0]))
+    before, replaced, replace = contents(tmp_path / "a.zarr"), [], Path.replace
 
-    def full(source: str, target: str) -> None:
+    def full(source: Path, target: Path) -> None:
         replaced.append(target)
         if len(replaced) == 5:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), source)
         replace(source, target)
 
-    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="space") as caught:
-        write_chunk(group, BLOCKS[1], part(found, BLOCKS[1]))
+        store.write(BLOCKS[1], part(found, BLOCKS[1]))
     monkeypatch.undo()
-    assert caught.value.errno == errno.ENOSPC
-    assert caught.value.filename == str(path)
-    assert contents(path) == before
-    assert BLOCKS[1] in left(group)
-    write_chunk(group, BLOCKS[1], part(found, BLOCKS[1]))
-    assert BLOCKS[1] not in left(group)
+    assert (caught.value.errno, caught.value.filename) == (errno.ENOSPC, str(tmp_path / "a.zarr"))
+    assert store.unfinished() == BLOCKS[1:]
+    (tmp_path / "a.zarr" / "flags" / "c" / f"0.123{PARTIAL}").write_bytes(b"half")
+    store.clean(BLOCKS[1:])
+    assert contents(tmp_path / "a.zarr") == before
 
 
-def test_flags_are_written_last_and_go_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found, group, order = numbers(SHAPE), empty(tmp_path / "a.zarr"), []
-    write = chunk_files.write
-
-    def watched(array: Path, *arguments: Any) -> None:
-        order.append(array.name)
-        assert not chunk_files.file_at(tmp_path / "a.zarr" / "flags", (0, 0)).exists()
-        write(array, *arguments)
-
-    monkeypatch.setattr(chunk_files, "write", watched)
-    for _ in range(2):
-        write_chunk(group, BLOCKS[0], part(found, BLOCKS[0]))
-    assert order[10] == order[-1] == "flags"
-
-
-@pytest.mark.parametrize("size", [None, 0, 100])
-def test_a_chunk_with_a_damaged_file_is_left(size: int | None, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", [None, 0, 100, "flipped"])
+def test_a_damaged_chunk_is_told_and_unfinished(damage: Any, tmp_path: Path) -> None:
     map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
-    file = map.path / "values" / NAMES[0] / "c" / "1" / "0"
-    assert file.stat().st_size == 4 * 4 * 8 + 4
-    if size is None:
+    file = map.path / FILE
+    content = file.read_bytes()
+    assert len(content) == 4 * 4 * 8 + 4
+    if damage is None:
         file.unlink()
         assert np.isnan(map.values[NAMES[0]][4:, :4]).all()
     else:
-        os.truncate(file, size)
-        with pytest.raises(ValueError, match=rf"^{re.escape(str(file))}: damaged, holds {size} bytes, must be 132$"):
+        file.write_bytes(bytes([content[0] ^ 0x5A]) + content[1:] if damage == "flipped" else content[:damage])
+        with pytest.raises(
+            ValueError, match=rf"a\.zarr/values/{NAMES[0].replace('[', '.').replace(']', '.')}: damaged, "
+        ):
             map.values[NAMES[0]]
-    assert left(zarr.open_group(map.path)) == [BLOCKS[3]]
-
-
-def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
-    map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
-    before = contents(map.path)
-    for folder in ("flags/c/0", "values/base.albedo/c/1"):
-        (map.path / folder / f"0.123{chunk_files.PARTIAL}").write_bytes(b"half")
-    clean(map.path)
-    assert contents(map.path) == before
+    store = Store(map.path)
+    assert store.unfinished() == [BLOCKS[3]]
+    store.clean(store.unfinished())
+    store.write(BLOCKS[3], part(numbers(SHAPE), BLOCKS[3]))
+    assert store.unfinished() == []
 
 
 def test_a_store_rewritten_with_compression_can_be_read(tmp_path: Path) -> None:
     found = numbers(SHAPE)
     map = stored(tmp_path / "a.zarr", found, CHUNK)
     shutil.rmtree(map.path / "flags")
-    root = zarr.open_group(map.path)
-    root.create_array("flags", data=found["flags"], chunks=(2, 3))
-    assert open_map(map.path).done == 1.0
+    zarr.open_group(map.path).create_array("flags", data=found["flags"], chunks=(2, 3))
     np.testing.assert_array_equal(open_map(map.path).flags, found["flags"])
 
 
-def test_many_parameters_have_a_bit_each(tmp_path: Path) -> None:
-    names = [f"base.albedo[{index}]" for index in range(40)]
-    assert arrays_of(names, False)["at_bound"][0] == np.uint64
-    with pytest.raises(ValueError, match=r"^names: 65 parameters given, must be 1 to 64 and different$"):
-        empty(tmp_path / "a.zarr", names=[str(index) for index in range(65)])
-
-
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"shape": (7, 0)}, r"shape: \(7, 0\) given"),
-        ({"shape": (), "chunk": ()}, r"shape: \(\) given"),
-        ({"chunk": (4,)}, "chunk: has 1 axes, must be 2"),
-        ({"names": ("a", "a")}, "names: 2 parameters given"),
-    ],
-)
-def test_what_cannot_be_a_store_is_refused(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=words):
-        empty(tmp_path / "a.zarr", **changed)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_store_replaces_nothing_and_is_not_made_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_is_not_made_half_nor_in_the_place_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert arrays_of([f"base.albedo[{index}]" for index in range(40)], False)["at_bound"][0] == np.uint64
     (tmp_path / "a.zarr").write_text("mine")
     with pytest.raises(ValueError, match="exists already"):
         empty(tmp_path / "a.zarr")
-    with pytest.raises(ValueError, match="there is no directory"):
-        empty(tmp_path / "none" / "a.zarr")
+    with pytest.raises(ValueError, match=r"^names: 65 parameters given, must be at most 64$"):
+        empty(tmp_path / "b.zarr", names=[str(index) for index in range(65)])
 
     def killed(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -203,28 +173,17 @@ def test_a_store_replaces_nothing_and_is_not_made_half(tmp_path: Path, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
 
 
-def test_results_must_be_those_of_a_chunk(tmp_path: Path) -> None:
-    found, group = numbers(SHAPE), empty(tmp_path / "a.zarr")
-    with pytest.raises(ValueError, match="is no chunk"):
-        write_chunk(group, (slice(0, 4), slice(2, 6)), part(found, (slice(0, 4), slice(2, 6))))
-    with pytest.raises(ValueError, match=r"'flags'.* are not both"):
-        write_chunk(group, BLOCKS[0], {name: one for name, one in part(found, BLOCKS[0]).items() if name != "flags"})
-    with pytest.raises(ValueError, match=r"shape \(3, 4\), must be \(4, 4\)"):
-        write_chunk(group, BLOCKS[0], part(found, BLOCKS[3]))
-    assert left(group) == BLOCKS
-
-
 def test_a_store_that_was_removed_is_not_made_again(tmp_path: Path) -> None:
-    found, group = numbers(SHAPE), empty(tmp_path / "a.zarr")
+    found, store = numbers(SHAPE), empty(tmp_path / "a.zarr")
     shutil.rmtree(tmp_path / "a.zarr")
     with pytest.raises(OSError, match=r"No such file.*a\.zarr"):
-        write_chunk(group, BLOCKS[0], part(found, BLOCKS[0]))
+        store.write(BLOCKS[0], part(found, BLOCKS[0]))
     assert not (tmp_path / "a.zarr").exists()
 
 
 def _root(path: Path, change: Any) -> None:
     described = json.loads((path / "zarr.json").read_text())
-    change(described)
+    change(described["attributes"]["layerjax"])
     (path / "zarr.json").write_text(json.dumps(described))
 
 
@@ -236,17 +195,14 @@ def _root(path: Path, change: Any) -> None:
         (lambda path: (path / "zarr.json").unlink(), "is a directory without zarr.json, must be the store"),
         (lambda path: (path / "zarr.json").write_text("{"), "not valid JSON"),
         (lambda path: (path / "zarr.json").write_text("[]"), "is no group of zarr arrays"),
-        (lambda path: _root(path, lambda root: root["attributes"].clear()), "is a zarr group that is not ours"),
-        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(kind="x")), "holds a x, must be"),
-        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(format=1)), "is version 1 of the"),
-        (
-            lambda path: _root(path, lambda root: root["attributes"]["layerjax"].pop("names")),
-            "damaged, KeyError 'names'",
-        ),
-        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(shape=7)), "damaged, TypeError"),
+        (lambda path: (path / "zarr.json").write_text('{"node_type": "group"}'), "is a zarr group that is not ours"),
+        (lambda path: _root(path, lambda about: about.update(kind="x")), "holds a x, must be"),
+        (lambda path: _root(path, lambda about: about.update(format=1)), "is version 1 of the"),
+        (lambda path: _root(path, lambda about: about.pop("names")), "damaged, KeyError 'names'"),
+        (lambda path: _root(path, lambda about: about.update(shape=7)), "damaged, TypeError"),
+        (lambda path: _root(path, lambda about: about.update(shape=[7, 9])), "has shape"),
         (lambda path: shutil.rmtree(path / "flags"), "damaged, .*flags"),
         (lambda path: (path / "flags" / "zarr.json").write_text("{"), "damaged, "),
-        (lambda path: _root(path, lambda root: root["attributes"]["layerjax"].update(shape=[7, 9])), "has shape"),
     ],
 )
 def test_what_is_no_such_store_says_what_it_is(damage: Any, words: str, tmp_path: Path) -> None:
@@ -262,37 +218,214 @@ def test_names_that_are_not_there_are_told(tmp_path: Path) -> None:
     map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
     with pytest.raises(ValueError, match=r"meaning: 'good' given, must be one of fitted, "):
         map.has("good")
-    with pytest.raises(KeyError, match=r"base\.albedo"):
-        map.values["albedo"]
-    with pytest.raises(KeyError, match="reduced_chi_square"):
-        map["chi"]
+    for ask, words in (
+        (lambda: map.values["albedo"], r"base\.albedo"),
+        (lambda: map["chi"], "reduced_chi_square"),
+        (lambda: map["smoothed/values/base.albedo"], "is not one of"),
+    ):
+        with pytest.raises(KeyError, match=words):
+            ask()
     assert map.numerical_error is None
     assert repr(map).startswith("<FittedMap of 7 x 10 texels, 100 % done: layers[0].thickness, ")
     assert len(map.values) == 3
 
 
-@pytest.mark.parametrize("at", [0, 40, 130])
-def test_flipped_bytes_are_damage_and_done_again(at: int, tmp_path: Path) -> None:
-    """Of the numbers and of the checksum; zarr by itself sees it as well."""
-    map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
-    file = map.path / "values" / NAMES[0] / "c" / "1" / "0"
-    content = bytearray(file.read_bytes())
-    content[at : at + 16] = bytes(byte ^ 0x5A for byte in content[at : at + 16])
-    file.write_bytes(content)
-    with pytest.raises(
-        ValueError, match=rf"^{re.escape(str(file))}: damaged, its checksum is not that of its content$"
-    ):
-        map.values[NAMES[0]]
-    with pytest.raises(ValueError, match="checksum"):
-        map[f"values/{NAMES[0]}"][...]
-    assert left(zarr.open_group(map.path)) == [BLOCKS[3]]
+# ---- whose map it is ----
 
 
-def test_what_is_written_is_what_zarr_reads_and_writes(tmp_path: Path) -> None:
-    found = numbers(SHAPE)
-    map = stored(tmp_path / "a.zarr", found, CHUNK)
-    name = f"values/{NAMES[0]}"
-    np.testing.assert_array_equal(map[name][...], found[name])
-    before = contents(map.path)
-    zarr.open_group(map.path, mode="r+")[name][...] = found[name]
-    assert contents(map.path) == before
+@pytest.fixture(scope="module")
+def given() -> np.ndarray:
+    return values((8, 8))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, given):
+    return fitted(tmp_path_factory.mktemp("map") / "coat.zarr", given)
+
+
+@pytest.fixture
+def out(tmp_path, whole):
+    """A copy of it."""
+    return shutil.copytree(whole.path, tmp_path / "coat.zarr")
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"seed": 1}, "seed"),
+        ({"chunk_size": 8}, "chunk_size"),
+        ({"starts": 3, "pilot_texels": 9}, "starts, pilot_texels"),
+        ({"stack": coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 0.9))}, "stack"),
+        ({"noise": fits.Noise(relative=0.03)}, "noise"),
+        ({"transport": lj.WeidlichWilkie()}, "transport"),
+        ({"mask": np.eye(8, dtype=bool)}, "measurements"),
+        ({"sigma": np.full((8, 8, 16, 1), 0.1)}, "measurements"),
+    ],
+)
+def test_what_differs_is_named(whole, given, changed, named):
+    with pytest.raises(ValueError, match=rf"holds a map of another fit, different in {named} \(--force"):
+        fitted(whole.path, given, **changed)
+
+
+def test_thresholds_of_verdicts_make_no_other_fit(out, given, whole):
+    assert_same(fitted(out, given, converged_share=0.5, chi_square_sigmas=5.0), whole)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_what_is_not_ours_is_never_touched(tmp_path, given, force):
+    zarr.create_group(tmp_path / "group.zarr", attributes={"mine": 1})
+    zarr.create_array(tmp_path / "array.zarr", shape=(3,), dtype="f8")
+    (tmp_path / "file.zarr").write_text("precious")
+    (tmp_path / "folder.zarr").mkdir()
+    (tmp_path / "torn.zarr").mkdir()
+    (tmp_path / "torn.zarr" / "zarr.json").write_text('{"attributes": {"layerjax": {"kind": "fitted')
+    for name, words in {
+        "group": "a zarr group that is not ours",
+        "array": "no group of zarr arrays",
+        "file": "is there, and is no fitted map",
+        "folder": "is there, and is no fitted map",
+        "torn": r"zarr\.json: damaged, not valid JSON",
+    }.items():
+        path = tmp_path / f"{name}.zarr"
+        with pytest.raises(ValueError, match=words) as error:
+            fitted(path, given, force=force)
+        assert str(error.value).startswith(str(path))
+    assert zarr.open_group(tmp_path / "group.zarr", mode="r").attrs["mine"] == 1
+    assert not list(tmp_path.glob("*.lock"))
+    with pytest.raises(ValueError, match=r"coat\.zarr: there is no directory"):
+        fitted(tmp_path / "no" / "such" / "coat.zarr", given)
+
+
+def test_a_damaged_store_is_named_and_can_be_thrown_away(out, given, whole):
+    shutil.rmtree(out / "flags")
+    with pytest.raises(ValueError, match=rf"{out}: damaged"):
+        fitted(out, given)
+    assert_same(fitted(out, given, force=True), whole)
+
+
+@pytest.mark.parametrize("damaged", ["zarr.json", "vectors/zarr.json", "vectors/c/0/0"])
+def test_what_chunks_have_in_common_is_found_again_where_it_is_damaged(out, given, whole, damaged):
+    shutil.rmtree(out / "flags" / "c" / "0")
+    place = out / "pilot" / damaged
+    place.write_bytes(place.read_bytes()[:10])
+    assert_same(fitted(out, given), whole)
+
+
+def test_force_keeps_what_is_of_the_same_fit_and_a_map_until_there_can_be_another(out, given, whole):
+    told = []
+    fitted(out, given, force=True, progress=lambda *what: told.append(what))
+    assert told == [("map", 4, 4, "")]
+
+    def interrupt(stage, *_):
+        assert stage == "pilot"
+        raise KeyboardInterrupt
+
+    with pytest.raises(ValueError, match="mask: no texel takes part"):
+        fitted(out, given, mask=np.zeros((8, 8), bool), force=True)
+    with pytest.raises(KeyboardInterrupt):
+        fitted(out, given, seed=1, force=True, progress=interrupt)
+    assert_same(fits.open_map(out), whole)
+
+
+def test_what_killed_runs_left_beside_it_is_taken_away(tmp_path, given):
+    for name in (".coat.zarr.abcd.partial", ".other.zarr.abcd.partial"):
+        (tmp_path / name / "values").mkdir(parents=True)
+    (tmp_path / "coat.zarr.lock").write_text("123\n")
+    fitted(tmp_path / "coat.zarr", given)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".other.zarr.abcd.partial", "coat.zarr"]
+
+
+def test_one_writer_also_by_a_link(tmp_path, out, given):
+    (tmp_path / "other").mkdir()
+    link = tmp_path / "other" / "link.zarr"
+    link.symlink_to(out)
+    refused = []
+
+    def second(stage, done, total=None, info=""):
+        with pytest.raises(ValueError, match="in use by another process"):
+            fitted(out, given)
+        refused.append(stage)
+
+    fitted(link, given, progress=second)
+    assert refused
+    assert fitted(link, given, seed=5, force=True).attributes["options"]["seed"] == 5
+    assert link.is_symlink()
+    assert fits.open_map(out).attributes["options"]["seed"] == 5
+
+
+def test_the_script_of_a_worker_ends_before_it_does_anything(tmp_path, given, monkeypatch):
+    """As a script without a guard has it, which workers run again."""
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit) as end:
+        fitted(tmp_path / "coat.zarr", given, processes=2)
+    assert end.value.code == AGAIN
+    assert not list(tmp_path.iterdir())
+
+
+def test_chunks_that_vanish_while_it_runs_are_told_of(tmp_path, given):
+    out = tmp_path / "coat.zarr"
+
+    def meddle(stage, done, total=None, info=""):
+        if stage == "map" and done == total:
+            next(out.glob("flags/c/*/*")).unlink()
+
+    with pytest.raises(ValueError, match="was written, and is not there; all other chunks are done"):
+        fitted(out, given, progress=meddle)
+    assert fitted(out, given).done == 1.0
+
+
+# ---- fingerprints: functions by what they do, wherever they are in memory ----
+
+
+def digest(tree):
+    return fingerprint(of=described(tree))["of"]
+
+
+def scaled(factor):
+    return lambda stack, wi, wo: factor * wi
+
+
+def recursive(limit):
+    def down(count):
+        return 0 if count > limit else down(count + 1)
+
+    return down
+
+
+class Scaled:
+    def __init__(self, factor):
+        self.factor = jnp.asarray(factor)
+
+    def __repr__(self):
+        return f"Scaled({self.factor})"
+
+    def transport(self, stack, wi, wo):
+        return self.factor * wi
+
+
+FUNCTIONS = {
+    "closure": scaled,
+    "array": lambda factor: scaled(factor * np.arange(3.0)),
+    "nested": lambda factor: lambda stack, wi, wo: jax.tree.map(lambda one: factor * one, wi),
+    "partial": lambda factor: functools.partial(scaled(1.0), wi=factor),
+    "compiled": lambda factor: jax.jit(scaled(factor)),
+    "recursive": recursive,
+    "method": lambda factor: Scaled(factor).transport,
+    "of a function": lambda factor: scaled(scaled(factor)),
+}
+
+
+@pytest.mark.parametrize("kind", FUNCTIONS)
+def test_a_function_is_known_again_by_what_it_holds(kind):
+    made = FUNCTIONS[kind]
+    assert digest({"of": made(2.0)}) == digest({"of": made(2.0)}) != digest({"of": made(3.0)})
+
+
+def test_a_function_is_told_from_others_of_its_name_by_what_it_does():
+    bodies = [
+        *(lambda x: jnp.sin(x), lambda x: jnp.cos(x), lambda x: 2.0 * jnp.sin(x), lambda x, y=1.0: jnp.sin(x)),
+        *(lambda x, y=2.0: jnp.sin(x), lambda x: [3.0 * one for one in x], lambda x: [4.0 * one for one in x]),
+    ]
+    assert len({one.__qualname__ for one in bodies}) == 1
+    assert len({digest(one) for one in bodies}) == len(bodies)
+    assert digest(scaled(object())) == digest(scaled(object()))  # by no place in memory

@@ -136,13 +136,13 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, progress=stop, checkpoint=kept)
     run: list[str] = []
-    end = starts_module.rough_end
+    end = starts_module.rough_descent
 
-    def counted(problem: FittingProblem, point: Floats) -> starts_module.End:
+    def counted(problem: FittingProblem, point: Floats) -> starts_module.StartOutcome:
         run.append(type(problem).__name__)
         return end(problem, point)
 
-    monkeypatch.setattr(starts_module, "rough_end", counted)
+    monkeypatch.setattr(starts_module, "rough_descent", counted)
     found = fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(found.vector, wrong.vector)
     assert len(run) == 1  # of two starts and, with shared errors, three

@@ -87,7 +87,10 @@ def test_a_race_ends_where_all_starts_do(name, monkeypatch):
     problem = Problem(given.stack, data, lj.SingleScattering(), replace(given.noise, discrepancy=False), given.scale)
     points = starts_module.start_points(problem, 8, 0)
     monkeypatch.setattr(starts_module, "EARLY", 10)
-    ends, every = starts_module.race(problem, points), multi_start(problem, points, "least_squares", lambda *told: None)
+    ends, every = (
+        starts_module.screened_starts(problem, points),
+        multi_start(problem, points, "least_squares", lambda *told: None),
+    )
     assert min(end.cost for end in ends) <= min(end.cost for end in every) + LEAST_GAIN
     left = [end for end in ends if end.max_steps_reached]
     assert 1 <= len(left) <= len(points) - starts_module.FRONT
@@ -132,7 +135,7 @@ class Dimmed:
 def test_starts_are_known_again_by_a_process_with_the_transport_elsewhere_in_memory(made, tmp_path, monkeypatch):
     transports = made(), made()  # both at once, so that they differ in place
     fit(LINE, line_data(), transport=transports[0], starts=2, checkpoint=tmp_path / "starts")
-    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
     fit(LINE, line_data(), transport=transports[1], starts=2, checkpoint=tmp_path / "starts")
 
 

@@ -14,7 +14,8 @@ from fits.optimise import multi_start as starts_module
 from fits.optimise import refinement
 from fits.optimise import resolution as resolution_module
 from fits.optimise.fit import fit
-from fits.optimise.resolution import LEAST_SCATTER, SUFFICIENT, resolutions, spread
+from fits.optimise.options import DEFAULT
+from fits.optimise.resolution import LEAST_SCATTER, resolutions, spread
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -58,14 +59,14 @@ def test_a_fit_is_refined_until_its_error_is_a_tenth_of_the_noise(refined, sharp
     transport = found.problem.transport
     assert isinstance(transport, lj.AddingDoubling)
     assert transport.nodes > COARSE.nodes
-    assert found.numerical_error <= SUFFICIENT
+    assert found.numerical_error <= DEFAULT.numerical_error
     assert found.resolution == f"{transport.nodes} nodes, {transport.modes} modes"
     assert f"numerical error of the model: {found.numerical_error:.2g} sigma at most" in found.status
     # against the resolution that made the data, the error is what is said, within the factor of one more rung
     exact = lj.evaluate(
         lacquered(found.values["base.alpha"]), sharp.wi, sharp.wo, lj.AddingDoubling(nodes=32, modes=48)
     )
-    assert np.max(np.abs(found.predicted - exact) / sharp.sigma) < 2.0 * SUFFICIENT
+    assert np.max(np.abs(found.predicted - exact) / sharp.sigma) < 2.0 * DEFAULT.numerical_error
     assert abs(found.values["base.alpha"] - NARROW) < 3.0 * found.standard_errors["base.alpha"]
     assert found.converged
     assert found.minima[0].count == 2
@@ -79,13 +80,13 @@ def as_fine(transport, other):
 def test_a_coarse_one_stays_where_it_will_do():
     found = fit(STACK, measured(WIDE, 0.05), starts=2)
     assert as_fine(found.problem.transport, COARSE)
-    assert found.numerical_error <= SUFFICIENT
+    assert found.numerical_error <= DEFAULT.numerical_error
 
 
 def test_a_resolution_that_is_given_stays_and_its_error_is_told(sharp):
     found = fit(STACK, sharp, transport=COARSE, starts=1)
     assert found.problem.transport == COARSE
-    assert found.numerical_error > SUFFICIENT
+    assert found.numerical_error > DEFAULT.numerical_error
     assert "sigma at most at 6 nodes, 12 modes, as given" in found.status
     _, remarks, sound = verdicts.verdict(found)
     assert not sound
@@ -102,7 +103,7 @@ def test_the_finest_resolution_is_told(sharp, monkeypatch):
 
 def test_a_fit_goes_on_with_the_starts_that_are_done(refined, sharp, monkeypatch):
     found, kept = refined
-    monkeypatch.setattr(starts_module, "rough_end", None)  # no start is run again
+    monkeypatch.setattr(starts_module, "rough_descent", None)  # no start is run again
     again = fit(STACK, sharp, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(again.vector, found.vector)
     assert again.problem.transport == found.problem.transport
@@ -174,10 +175,10 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
             return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
 
     monkeypatch.undo()
-    needed, error, finest = refinement._needed(known, here, Alike(), lambda *_: None)
+    needed, error, finest = refinement._needed(known, here, Alike(), DEFAULT.numerical_error, lambda *_: None)
     assert (needed.nodes, finest) == (12, False)
     assert needed.modes > 30
-    assert error <= SUFFICIENT
+    assert error <= DEFAULT.numerical_error
 
 
 def test_what_is_given_in_part_stays():

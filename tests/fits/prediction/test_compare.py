@@ -41,7 +41,7 @@ def test_criteria_are_those_of_the_books(fits: dict) -> None:
 
 
 def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
-    """Exact leave-one-out of a linear model with known noise; flat priors are wide enough to be left out."""
+    """Exact leave-one-out of a linear model with known noise; flat priors are wide enough to be omitted."""
     posteriors = {name: sample(entry, walkers=16, seed=0) for name, entry in fits.items()}
     comparison = compare(posteriors)
     assert comparison.sorted_by == "loo"
@@ -58,7 +58,7 @@ def test_leave_one_out_is_that_of_the_regression(fits: dict) -> None:
         assert row.unreliable == 0
     assert comparison.rows[0].loo_diff == 0
     assert comparison.rows[1].loo_diff > 3 * comparison.rows[1].loo_dse
-    assert comparison.verdict[0].startswith("The data prefer line to flat: it expects new data")
+    assert comparison.verdict[0].startswith("The data prefer line to flat: elpd difference")
 
 
 def test_the_verdict_says_what_the_data_prefer(fits: dict) -> None:
@@ -68,11 +68,14 @@ def test_the_verdict_says_what_the_data_prefer(fits: dict) -> None:
 
     rows = compare(fits).rows
     aic, bic = rows[1].aic - rows[0].aic, rows[1].bic - rows[0].bic
-    assert verdict(FLAT) == f"The data prefer line to other: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+    assert verdict(FLAT) == f"The data prefer line to other: AIC difference {aic:.1f}, BIC difference {bic:.1f}."
     slope, error = fits["line"].values["['b']"], fits["line"].standard_errors["['b']"]
     nearly = verdict({"a": Free(0.9, -1.0, 3.0), "b": slope + 0.4 * error})
     aic, bic = 2 - 0.16, math.log(COUNT) - 0.16  # a parameter less, for 0.4 standard errors
-    assert nearly == f"The data do not tell other from line: AIC lower by {aic:.1f}, BIC by {bic:.1f}."
+    assert (
+        nearly
+        == f"other and line are statistically indistinguishable: AIC difference {aic:.1f}, BIC difference {bic:.1f}."
+    )
 
 
 def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
@@ -82,7 +85,7 @@ def test_a_misfit_counts_as_noise_in_the_verdict() -> None:
     best, other = comparison.rows
     assert 80 < best.reduced_chi_square < 130
     gain = (other.chi_square - best.chi_square) / best.reduced_chi_square
-    words = f"AIC lower by {gain - 2:.1f}, BIC by {gain - math.log(COUNT):.1f} (the scatter that line leaves counted"
+    words = f"AIC difference {gain - 2:.1f}, BIC difference {gain - math.log(COUNT):.1f} (noise scaled to the residuals"
     assert words in comparison.verdict[0]
 
 

@@ -1,10 +1,9 @@
-"""What is foretold of what is left out, evidence and weights, beside linear regression, where all of them are known."""
+"""Cross-validation, evidence and stacking weights, beside linear regression, where all of them are known."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits.prediction.conditional import without
 from scipy import stats
 from scipy.special import logsumexp
 
@@ -14,7 +13,7 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.average import average
 from fits.prediction.compare import compare
-from fits.prediction.cross_validation import CrossValidation, cross_validate, groups_of
+from fits.prediction.cross_validation import CrossValidation, cross_validate, groups_of, without
 from fits.prediction.evidence import Evidence, evidence, posterior_draws
 from fits.prediction.model_scores import model_scores, rank_models, stacking
 from fits.prediction.predict import predict
@@ -31,7 +30,7 @@ STACK = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": Free(0.1, -4.0, 5.0, 
 FLAT = {"a": Free(0.9, -4.0, 6.0, Normal(1.0, 0.5)), "b": 0.0}
 
 
-def readings(seed: int = 0) -> Measurements:
+def measurements(seed: int = 0) -> Measurements:
     exact = np.asarray(line({"a": 1.0, "b": 0.5}, GEOMETRY.wi, GEOMETRY.wo))
     values = exact + SIGMA * np.random.default_rng(seed).standard_normal(exact.shape)
     sigma = np.full_like(values, SIGMA)
@@ -40,37 +39,37 @@ def readings(seed: int = 0) -> Measurements:
 
 @pytest.fixture(scope="module")
 def found() -> Fit:
-    return fit(STACK, readings(), transport=line, noise=Noise(discrepancy=False), starts=2)
+    return fit(STACK, measurements(), transport=line, noise=Noise(discrepancy=False), starts=2)
 
 
 @pytest.fixture(scope="module")
 def flat() -> Fit:
-    return fit(FLAT, readings(), transport=line, noise=Noise(discrepancy=False), starts=2)
+    return fit(FLAT, measurements(), transport=line, noise=Noise(discrepancy=False), starts=2)
 
 
 def regression(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the parameters, from these rows and the priors."""
-    data = readings()
+    data = measurements()
     columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)[rows]
     precision = columns.T @ columns / SIGMA**2 + np.diag(1.0 / np.array([0.5, 0.4]) ** 2)
     pulled = columns.T @ data.values[rows, 0] / SIGMA**2 + np.array([1.0, 0.5]) / np.array([0.5, 0.4]) ** 2
     return np.linalg.solve(precision, pulled), np.linalg.inv(precision)
 
 
-def test_rows_that_are_left_out_count_for_nothing(found: Fit) -> None:
-    rows = np.arange(len(readings())) % 3 == 0
+def test_held_out_rows_have_no_influence(found: Fit) -> None:
+    rows = np.arange(len(measurements())) % 3 == 0
     left = without(found.problem, rows)
-    fewer = Problem(STACK, readings().where(~rows), line, Noise(discrepancy=False))
+    fewer = Problem(STACK, measurements().where(~rows), line, Noise(discrepancy=False))
     for vector in (found.vector, np.array([0.0, 2.0])):
         gaps = [float(of.log_likelihood(vector) - of.log_likelihood([1.0, 0.5])) for of in (left, fewer)]
         assert gaps[0] == pytest.approx(gaps[1], abs=1e-6)
 
 
-def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
-    rows = np.arange(len(readings())) % 3 == 0
+def test_held_out_rows_have_no_influence_on_a_discrepancy() -> None:
+    rows = np.arange(len(measurements())) % 3 == 0
     noise = Noise(discrepancy=True)
-    whole, fewer = (Problem(STACK, data, line, noise) for data in (readings(), readings().where(~rows)))
-    # of so few readings all are nodes, in both
+    whole, fewer = (Problem(STACK, data, line, noise) for data in (measurements(), measurements().where(~rows)))
+    # so few measurements are all inducing points, in both
     for of in (whole, fewer):
         np.testing.assert_allclose(np.max(of.model.process.weights, axis=-1), 1.0, atol=1e-6)
     left = without(whole, rows)
@@ -79,8 +78,8 @@ def test_rows_left_out_of_shared_errors_count_for_nothing() -> None:
     assert gaps[0] == pytest.approx(gaps[1], abs=1e-3)
 
 
-def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
-    left, data = cross_validate(found, draws=2000), readings()
+def test_held_out_data_are_predicted_by_the_others(found: Fit) -> None:
+    left, data = cross_validate(found, draws=2000), measurements()
     assert left.groups == ("θᵢ = 10°", "θᵢ = 30°", "θᵢ = 50°")
     assert left.converged
     for rows in left.rows:
@@ -90,20 +89,20 @@ def test_what_is_left_out_is_foretold_by_the_others(found: Fit) -> None:
         width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
         expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
-    assert left.elpd == pytest.approx(left.by_group.sum())
+    assert left.elpd == pytest.approx(left.elpd_by_group.sum())
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_what_leaves_a_ridge_open_is_foretold(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a level times a scale the product alone is known; draws for all readings spare the ridge without some."""
-    data = readings(1)
+def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the product of a level and a scale is identified; draws of the whole posterior follow the ridge."""
+    data = measurements(1)
     level = replace(data, values=1.0 + data.values - np.asarray(line({"a": 1.0, "b": 0.5}, data.wi, data.wo)))
     stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
-    open_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(discrepancy=False), starts=2)
-    draws = posterior_draws(open_fit) if known else None
+    ridge_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(discrepancy=False), starts=2)
+    draws = posterior_draws(ridge_fit) if known else None
     followed: list[Fit] = []
     monkeypatch.setattr(Mixture, "of", lambda fit, of=Mixture.of: followed.append(fit) or of(fit))
-    left = cross_validate(open_fit, draws=2000, known=draws)
+    left = cross_validate(ridge_fit, draws=2000, posterior=draws)
     assert len(followed) == (0 if known else 3)
     for rows in left.rows:
         others = np.setdiff1d(np.arange(len(level)), rows)
@@ -112,8 +111,8 @@ def test_what_leaves_a_ridge_open_is_foretold(known: bool, monkeypatch: pytest.M
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
 
 
-def test_few_incidences_are_left_out_by_stretches() -> None:
-    data = readings()
+def test_few_incidences_are_held_out_by_parts_of_scans() -> None:
+    data = measurements()
     one = data.where(np.abs(data.theta_i - 10.0) < 1.0).used()
     groups = groups_of(one)
     assert sorted(np.concatenate(list(groups.values()))) == list(range(len(one)))
@@ -122,9 +121,9 @@ def test_few_incidences_are_left_out_by_stretches() -> None:
         assert np.ptp(one.theta_o[rows] * np.sign(one.wo[rows, 0])) < 40.0
 
 
-def test_readings_in_no_group_say_nothing_of_what_is_foretold() -> None:
-    """Of one incidence a scan, and three readings of another plane, too few to leave some of them out."""
-    data = readings()
+def test_measurements_in_no_group_do_not_count() -> None:
+    """One scan at one incidence, and three measurements in another plane, too few to hold some out."""
+    data = measurements()
     scan = np.abs(data.theta_i - 10.0) < 1.0
     aside = np.flatnonzero(scan)[:3]
     wo = data.wo.copy()
@@ -134,12 +133,12 @@ def test_readings_in_no_group_say_nothing_of_what_is_foretold() -> None:
     alone = np.setdiff1d(np.arange(scan.sum()), np.concatenate(left.rows))
     assert alone.size == 3
     assert np.all(left.log_density[alone] == 0.0)
-    assert left.elpd == pytest.approx(left.by_group.sum())
+    assert left.elpd == pytest.approx(left.elpd_by_group.sum())
 
 
 @pytest.mark.parametrize("stack", ["line", "flat"])
 def test_evidence_is_that_of_regression(found: Fit, flat: Fit, stack: str) -> None:
-    data = readings()
+    data = measurements()
     columns = np.stack([np.ones(len(data)), data.wo[:, 2]], axis=-1)
     prior = np.diag(np.array([0.5, 0.4]) ** 2)
     mean = columns @ [1.0, 0.5]
@@ -168,9 +167,9 @@ def test_weights_of_stacking_are_the_best() -> None:
     np.testing.assert_allclose(stacking(np.array([[0.0, 0.0], [-50.0, -50.0]])), [1.0, 0.0], atol=1e-6)
 
 
-def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
+def test_fits_are_ranked_by_elpd(found: Fit, flat: Fit) -> None:
     compared = compare({"flat": flat, "line": found}, refit=True)
-    assert compared.sorted_by == "left_out"
+    assert compared.sorted_by == "elpd"
     best, other = compared.rows
     assert (best.name, other.name) == ("line", "flat")
     assert best.model_score.elpd_diff == 0.0
@@ -178,13 +177,13 @@ def test_fits_are_ranked_by_what_they_foretell(found: Fit, flat: Fit) -> None:
     assert best.model_score.weight + other.model_score.weight == pytest.approx(1.0)
     odds = np.exp(best.model_score.evidence.log_evidence - other.model_score.evidence.log_evidence)
     assert best.model_score.model_probability / other.model_score.model_probability == pytest.approx(odds)
-    assert "foretells incidences that are left out" in compared.verdict[0]
+    assert "by cross-validation" in compared.verdict[0]
     table = tables.comparison_table(compared)
-    assert {"left out: score", "weight", "log evidence", "probability"} <= set(table.columns)
+    assert {"elpd", "weight", "log evidence", "model probability"} <= set(table.columns)
 
 
 def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
-    candidates, at = {"line": found, "flat": flat}, readings()
+    candidates, at = {"line": found, "flat": flat}, measurements()
     alone = predict(average(candidates, {"line": 1.0, "flat": 0.0}), at, draws=1000)
     one = predict(found, at, draws=1000)
     np.testing.assert_allclose(alone.predictive.mean, one.predictive.mean, atol=0.01)
@@ -196,7 +195,7 @@ def test_averages_are_mixtures(found: Fit, flat: Fit) -> None:
 
 def test_more_fits_than_draws_are_averaged(found: Fit) -> None:
     many = {f"{number}": found for number in range(9)}
-    both = predict(average(many, dict.fromkeys(many, 1.0)), readings(), draws=4)
+    both = predict(average(many, dict.fromkeys(many, 1.0)), measurements(), draws=4)
     assert len(both.values) == 4 * 2  # of those that are drawn at all, two
     np.testing.assert_allclose(both.mean, found.predicted, atol=5.0 * SIGMA)
 
@@ -214,26 +213,26 @@ def test_averages_are_weighted_by_stacking(found: Fit, flat: Fit) -> None:
     both = average({"line": found, "flat": flat})
     weights = {name: seen.weight for name, seen in model_scores({"line": found, "flat": flat}).items()}
     assert both.weights == pytest.approx(weights)
-    assert predict(both, readings()).scores.count == readings().values.size
+    assert predict(both, measurements()).scores.count == measurements().values.size
     with pytest.raises(ValueError, match="there is no fit to average"):
         average({})
 
 
-def test_fits_that_say_nothing_of_readings_are_refused() -> None:
+def test_fits_without_a_noise_model_are_refused() -> None:
     free = {"a": Free(0.9, -4.0, 6.0), "b": Free(0.1, -4.0, 5.0)}
-    named = fit(free, readings(), transport=line, objective="cube_root", starts=1)
+    named = fit(free, measurements(), transport=line, objective="cube_root", starts=1)
     with pytest.raises(ValueError, match="a fit of 'cube_root' has no noise model"):
         cross_validate(named)
     with pytest.raises(ValueError, match="a fit of 'cube_root' has none"):
         evidence(named)
-    data = readings()
+    data = measurements()
     few = data.where((np.abs(data.theta_i - 10.0) < 1.0) & (data.theta_o < 10.0))
-    with pytest.raises(ValueError, match="too few to leave some of them out"):
+    with pytest.raises(ValueError, match="too few measurements to hold some"):
         cross_validate(fit(STACK, few, transport=line, noise=Noise(discrepancy=False), starts=1))
 
 
 @pytest.mark.parametrize(
-    ("gaps", "told"),
+    ("gaps", "clear"),
     [
         ((30.0, 200.0, 900.0), True),  # 1130 +- 780, but worse everywhere
         ((2.0, 200.0, 900.0), False),
@@ -241,12 +240,12 @@ def test_fits_that_say_nothing_of_readings_are_refused() -> None:
         ((-1.0, 0.5, 2.0), False),
     ],
 )
-def test_what_is_worse_everywhere_is_told_apart(gaps: tuple[float, ...], told: bool) -> None:
-    """Three groups of ten readings, over which a gap is spread evenly."""
+def test_what_is_worse_everywhere_is_distinguished(gaps: tuple[float, ...], clear: bool) -> None:
+    """Three groups of ten measurements, over which a gap is spread evenly."""
     rows = tuple(np.split(np.arange(30), 3))
     best = CrossValidation(("1", "2", "3"), rows, np.zeros((30, 1)), True)
     other = CrossValidation(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
     known = Evidence(0.0, 0.1, 0.1)
     seen = rank_models({"best": best, "other": other}, {"best": known, "other": known})["other"]
-    assert (seen.clear_diff > 0.0) == told
+    assert (seen.clear_diff > 0.0) == clear
     assert seen.least_diff == pytest.approx(min(gaps) / 10.0)

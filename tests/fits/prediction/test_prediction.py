@@ -1,4 +1,4 @@
-"""Predictions beside what is known of them, and their scores by readings that were not fitted."""
+"""Predictions beside what is known of them, and their scores by held-out measurements."""
 
 from dataclasses import replace
 
@@ -11,8 +11,7 @@ from fits.data.measurements import Measurements
 from fits.data.selection import select
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
-from fits.prediction.predict import predict
-from fits.prediction.prediction import scores
+from fits.prediction.predict import predict, scores
 from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
@@ -26,7 +25,7 @@ GEOMETRY = slices([10.0, 30.0, 50.0, 70.0], np.arange(-80.0, 81.0, 4.0))
 SIGMA = 0.02
 
 
-def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
+def measurements(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     """Of the line, with smooth errors relative to it, of another shape in every set, and noise."""
     generator = np.random.default_rng(seed)
     count = len(GEOMETRY)
@@ -38,14 +37,14 @@ def readings(seed: int, wrong: float, sigma: float = SIGMA) -> Measurements:
     assert process is not None
     assert at is not None
     white = generator.standard_normal((1, len(process.where)))
-    lack = np.asarray(process.sample(white, at))
-    values = exact * (np.exp(lack) + sigma * generator.standard_normal(exact.shape))
+    discrepancy = np.asarray(process.sample(white, at))
+    values = exact * (np.exp(discrepancy) + sigma * generator.standard_normal(exact.shape))
     return Measurements(GEOMETRY.wi, GEOMETRY.wo, values, None, np.ones(count, bool), ("value",))
 
 
 def without_noise(seed: int, wrong: float) -> Measurements:
-    """The BSDF behind `readings`: its discrepancy is drawn before the noise."""
-    return readings(seed, wrong, sigma=0.0)
+    """The BSDF behind `measurements`: its discrepancy is drawn before the noise."""
+    return measurements(seed, wrong, sigma=0.0)
 
 
 def split(data: Measurements) -> tuple[Measurements, Measurements]:
@@ -53,14 +52,14 @@ def split(data: Measurements) -> tuple[Measurements, Measurements]:
     return data.where(~held), data.where(held)
 
 
-def test_bands_of_a_line_are_those_of_regression() -> None:
+def test_intervals_of_a_line_are_those_of_regression() -> None:
     found = line_fit()
     data = found.problem.data
     at = predict(found, data, draws=4000)
     columns = design(COUNT)
     covariance = np.linalg.inv(columns.T @ columns / 0.05**2)
     expected = np.sqrt(np.sum(columns @ covariance * columns, axis=-1))
-    # 4,000 draws, of some 5,000 that are worth it: 1.5 % of a standard deviation, at 4 standard errors
+    # 4,000 draws: 1.5 % of a standard deviation, at 4 standard errors
     np.testing.assert_allclose(at.latent.sd[:, 0], expected, rtol=0.06)
     np.testing.assert_allclose(at.predictive.sd[:, 0], np.sqrt(expected**2 + 0.05**2), rtol=0.05)
     np.testing.assert_allclose(at.latent.mean, found.predicted, atol=0.1 * expected.max())
@@ -88,19 +87,19 @@ def test_draws_that_may_miss_a_part_are_said_to() -> None:
 
 
 @pytest.mark.slow
-def test_wrong_models_need_shared_errors() -> None:
-    """Of 10 sets whose model is wrong by 10 %: the bands hold what they say, those of noise alone do not."""
+def test_wrong_models_need_a_discrepancy() -> None:
+    """Of 10 sets whose model is wrong by 10 %: intervals cover what they say, those of independent noise do not."""
     held: dict[bool, list[float]] = {True: [], False: []}
     better = []
     for seed in range(10):
-        fitted, unseen = split(readings(seed, 0.1))
+        fitted, held_out = split(measurements(seed, 0.1))
         found = {}
         for shared in held:
             noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
-            found[shared] = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen).scores
+            found[shared] = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out).scores
             held[shared].append(found[shared].coverage[0.95])
         better.append(found[True].elpd - found[False].elpd)
-    # 82 unseen readings a set are alike: the standard error of the mean of 10 sets is about 0.03
+    # 82 held-out measurements a set are correlated: the standard error of the mean of 10 sets is about 0.03
     assert 0.86 < np.mean(held[True]) < 0.99
     assert np.mean(held[False]) < 0.7
     assert np.mean(better) > 1.0
@@ -108,42 +107,42 @@ def test_wrong_models_need_shared_errors() -> None:
 
 @pytest.mark.parametrize("shared", [False, True])
 def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
-    fitted, unseen = split(readings(3, 0.1))
+    fitted, held_out = split(measurements(3, 0.1))
     noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
-    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), unseen)
+    at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), held_out)
     assert np.array_equal(at.mean, at.latent.mean) != shared
     # by 2,048 draws: the standard error of a quantile is at most 0.06 sd, at 4 or 5 of them
-    for level, of_bsdf, of_reading in zip(at.levels, at.bsdf.quantiles, at.predictive.quantiles, strict=True):
+    for level, of_bsdf, of_measurement in zip(at.levels, at.bsdf.quantiles, at.predictive.quantiles, strict=True):
         np.testing.assert_allclose(at.quantile(level), of_bsdf, atol=0.3 * at.sd.max())
-        np.testing.assert_allclose(at.rank(at.predictive_quantile(level)), level, atol=1e-9)
-        np.testing.assert_allclose(at.predictive_quantile(level), of_reading, atol=0.25 * at.predictive.sd.max())
+        np.testing.assert_allclose(at.cdf(at.predictive_quantile(level)), level, atol=1e-9)
+        np.testing.assert_allclose(at.predictive_quantile(level), of_measurement, atol=0.25 * at.predictive.sd.max())
     low, high = (at.predictive_quantile(level) for level in (0.025, 0.975))
-    expected = np.mean((unseen.used().values > low) & (unseen.used().values < high))
+    expected = np.mean((held_out.used().values > low) & (held_out.used().values < high))
     assert at.scores.coverage[0.95] == pytest.approx(expected)
-    assert at.scores == scores(at, unseen)
+    assert at.scores == scores(at, held_out)
 
 
 def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
     """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
-    inside: dict[str, list[float]] = {"bsdf": [], "model": []}
+    inside: dict[str, list[float]] = {"bsdf": [], "latent": []}
     closer = []
     for seed in range(2):
-        fitted, _ = split(readings(seed, 0.1))
+        fitted, _ = split(measurements(seed, 0.1))
         _, truth = split(without_noise(seed, 0.1))
         noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
         at = predict(fit(STACK, fitted, transport=line, noise=noise, starts=2), truth)
         exact = truth.used().values
         for name, held in inside.items():
-            band = getattr(at, name)
-            held.append(float(np.mean((band.quantiles[0] < exact) & (exact < band.quantiles[-1]))))
+            interval = getattr(at, name)
+            held.append(float(np.mean((interval.quantiles[0] < exact) & (exact < interval.quantiles[-1]))))
         np.testing.assert_array_equal(at.mean, at.bsdf.mean)
         np.testing.assert_array_equal(at.sd, at.bsdf.sd)
         # a measurement adds independent noise: of the logarithm, which is the relative deviation here
-        np.testing.assert_allclose(at.scales**2, at.unknown**2 + SIGMA**2, rtol=1e-3)
+        np.testing.assert_allclose(at.scales**2, at.discrepancy_sd**2 + SIGMA**2, rtol=1e-3)
         closer.append(np.median(np.abs(at.mean / exact - 1.0)) / np.median(np.abs(at.latent.mean / exact - 1.0)))
-    # neighbours are alike: a set of 82 is worth some ten, whose share scatters by 0.07, the mean of 2 by 0.05
+    # neighbours are correlated: 82 count as some ten, whose share scatters by 0.07, the mean of 2 by 0.05
     assert np.mean(inside["bsdf"]) > 0.85
-    assert np.mean(inside["model"]) < 0.7
+    assert np.mean(inside["latent"]) < 0.7
     assert np.mean(closer) < 0.9
 
 
@@ -156,17 +155,17 @@ def test_directions_below_an_opaque_stack_are_refused(coat_fit: Fit) -> None:
 
 
 def test_right_models_lose_little_by_it() -> None:
-    fitted, unseen = split(readings(1, 0.0))
+    fitted, held_out = split(measurements(1, 0.0))
     noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=True)
     found = fit(STACK, fitted, transport=line, noise=noise, starts=2)
     assert found.values["noise.discrepancy.amplitude"] < SIGMA
-    got = predict(found, unseen).scores
+    got = predict(found, held_out).scores
     assert got.coverage[0.95] > 0.9
     assert got.median_error < SIGMA
 
 
 def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
-    fitted, _ = split(readings(2, 0.0))
+    fitted, _ = split(measurements(2, 0.0))
     sigma = SIGMA * fitted.values
     known = Measurements(fitted.wi, fitted.wo, fitted.values, sigma, fitted.mask, fitted.channels)
     found = fit(STACK, known, transport=line, starts=2)
@@ -184,7 +183,7 @@ def test_bad_requests_are_refused() -> None:
     for quantile in (directions.quantile, directions.predictive_quantile):
         with pytest.raises(ValueError, match=r"level is 0.0; it must be in \(0, 1\)"):
             quantile(0.0)
-    with pytest.raises(ValueError, match="directions alone were predicted"):
+    with pytest.raises(ValueError, match="a Geometry was predicted"):
         _ = directions.scores
     with pytest.raises(ValueError, match=r"draws is 1; it must be at least 2"):
         predict(found, found.problem.data, draws=1)
@@ -193,16 +192,16 @@ def test_bad_requests_are_refused() -> None:
         predict(named, found.problem.data)
     data = found.problem.data
     colours = Measurements(data.wi, data.wo, np.tile(data.values, 3), None, data.mask, ("r", "g", "b"))
-    with pytest.raises(ValueError, match=r"the readings have the channels r, g, b, the fit c0"):
+    with pytest.raises(ValueError, match=r"the measurements have the channels r, g, b, the fit c0"):
         predict(found, colours)
     at = predict(found, slices([30.0]))
-    with pytest.raises(ValueError, match=r"the readings were taken elsewhere"):
+    with pytest.raises(ValueError, match=r"the measurements have other directions"):
         scores(at, found.problem.data)
 
 
 @pytest.mark.parametrize("sigma", [0.02, 0.001])
-def test_of_a_product_the_bands_hold_though_its_factors_are_open(sigma) -> None:
-    """The posterior is a hyperbola, the narrower the less noise there is, far from what a fit's covariance tells."""
+def test_intervals_of_a_product_hold_though_its_factors_are_unidentified(sigma) -> None:
+    """The posterior is a hyperbola, the narrower the less noise there is, far from what a fit's covariance says."""
 
     def product(stack, wi, wo):
         return (stack["a"] * stack["b"] * (1.0 + 0.5 * wo[:, 2]))[:, None]
@@ -214,8 +213,8 @@ def test_of_a_product_the_bands_hold_though_its_factors_are_open(sigma) -> None:
     at = predict(found, data, draws=1000)
     expected = exact[:, 0] * sigma / np.sqrt(np.sum(exact**2))
     ratio = at.latent.sd[:, 0] / expected
-    # weights that are reliable are worth some hundred draws, 4 standard errors of whose deviation are 0.2; others make
-    # bands wider, never narrower
+    # reliable weights have some hundred effective draws, 4 standard errors of whose deviation are 0.2; others make
+    # intervals wider, never narrower
     assert np.all(ratio > 0.8)
     assert np.all(ratio < (1.2 if at.reliable else 10.0))
     assert np.all(np.abs(at.latent.mean - found.predicted)[:, 0] < at.latent.sd[:, 0])

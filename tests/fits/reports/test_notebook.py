@@ -87,7 +87,7 @@ def test_a_comparison_is_its_verdict_and_its_table(result: Fit) -> None:
 def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -> None:
     assert (
         repr(coat_data)
-        == f"<Measurements: {len(coat_data)} readings, 10 of them masked, of value, from simulated data>"
+        == f"<Measurements: {len(coat_data)} data points, 10 of them masked, of value, from simulated data>"
     )
     assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"
     assert repr(result).startswith(f"<Fit to 100 measurements: ['a'] {result.vector[0]:.4g} ± ")

@@ -12,7 +12,7 @@ import fits
 import layerjax as lj
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
-from fits.prediction.importance import weighted
+from fits.prediction.importance import importance_draws
 from fits.problem.parameters import Free, Normal
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
@@ -83,7 +83,7 @@ def test_the_evidence_is_that_of_all_modes(fitted: Fit, summed: Sums) -> None:
 def test_draws_by_weight_are_of_all_modes(fitted: Fit, summed: Sums) -> None:
     """Those that predictions are made with."""
     *_, share, _ = summed
-    draws = weighted(fitted, 1000, np.random.RandomState(0)).resampled(np.random.RandomState(1), 1000)
+    draws = importance_draws(fitted, 1000, np.random.RandomState(0)).resample(np.random.RandomState(1), 1000)
     mixture = Mixture.of(fitted)
     assert mixture is not None
     larger = mixture.centre[mixture.mode_of(draws), 0] > 0.3

@@ -139,6 +139,19 @@ def test_vmf_normals_are_finite_over_the_box(dtype):
                 assert np.isfinite(leaf).all(), (ratio, alpha)
 
 
+def test_energies_beyond_the_critical_angle_are_smooth_in_the_index():
+    """Light that only tilted facets let in: no point crosses the horizon of what they refract. Steps are a fiftieth of
+    the width of the normals; alpha 0.05, index 0.7."""
+    slopes = jax.jit(jax.jacfwd(energies, 1))
+    step = 1e-3
+    for ratio in 0.7 + step * np.arange(8):
+        found = slopes(SLOPED, ratio, 0.05)
+        wide, narrow = (
+            (energies(SLOPED, ratio + h, 0.05) - energies(SLOPED, ratio - h, 0.05)) / (2 * h) for h in (step, step / 2)
+        )
+        np.testing.assert_allclose(found, (4 * narrow - wide) / 3, rtol=0, atol=1e-6)
+
+
 def test_derivatives_are_finite_and_those_of_the_values():
     slopes = jax.jit(jax.jacfwd(energies, (0, 1, 2)))
     for ratio in (0.25, 1.0 - 1e-7, 1.0, 1.5):

@@ -47,6 +47,18 @@ def test_values_of_a_walk(g, resolution, rtol):
     assert np.all(np.abs(found - expected) < rtol * np.array(expected) + 3.0 * np.array(error))
 
 
+@pytest.mark.parametrize(
+    ("g", "expected", "error"),
+    [(0.9, [0.115908, 0.035790, 0.031283], 1.7e-4), (-0.7, [0.315262, 0.248141, 0.258980], 4.6e-4)],
+)
+def test_peaks_within_a_coat_seen_straight_back(g, expected, error):
+    """The default's own resolution, where the series of few moments is farthest off; values of `RandomWalk`."""
+    coat = [lj.Interface(1.5, 0.15), lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(g))]
+    wi = lj.direction(np.deg2rad([5.0, 30.0, 55.0]), 0.0)
+    found = lj.evaluate(lj.Stack(coat, lj.Lambertian(0.3)), wi, wi)[:, 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=3.0 * error)
+
+
 @pytest.mark.parametrize("g", [-0.97, -0.3, 0.0, 0.6, 0.97, 0.999])
 def test_moments_by_quadrature_are_powers_of_g(g):
     found = moments_by_quadrature(lj.HenyeyGreenstein(g).pdf, 64, jnp.float64)

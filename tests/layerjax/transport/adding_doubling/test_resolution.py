@@ -20,8 +20,8 @@ def flakes(alpha):
 @pytest.mark.parametrize(
     ("stack", "followed", "least"),
     [
-        (lj.Stack([FACE, HAZE], PAINT), True, 6),
-        (lj.Stack([FACE, HAZE], PAINT), False, 12),
+        (lj.Stack([FACE, HAZE], PAINT), True, 24),
+        (lj.Stack([FACE, HAZE], PAINT), False, 24),
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 0.5)), True, 6),
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 0.12)), True, 20),
         (lj.Stack([FACE, flakes(0.1)], PAINT), True, 24),
@@ -29,17 +29,17 @@ def flakes(alpha):
         (lj.Stack([FACE], lj.Conductor(0.4, 3.0, 1e-3)), True, 96),
         (lj.Stack([lj.Interface(1.1, 0.05)], lj.Conductor(0.4, 3.0, 0.5)), True, 12),
         (lj.Stack([lj.Interface(1.1, 0.05), lj.Medium(1.0, 0.9)], PAINT), True, 6),
-        (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 12),
-        (lj.Stack([FACE, HAZE, lj.Interface(1.0, 0.6)]), True, 24),
-        (lj.Stack([FACE, lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(-0.9))], PAINT), True, 24),
-        (lj.Stack([*SLAB.layers, lj.Medium(1.0, 0.9)]), False, 12),
+        (lj.Stack([FACE, HAZE, lj.Interface(1.6, 0.2)], PAINT), True, 24),
+        (lj.Stack([FACE, HAZE, lj.Interface(1.0, 0.6)]), True, 32),
+        (lj.Stack([FACE, lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(-0.9))], PAINT), True, 64),
+        (lj.Stack([*SLAB.layers, lj.Medium(1.0, 0.9)]), False, 32),
         (lj.Stack([*SLAB.layers, lj.Medium(1.0, 0.9), lj.Interface(1.5, 0.3)]), True, 32),
     ],
 )
 def test_narrow_lobes_behind_others_decide(stack, followed, least):
     found = chosen(lj.stack.simplify(stack), followed)
     assert least <= found.nodes <= max(least, 4 * least // 3)
-    assert found.modes >= found.nodes
+    assert found.modes >= found.nodes // 2
 
 
 def test_bare_media_need_modes_rather_than_nodes():
@@ -61,12 +61,13 @@ def test_traced_lobes_count_as_rather_narrow():
 def test_what_is_chosen_is_told_and_what_is_given_stays():
     stack = lj.Stack([FACE, HAZE], PAINT)
     told = lj.choose_transport(stack)
-    assert (told.nodes, told.modes) == (12, 16)
+    assert (told.nodes, told.modes) == (24, 32)
     assert lj.prepare(stack).transport == told
     assert lj.choose_transport(stack, transport=lj.AddingDoubling(nodes=10)).modes == 15
     assert lj.choose_transport(stack, transport=lj.AddingDoubling(modes=10)).modes == 10
-    wi, wo = lj.direction([0.2, 0.3], 0.0), lj.direction(0.4, 1.0)
-    assert lj.choose_transport(stack, wi, wo).nodes == 6
+    wi, wo, varnish = lj.direction([0.2, 0.3], 0.0), lj.direction(0.4, 1.0), lj.Stack([FACE], PAINT)
+    assert lj.choose_transport(varnish).nodes == 12
+    assert lj.choose_transport(varnish, wi, wo).nodes == 6
     with pytest.raises(ValueError, match=r"AddingDoubling.nodes: none are given; choose_transport"):
         lj.AddingDoubling().finer()
 

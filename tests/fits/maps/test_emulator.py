@@ -1,4 +1,4 @@
-"""Tables in the place of a transport: their values and derivatives against the transport itself."""
+"""Emulators in the place of a transport: their values and derivatives against the transport itself."""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,12 @@ import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
-from fits.maps.tabulated import chebyshev, coarser, with_table
-from fits.maps.tabulating import ACCEPTED, tabulate
+from fits.maps.emulator import chebyshev, coarser, emulate, with_emulator
+from fits.maps.options import MapOptions
 from fits.problem.model import Density
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
+ERROR = MapOptions.emulator_error
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
 
 
@@ -36,10 +37,10 @@ def problem():
 
 
 @pytest.fixture(scope="module")
-def table(problem):
-    tried = tabulate(problem)
+def emulator(problem):
+    tried = emulate(problem)
     assert tried.problem is not None
-    assert tried.error <= ACCEPTED
+    assert tried.error <= ERROR
     return tried.problem
 
 
@@ -49,17 +50,17 @@ def vectors(problem):
     return qmc.scale(points, problem.low, problem.high)
 
 
-def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, table, vectors):
+def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, emulator, vectors):
     ends = np.stack([problem.low, problem.high])
     for vector in (*vectors, *ends):
-        exact, found = (np.asarray(one.predict(vector)) for one in (problem, table))
+        exact, found = (np.asarray(one.predict(vector)) for one in (problem, emulator))
         sigma = np.asarray(problem.call(Density.sigma_at, vector, problem.predict(vector)))
-        assert np.max(np.abs(found - exact) / sigma) < 2.0 * ACCEPTED  # at points that no check has seen
+        assert np.max(np.abs(found - exact) / sigma) < 2.0 * ERROR  # at points that no check has seen
 
 
-def test_derivatives_are_those_of_the_table(problem, table, vectors):
+def test_derivatives_are_those_of_the_emulator(problem, emulator, vectors):
     def predict(vector):
-        return table.model.predict(vector)
+        return emulator.model.predict(vector)
 
     for vector in (jnp.asarray(vectors[7]), jnp.asarray(problem.low), jnp.asarray(problem.high)):
         forward, reverse = jax.jacfwd(predict)(vector), jax.jacrev(predict)(vector)
@@ -73,18 +74,18 @@ def test_derivatives_are_those_of_the_table(problem, table, vectors):
         )
 
 
-def test_each_channel_has_its_own_parameters(table, vectors):
-    slopes = np.asarray(jax.jacfwd(table.model.predict)(jnp.asarray(vectors[3])))
-    names = table.names
+def test_each_channel_has_its_own_parameters(emulator, vectors):
+    slopes = np.asarray(jax.jacfwd(emulator.model.predict)(jnp.asarray(vectors[3])))
+    names = emulator.names
     first, second = names.index("base.albedo[0]"), names.index("base.albedo[1]")
     assert np.all(slopes[:, 0, second] == 0.0)
     assert np.all(slopes[:, 1, first] == 0.0)
     assert np.any(slopes[:, 0, first] != 0.0)
 
 
-def test_the_last_terms_tell_of_the_error(problem, table, vectors):
-    rough = problem.with_model(with_table(table.model, coarser(table.model.table)))
-    apart = [float(np.max(np.abs(np.asarray(rough.predict(v)) - np.asarray(table.predict(v))))) for v in vectors[:8]]
+def test_the_last_terms_tell_of_the_error(problem, emulator, vectors):
+    rough = problem.with_model(with_emulator(emulator.model, coarser(emulator.model.emulator)))
+    apart = [float(np.max(np.abs(np.asarray(rough.predict(v)) - np.asarray(emulator.predict(v))))) for v in vectors[:8]]
     assert 0.0 < max(apart) < 0.05
 
 
@@ -98,28 +99,31 @@ def test_chebyshev_polynomials_are_cosines():
 
 
 def test_too_dear_a_table_is_not_made(problem):
-    tried = tabulate(problem, most=10)
+    tried = emulate(problem, MapOptions(emulator_max_solves=10))
     assert tried.problem is None
     assert "of 10 allowed" in tried.words
 
 
 def test_a_map_of_exact_transport_by_a_table_ends_where_it_does_without(tmp_path, problem):
+    def small(**more):
+        return MapOptions(starts=2, chunk_size=4, **more)
+
     truth = np.array([0.2, 0.3, 0.6, 1.0])
     names = ("layers[0].alpha", "base.albedo[0]", "base.albedo[1]")
     exact = np.asarray(problem.predict(truth))
     noise = np.random.default_rng(2).standard_normal((6, *exact.shape))
     values = exact * (1.0 + NOISE.relative * noise)
     geometry = Geometry(problem.data.wi, problem.data.wo)
-    options = {"noise": NOISE, "transport": TRANSPORT, "starts": 2, "chunk": 4}
-    by_table, direct = (
-        fits.fit_map(FREE, geometry, values, tmp_path / f"{known}.zarr", tabulate=known, **options)
+    options = {"noise": NOISE, "transport": TRANSPORT}
+    emulated, direct = (
+        fits.fit_map(FREE, geometry, values, tmp_path / f"{known}.zarr", **options, options=small(emulator=known))
         for known in (True, False)
     )
-    assert "a table of" in by_table.attributes["numerical"]["table"]
-    # values move by as much as the table's error is of the noise, a tenth at most in a reading
+    assert "an emulator of" in emulated.attributes["numerical"]["emulator"]
+    # values move by as much as the emulator's error is of the noise, a tenth at most in a reading
     for name in names:
-        assert np.all(np.abs(by_table.values[name] - direct.values[name]) < ACCEPTED * direct.errors[name])
-        np.testing.assert_allclose(by_table.errors[name], direct.errors[name], rtol=0.02)
-    assert np.all(by_table.numerical_error > 0.0)
-    again = fits.fit_map(FREE, geometry, values, tmp_path / "True.zarr", tabulate=True, **options)
-    assert again.attributes == by_table.attributes
+        assert np.all(np.abs(emulated.values[name] - direct.values[name]) < ERROR * direct.errors[name])
+        np.testing.assert_allclose(emulated.errors[name], direct.errors[name], rtol=0.02)
+    assert np.all(emulated.numerical_error > 0.0)
+    again = fits.fit_map(FREE, geometry, values, tmp_path / "True.zarr", **options, options=small(emulator=True))
+    assert again.attributes == emulated.attributes

@@ -7,10 +7,10 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.maps import descending
-from fits.maps.searching import search, starts_at
-from fits.maps.solving import _solved, all_known, solve
-from fits.maps.texels import blank, texels, with_own_directions
+from fits.maps import descent
+from fits.maps.descent import blank_texel, make_texels, with_own_directions
+from fits.maps.options import USUAL
+from fits.maps.search import _program, linearise_all, search, solve, starts_at
 from fits.optimise.descent import COST_TOLERANCE, descend
 from fits.problem.compilation import _run
 from fits.problem.problem import Problem
@@ -27,7 +27,7 @@ def geometry():
 
 
 @pytest.fixture(scope="module")
-def readings(geometry):
+def measured(geometry):
     """Of texels with numbers of their own, the last at a bound: (M, N, 1)."""
     rng = np.random.default_rng(4)
     truth = np.append(rng.uniform((0.2, 0.2), (2.0, 0.9), (TEXELS - 1, 2)), [[0.4, 1.0]], axis=0)
@@ -54,21 +54,21 @@ LEVELS = fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)
     [(FIXED, "likelihood"), (LEVELS, "likelihood"), (FIXED, "cube_root")],
     ids=["fixed", "free", "named"],
 )
-def test_each_ends_where_a_descent_of_its_own_does(geometry, readings, noise, objective):
+def test_each_ends_where_a_descent_of_its_own_does(geometry, measured, noise, objective):
     """From starts far away, and near, however the descent is cut short.
 
-    Within what `Found.better` counts as nothing gained: 10 `COST_TOLERANCE` of the cost, half a square of standard
+    Within what `Fits.better` counts as nothing gained: 10 `COST_TOLERANCE` of the cost, half a square of standard
     errors. A named objective stops at 1e-10 of its cost.
     """
     left = 10.0 * COST_TOLERANCE
     cost, apart = (left, np.sqrt(2.0 * left)) if objective == "likelihood" else (0.0, 1e-3)
     problem, rng = problem_of(geometry, noise, objective=objective), np.random.default_rng(7)
-    rows = texels(readings, least=1e-4)
+    rows = make_texels(measured, least=1e-4)
     units = rng.uniform(0.2, 0.8, (5, len(problem.names)))[np.arange(TEXELS) % 5]
     for fresh in (True, False):
         found = solve(problem, units, rows, SIZE, fresh)
         for place in range(TEXELS):
-            own = problem_of(geometry, noise, readings[place], objective)
+            own = problem_of(geometry, noise, measured[place], objective)
             alone = own.call(descend, units[place], fresh, 200, COST_TOLERANCE)
             assert bool(alone.converged)
             assert bool(found.converged[place])
@@ -79,8 +79,8 @@ def test_each_ends_where_a_descent_of_its_own_does(geometry, readings, noise, ob
         units = np.clip(ends + rng.uniform(-0.02, 0.02, ends.shape), 0.0, 1.0)
 
 
-def test_a_start_at_the_minimum_ends_there(geometry, readings):
-    problem, rows = problem_of(geometry, FIXED), texels(readings, least=1e-4)
+def test_a_start_at_the_minimum_ends_there(geometry, measured):
+    problem, rows = problem_of(geometry, FIXED), make_texels(measured, least=1e-4)
     first = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
     units = np.clip(np.asarray(jax.vmap(problem.model.box.to_unit)(first.vector)), 0.0, 1.0)
     again = solve(problem, units, rows, SIZE, fresh=False)
@@ -89,13 +89,13 @@ def test_a_start_at_the_minimum_ends_there(geometry, readings):
 
 
 @pytest.mark.parametrize("count", [1, 40, 70])
-def test_what_is_known_is_what_the_model_says(geometry, readings, count):
-    """Values and derivatives of few points, and of more than a program takes at once; whatever the readings."""
+def test_what_is_known_is_what_the_model_says(geometry, measured, count):
+    """Values and derivatives of few points, and of more than a program takes at once; whatever the measured."""
     problem = problem_of(geometry, LEVELS)
     units = np.random.default_rng(count).random((count, 3))
-    rows = texels(np.full_like(readings, np.nan), least=1e-4).rows(np.arange(3))
-    for asked in (blank((16, 1)), rows):
-        known = all_known(problem, units, asked, SIZE)
+    rows = make_texels(np.full_like(measured, np.nan), least=1e-4).rows(np.arange(3))
+    for asked in (blank_texel((16, 1)), rows):
+        known = linearise_all(problem, units, asked, SIZE)
         assert known.values.shape == (count, 16, 1)
         assert known.slopes.shape == (count, 3, 16, 1)
         for place in (0, count - 1):
@@ -105,38 +105,40 @@ def test_what_is_known_is_what_the_model_says(geometry, readings, count):
             np.testing.assert_allclose(known.slopes[place], np.moveaxis(slopes, -1, 0), rtol=1e-9, atol=1e-12)
 
 
-def test_the_model_stands_in_the_program_once(geometry, readings, monkeypatch):
+def test_the_model_stands_in_the_program_once(geometry, measured, monkeypatch):
     """It takes most of the time and the memory that compiling takes."""
     traced = []
-    original = descending.known_at
-    monkeypatch.setattr(descending, "known_at", lambda *given: traced.append(given) or original(*given))
-    model, rows = problem_of(geometry, FIXED).model, texels(readings, least=1e-4).rows(np.arange(SIZE))
-    known = descending.Known(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
+    original = descent.linearise
+    monkeypatch.setattr(descent, "linearise", lambda *given: traced.append(given) or original(*given))
+    model, rows = problem_of(geometry, FIXED).model, make_texels(measured, least=1e-4).rows(np.arange(SIZE))
+    known = descent.Linearisation(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
     given = np.full((64, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, False, False))
-    jax.make_jaxpr(lambda *given: _solved(model, *given))(*given)
+    jax.make_jaxpr(lambda *given: _program(model, *given))(*given)
     assert len(traced) == 1
 
 
-def test_own_directions_begin_with_nothing_known(geometry, readings):
+def test_own_directions_begin_with_nothing_known(geometry, measured):
     """By a program of its own, to the same ends."""
-    problem, rows = problem_of(geometry, FIXED), texels(readings, least=1e-4)
+    problem, rows = problem_of(geometry, FIXED), make_texels(measured, least=1e-4)
     common = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
     wi, wo = (np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo))
-    own = solve(with_own_directions(problem), np.full((TEXELS, 2), 0.5), texels(readings, None, 1e-4, wi, wo), SIZE)
+    own = solve(
+        with_own_directions(problem), np.full((TEXELS, 2), 0.5), make_texels(measured, None, 1e-4, wi, wo), SIZE
+    )
     np.testing.assert_allclose(own.cost, common.cost, rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["common directions", "own directions"])
-def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, readings, own):
+def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, measured, own):
     problem = problem_of(geometry, FIXED)
     problem = with_own_directions(problem) if own else problem
     sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if own else []
-    rows, vectors = texels(readings, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
+    rows, vectors = make_texels(measured, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
     starts = starts_at(problem, vectors, np.zeros((0, 2)), own, SIZE)
-    whole = search(problem, starts, rows, SIZE)
+    whole = search(problem, starts, rows, SIZE, USUAL)
     before = _run._cache_size()
     for count in (1, 6, SIZE, SIZE + 1):
-        some = search(problem, starts, rows.rows(np.arange(count)), SIZE)
+        some = search(problem, starts, rows.rows(np.arange(count)), SIZE, USUAL)
         np.testing.assert_array_equal(some.start, whole.start[:count])
-        np.testing.assert_allclose(some.found.cost, whole.found.cost[:count], rtol=1e-9)
+        np.testing.assert_allclose(some.fits.cost, whole.fits.cost[:count], rtol=1e-9)
     assert _run._cache_size() == before

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,9 @@ from scipy.optimize import least_squares, minimize
 import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
-from fits.maps import alternating, chunk_files
+from fits.maps import spatial
+from fits.maps.options import MapOptions
+from fits.maps.spatial import Edges
 
 TRANSPORT = lj.SingleScattering()
 SHAPE, CHUNK = (4, 4), 12  # the second chunk begins at an odd column
@@ -59,7 +62,7 @@ def mask():
 
 
 @pytest.fixture(scope="module")
-def readings(predict):
+def measured(predict):
     """Of a map whose albedo has an edge in the middle, with their standard deviations."""
     rows, columns = np.indices(SHAPE)
     truth = np.stack([np.log(0.3 + 0.1 * rows), np.where(columns < 2, 0.3, 0.6)], axis=-1)
@@ -69,22 +72,24 @@ def readings(predict):
 
 
 @pytest.fixture(scope="module")
-def fitted(geometry, readings, mask):
+def fitted(geometry, measured, mask):
     """Fits the map, with these options."""
 
     def fit(out, **options):
-        options = {"chunk": CHUNK, "sample": 4, "starts": 2} | options
+        chosen = MapOptions(**{"chunk_size": CHUNK, "pilot_texels": 4, "starts": 2} | options)
         noise = fits.Noise(relative=0.0, floor=0.0)
-        values, sigma = readings
-        return fits.fit_map(FREE, geometry, values, out, noise, transport=TRANSPORT, sigma=sigma, mask=mask, **options)
+        values, sigma = measured
+        return fits.fit_map(
+            FREE, geometry, values, out, noise, transport=TRANSPORT, sigma=sigma, mask=mask, options=chosen
+        )
 
     return fit
 
 
 @pytest.fixture(scope="module")
-def own(predict, readings, mask):
-    """Residuals of all readings and priors at units (15, 2) of the texels that are fitted, written down anew."""
-    values, sigma = (jnp.asarray(one[mask][..., 0]) for one in readings)
+def own(predict, measured, mask):
+    """Residuals of all measured and priors at units (15, 2) of the texels that are fitted, written down anew."""
+    values, sigma = (jnp.asarray(one[mask][..., 0]) for one in measured)
 
     def residuals(units):
         data = (jax.vmap(predict)(units) - values) / sigma
@@ -117,22 +122,23 @@ def unit_errors(map, mask, errors):
     return np.stack([errors[name][mask] for name in NAMES], axis=-1) / slope
 
 
+GROUPS = ("values", "errors", "smoothed/values", "smoothed/errors")
 SCALES = np.array([0.03, 0.02])
 WIDER = 3.0 * SCALES
 """Of a total variation, whose neighbours hold on to each other ten times as much: few rounds are enough."""
 
-GAUSSIAN = fits.Smoothness("gaussian", dict(zip(NAMES, SCALES, strict=True)), rounds=40)
-VARIATION = fits.Smoothness("total_variation", dict(zip(NAMES, WIDER, strict=True)), rounds=100)
+GAUSSIAN = fits.SpatialPrior("gaussian", dict(zip(NAMES, SCALES, strict=True)), rounds=40)
+VARIATION = fits.SpatialPrior("total_variation", dict(zip(NAMES, WIDER, strict=True)), rounds=100)
 
 
 @pytest.fixture(scope="module")
 def gaussian(tmp_path_factory, fitted):
-    return fitted(tmp_path_factory.mktemp("map") / "gaussian.zarr", smooth=GAUSSIAN)
+    return fitted(tmp_path_factory.mktemp("map") / "gaussian.zarr", spatial_prior=GAUSSIAN)
 
 
 @pytest.fixture(scope="module")
 def variation(tmp_path_factory, fitted):
-    return fitted(tmp_path_factory.mktemp("map") / "variation.zarr", smooth=VARIATION)
+    return fitted(tmp_path_factory.mktemp("map") / "variation.zarr", spatial_prior=VARIATION)
 
 
 def left_to_go(map):
@@ -217,7 +223,7 @@ def test_the_plain_fit_stays_and_texels_left_out_stay_out(tmp_path, gaussian, fi
     plain = fitted(tmp_path / "plain.zarr")
     assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
     assert plain.attributes == gaussian.attributes
-    for name in plain._types:
+    for name in plain._store.types:
         np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
@@ -228,8 +234,8 @@ def test_the_plain_fit_stays_and_texels_left_out_stay_out(tmp_path, gaussian, fi
 
 
 def test_what_is_not_named_is_not_smoothed(tmp_path, fitted, mask):
-    map = fitted(tmp_path / "one.zarr", smooth=fits.Smoothness("gaussian", {ALBEDO: 0.001}, rounds=2))
-    assert map.smoothing["smoothness"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 2}
+    map = fitted(tmp_path / "one.zarr", spatial_prior=fits.SpatialPrior("gaussian", {ALBEDO: 0.001}, rounds=2))
+    assert map.smoothing["prior"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 2, "settled": 0.01}
     assert not map.smoothing["settled"]
     rough = {name: np.nanstd(map.smoothed[name]) / np.nanstd(map.values[name]) for name in NAMES}
     assert rough[ALBEDO] < 0.5
@@ -238,7 +244,7 @@ def test_what_is_not_named_is_not_smoothed(tmp_path, fitted, mask):
 
 def assert_same(found, expected):
     assert found.smoothing == expected.smoothing
-    for name in expected._every:
+    for name in [f"{group}/{name}" for group in GROUPS for name in NAMES]:
         np.testing.assert_array_equal(found[name][:], expected[name][:], err_msg=name)
 
 
@@ -249,10 +255,10 @@ def test_a_run_that_was_stopped_between_rounds_goes_on_to_the_bit(tmp_path, fitt
 
     out, told = tmp_path / "stopped.zarr", []
     with pytest.raises(KeyboardInterrupt):
-        fitted(out, smooth=GAUSSIAN, progress=stop)
+        fitted(out, spatial_prior=GAUSSIAN, progress=stop)
     assert fits.open_map(out).done == 1.0
     assert fits.open_map(out).smoothed is None
-    found = fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    found = fitted(out, spatial_prior=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
     rounds = [done for stage, done in told if stage == "smoothing"]
     assert rounds[0] == 2  # not begun anew
     assert_same(found, gaussian)
@@ -261,70 +267,135 @@ def test_a_run_that_was_stopped_between_rounds_goes_on_to_the_bit(tmp_path, fitt
 
 def test_a_run_that_was_killed_in_its_last_moments_goes_on_to_the_bit(tmp_path, fitted, gaussian):
     out = tmp_path / "killed.zarr"
-    found, rounds = fitted(out, smooth=GAUSSIAN), gaussian.smoothing["rounds"]
+    found, rounds = fitted(out, spatial_prior=GAUSSIAN), gaussian.smoothing["rounds"]
     os.rename(out / "smoothed", out / f"smoothing_{rounds}")
-    (out / "smoothed.old.partial" / "values").mkdir(parents=True)  # of what was there before
+    (out / "smoothed.partial" / "values").mkdir(parents=True)  # of what was there before
     (out / f"smoothing_{rounds + 1}.partial").mkdir()
     assert fits.open_map(out).smoothed is None
-    found = fitted(out, smooth=GAUSSIAN)
+    found = fitted(out, spatial_prior=GAUSSIAN)
     assert_same(found, gaussian)
     assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
 
 
 def test_a_full_disk_costs_a_round(tmp_path, monkeypatch, fitted, gaussian):
-    out, write, calls = tmp_path / "full.zarr", chunk_files.write, []
+    out, replace, calls = tmp_path / "full.zarr", Path.replace, []
     fitted(out)
 
-    def full(*arguments):
-        calls.append(arguments)
-        if len(calls) == 12:
+    def full(source, target):
+        calls.append(target)
+        if len(calls) == 30:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        write(*arguments)
+        replace(source, target)
 
-    monkeypatch.setattr(chunk_files, "write", full)
+    monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="No space left"):
-        fitted(out, smooth=GAUSSIAN)
+        fitted(out, spatial_prior=GAUSSIAN)
     monkeypatch.undo()
-    assert not list(out.glob("*.partial"))
     assert fits.open_map(out).smoothed is None
-    assert_same(fitted(out, smooth=GAUSSIAN), gaussian)
+    assert_same(fitted(out, spatial_prior=GAUSSIAN), gaussian)
+    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
 
 
-def test_readings_that_cannot_be_read_again_are_named(tmp_path, monkeypatch, fitted):
+def test_data_that_cannot_be_read_again_are_named(tmp_path, monkeypatch, fitted):
     out = tmp_path / "gone.zarr"
     fitted(out)
 
     def gone(*arguments):
         raise ValueError("values: damaged")
 
-    monkeypatch.setattr(alternating, "part_of", gone)
+    monkeypatch.setattr(spatial, "read_part", gone)
     with pytest.raises(ValueError, match=r"smoothing of chunk \[0:4, 0:3\]: values: damaged; the map is fitted"):
-        fitted(out, smooth=GAUSSIAN)
+        fitted(out, spatial_prior=GAUSSIAN)
 
 
 def test_other_smoothness_smooths_anew_and_fits_nothing_again(tmp_path, fitted, gaussian, variation):
     out, told = tmp_path / "again.zarr", []
-    fitted(out, smooth=VARIATION)
+    fitted(out, spatial_prior=VARIATION)
     before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
-    found = fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    found = fitted(out, spatial_prior=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
     assert_same(found, gaussian)
-    assert "sample" not in {stage for stage, _ in told}
+    assert "pilot" not in {stage for stage, _ in told}
     assert {path: path.stat().st_mtime_ns for path in before} == before
     told.clear()
-    fitted(out, smooth=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
+    fitted(out, spatial_prior=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
     assert "smoothing" not in {stage for stage, _ in told}  # it is there
     assert fitted(out).smoothed is not None  # and stays
 
 
-def test_smoothness_of_what_texels_do_not_have_is_refused(tmp_path, geometry, readings, fitted):
+def test_smoothness_of_what_texels_do_not_have_is_refused(tmp_path, geometry, measured, fitted):
     out = tmp_path / "none.zarr"
     with pytest.raises(ValueError, match=r"names 'albedo'; it must be one of layers\[0\].thickness, base.albedo"):
-        fitted(out, smooth=fits.Smoothness("gaussian", {"albedo": 0.1}))
-    with pytest.raises(ValueError, match=r"smooth is 0\.1; it must be a fits\.Smoothness"):
-        fitted(out, smooth=0.1)
+        fitted(out, spatial_prior=fits.SpatialPrior("gaussian", {"albedo": 0.1}))
+    with pytest.raises(ValueError, match=r"spatial_prior is 0\.1; it must be a fits\.SpatialPrior"):
+        fitted(out, spatial_prior=0.1)
     free = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0))
     with pytest.raises(ValueError, match="objective 'cosine_l2' has no noise"):
         fits.fit_map(
-            free, geometry, readings[0], out, transport=TRANSPORT, objective="cosine_l2", smooth=GAUSSIAN, sample=4
+            free,
+            geometry,
+            measured[0],
+            out,
+            transport=TRANSPORT,
+            options=MapOptions(objective="cosine_l2", spatial_prior=GAUSSIAN, pilot_texels=4),
         )
     assert not out.exists()
+
+
+# ---- the prior by itself: against loops over all pairs of texels ----
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "total_variation"])
+def test_edges_are_those_of_a_loop_over_all_pairs(kind):
+    rng = np.random.default_rng(0)
+    shape, scales = (3, 4, 2), np.array([0.2, np.inf, 0.05])
+    units, there = rng.random((*shape, 3)), rng.random(shape) < 0.8
+    units[~there] = np.nan
+    edges = Edges(kind, scales)
+    centre, precision = edges.pull(units, there)
+    total = 0.0
+    for place in np.ndindex(shape):
+        pulls = []
+        for other in np.ndindex(shape):
+            if np.abs(np.subtract(place, other)).sum() != 1 or not (there[place] and there[other]):
+                continue
+            for k in (0, 2):
+                distance = abs(units[place][k] - units[other][k])
+                width = max(distance, HUBER * scales[k])
+                pulls.append((k, other, 1.0 / scales[k] ** 2 if kind == "gaussian" else 1.0 / (scales[k] * width)))
+                flat = distance**2 / (2.0 * HUBER * scales[k] ** 2) + 0.5 * HUBER
+                size = distance / scales[k] if distance > HUBER * scales[k] else flat
+                total += 0.5 * (0.5 * (distance / scales[k]) ** 2 if kind == "gaussian" else size)
+        if not there[place]:
+            continue
+        for k in range(3):
+            mine = [(units[other][k], weight) for at, other, weight in pulls if at == k]
+            weights = np.array([weight for _, weight in mine])
+            assert precision[place][k] == pytest.approx(weights.sum())
+            if mine:
+                assert centre[place][k] == pytest.approx(np.average([unit for unit, _ in mine], weights=weights))
+    assert edges.cost(units, there) == pytest.approx(total)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"kind": "laplace"}, "SpatialPrior.kind is 'laplace'; it must be one of gaussian, total_variation"),
+        ({"scale": 0.0}, "SpatialPrior.scale is 0.0; it must be a number from 1e-06 to 1e"),
+        ({"scale": np.nan}, "SpatialPrior.scale is nan"),
+        ({"scale": "wide"}, "SpatialPrior.scale is 'wide'"),
+        ({"scale": {"base.albedo": -1.0}}, r"SpatialPrior.scale\['base.albedo'\] is -1.0"),
+        ({"scale": {}}, "SpatialPrior.scale is empty"),
+        ({"rounds": 0}, "SpatialPrior.rounds is 0; it must be a whole number of at least 1"),
+        ({"rounds": 1.5}, "SpatialPrior.rounds is 1.5"),
+    ],
+)
+def test_spatial_priors_that_cannot_be_is_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        fits.SpatialPrior(**({"kind": "gaussian", "scale": 0.1} | options))
+
+
+def test_channels_have_a_scale_together_or_their_own():
+    names = ["base.albedo[0]", "base.albedo[1]", "layers[0].thickness"]
+    both = fits.SpatialPrior("gaussian", {"base.albedo[1]": 0.3, "base.albedo": 0.1})
+    assert both.scales(names) == {"base.albedo[0]": 0.1, "base.albedo[1]": 0.3}
+    assert fits.SpatialPrior("gaussian", 0.2).scales(names) == dict.fromkeys(names, 0.2)

@@ -1,0 +1,172 @@
+"""How a map is fitted, and what decides a flag or a verdict: one documented number a line, all of them in the store."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from fits.names import Objective
+from fits.problem.instrument import Instrument
+from fits.problem.parameters import Free
+from fits.progress import Progress
+
+Kind = Literal["gaussian", "total_variation"]
+SCALES = 1e-6, 1e6
+"""Of a spatial prior, as shares of a parameter's bounds."""
+
+
+@dataclass(frozen=True)
+class SpatialPrior:
+    """A prior of the differences between neighbouring texels, see `MapOptions.spatial_prior`.
+
+    Args:
+        kind: "gaussian": a difference d between neighbours adds d² / (2 scale²) to minus the log-posterior, a Gaussian
+            Markov random field; changes are gradual. "total_variation": it adds abs(d) / scale, or
+            d² / (2 eps scale) + eps / (2 scale) where abs(d) < eps = scale / 10; areas are even and edges stay.
+        scale: of the difference between neighbours, as a share of the bounds of a parameter (of their logarithms, for
+            `LogUniform` and `LogNormal`): its standard deviation, or for a total variation its mean absolute value. A
+            number for all parameters, or numbers by name, such as ``{"base.albedo": 0.02}`` (of all channels) or
+            ``{"base.albedo[2]": 0.02}``; others are not smoothed. From 1e-6 to 1e6.
+        rounds: at most so many, in each of which every texel is fitted again.
+
+    Raises:
+        ValueError: a field is not what it must be.
+    """
+
+    kind: Kind
+    scale: float | Mapping[str, float]
+    rounds: int = 10
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(Kind):
+            raise ValueError(f"SpatialPrior.kind is {self.kind!r}; it must be one of {', '.join(get_args(Kind))}")
+        given = self.scale if isinstance(self.scale, Mapping) else {"": self.scale}
+        if not given:
+            raise ValueError("SpatialPrior.scale is empty; it must name a parameter, or be a number")
+        where = {name: f"SpatialPrior.scale[{name!r}]" if name else "SpatialPrior.scale" for name in given}
+        checked = {str(name): _number(where[name], one, *SCALES) for name, one in given.items()}
+        object.__setattr__(self, "scale", checked if isinstance(self.scale, Mapping) else checked[""])
+        _whole("SpatialPrior.rounds", self.rounds, 1)
+
+    def scales(self, names: Sequence[str]) -> dict[str, float]:
+        """Of those of these parameters that are smoothed. ValueError: a scale is of none of them."""
+        if not isinstance(self.scale, Mapping):
+            return dict.fromkeys(names, self.scale)
+        found: dict[str, float] = {}
+        for name, scale in self.scale.items():
+            own = [one for one in names if name in (one, re.sub(r"\[\d+\]$", "", one))]
+            if not own:
+                raise ValueError(f"SpatialPrior.scale names {name!r}; it must be one of {', '.join(names)}")
+            # a channel's own goes before that of all channels
+            found |= {one: scale for one in own if one == name or one not in self.scale}
+        return found
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a map is fitted: the model beyond stack and transport, the work, and the thresholds of flags and verdicts."""
+
+    scale: float | Free | None = None
+    """A factor of all measurements, as in `fits.fit`."""
+    objective: Objective = "likelihood"
+    """What is minimised, as in `fits.fit`."""
+    instrument: Instrument | None = None
+    """As in `fits.fit`; none where texels have directions of their own."""
+
+    starts: int = 8
+    """Starts of each of the first few pilot texels."""
+    seed: int = 0
+    """Of these starts."""
+    pilot_texels: int = 64
+    """Texels that are fitted first: starts, resolution and common parameters come from them."""
+    chunk_size: int = 1024
+    """Texels that are fitted and written together."""
+    restarts: int = 3
+    """Further starts, and rounds of neighbours' values, that a texel which ended poorly is tried from."""
+    emulator: bool | None = None
+    """Whether an exact transport is replaced by an emulator over the bounds, made once; None: where it holds, and the
+    map has `emulator_min_texels`."""
+    emulator_min_texels: int = 1_000
+    """Texels from which on an emulator is made where nothing is said of it."""
+    emulator_max_solves: int = 30_000
+    """Solutions of the transport that an emulator may take."""
+    emulator_error: float = 0.1
+    """Of an emulator at points that it has not seen, at most, in standard deviations of the data."""
+    spatial_prior: SpatialPrior | None = None
+    """Of neighbouring texels, beside the plain fit and after it, see `FittedMap.smoothed`; with another one the map is
+    smoothed anew, and nothing else fitted again."""
+    settled: float = 0.01
+    """A map is smooth where no texel moved farther in a round, in standard errors."""
+
+    poor_probability: float = 1e-6
+    """A chi-square that noise exceeds less often is poor, unless those of the pilot are as large."""
+    pilot_quantile: float = 0.9
+    """Of the pilot's reduced chi-squares, which counts as explained ..."""
+    pilot_factor: float = 1.5
+    """... up to this multiple."""
+
+    converged_share: float = 0.99
+    """Of the fitted texels, that must have converged in a map to be relied on."""
+    flagged_share: float = 0.05
+    """Of the fitted texels, that may be at a bound, poor or unresolved in such a map."""
+    numerical_error: float = 0.1
+    """Of the model, in standard deviations of the data, that is small: a resolution that is chosen stays below it."""
+    chi_square_sigmas: float = 3.0
+    """The median chi-square is no chance this many of a texel's standard deviations from 1."""
+
+    processes: int = 1
+    """1: threads of this process, one a core; of more each has a core of its own."""
+    force: bool = False
+    """Throw away a store of other arguments, and begin anew."""
+    progress: Progress | None = None
+    """Called with (stage, done, all, note): "pilot", "map" and so on."""
+
+    def __post_init__(self) -> None:
+        for name, least in {"starts": 1, "seed": 0, "pilot_texels": 1, "chunk_size": 1, "restarts": 0, "processes": 1,
+                            "emulator_min_texels": 0, "emulator_max_solves": 1}.items():  # fmt: skip
+            _whole(name, getattr(self, name), least)
+        for name in ("emulator_error", "settled", "pilot_factor", "numerical_error", "chi_square_sigmas"):
+            _number(name, getattr(self, name), 0.0, math.inf)
+        for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
+            _number(name, getattr(self, name), 0.0, 1.0)
+        if not isinstance(self.spatial_prior, SpatialPrior | None):
+            raise ValueError(f"spatial_prior is {self.spatial_prior!r}; it must be a fits.SpatialPrior, or None")
+
+    @property
+    def model(self) -> dict[str, Any]:
+        """What a problem is made with, beside the stack and its transport."""
+        return {"scale": self.scale, "objective": self.objective, "instrument": self.instrument}
+
+    def numbers(self) -> dict[str, Any]:
+        """Those that a store keeps: all but the model, the spatial prior and who does the work."""
+        without = {*self.model, "spatial_prior", "processes", "force", "progress"}
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in without}
+
+    def tell(self, stage: str, done: int, total: int, note: str = "") -> None:
+        """Report progress, where somebody listens."""
+        if self.progress is not None:
+            self.progress(stage, done, total, note)
+
+
+def _whole(name: str, value: object, least: int) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}")
+
+
+def _number(name: str, value: Any, low: float, high: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high:
+        raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
+    return number
+
+
+USUAL = MapOptions()
+
+VERDICTS = {"converged_share", "flagged_share", "chi_square_sigmas", "settled"}
+"""Options that change no number of a store: another value is not another fit."""

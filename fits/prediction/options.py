@@ -1,0 +1,44 @@
+"""What decides the verdicts of a comparison of models."""
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(frozen=True)
+class ComparisonOptions:
+    """Thresholds of `fits.compare`, `fits.cross_validate` and `fits.average`."""
+
+    standard_errors: float = 2.0
+    """Two models are statistically indistinguishable if their elpd difference is below so many standard
+    errors."""
+
+    decisive_per_measurement: float = 1.0
+    """An elpd difference above this a measurement, in every group of held-out data, decides whatever its standard
+    error: a few groups say little of the error of their sum."""
+
+    slight_difference: float = 2.0
+    """Below this difference in AIC and BIC (for elpd: twice the difference less its error) two models are statistically
+    indistinguishable (Burnham & Anderson 2002, Sec. 2.6; Kass & Raftery 1995)."""
+
+    clear_difference: float = 10.0
+    """Above this difference in AIC and BIC (or as above in elpd) hardly any doubt remains; between the two the data
+    prefer a model slightly."""
+
+    max_pareto_k: float = 0.7
+    """Pareto k of importance weights above which leave-one-out and evidence are unreliable (Vehtari et al. 2024)."""
+
+    max_reduced_chi_square: float = 2.0
+    """If the reduced chi-square of every model is above this, a note says that none explains the data."""
+
+    min_incidences: int = 3
+    """Cross-validation holds out one incidence at a time if there are so many, and parts of every scan if there are
+    fewer, as a fit of one incidence says little of another."""
+
+    scan_parts: int = 5
+    """Parts of equal size that every scan is then divided into."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not getattr(self, field.name) > 0:
+                raise ValueError(f"{field.name} is {getattr(self, field.name)}; it must be above 0")
+        if self.scan_parts < 2:
+            raise ValueError(f"scan_parts is {self.scan_parts}; it must be at least 2")

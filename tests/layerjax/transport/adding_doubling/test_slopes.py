@@ -1,0 +1,157 @@
+"""Slopes of `AddingDoubling`, by every continuous parameter of random stacks of every structure.
+
+Forward and reverse mode agree with each other and with differences of values at the same resolution: no point of a
+quadrature crosses an edge of what it sums, so that values are no staircase. At the default resolution slopes are those
+of a finer one.
+
+Slopes are by the parameter itself, of widths and thicknesses by its share. They are compared relative to |f|, or to
+`FLOOR` of the largest |f| of the pairs.
+"""
+
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import layerjax as lj
+from layerjax._parameters import leaves_with_names
+from tests.helpers.random_stacks import STRUCTURES, drawn
+
+FLOOR = 1e-2
+SHORT = lj.AddingDoubling(nodes=6, modes=8)
+STEPS = (2e-4, 2e-5)
+"""Central differences at a step and half of it, extrapolated (Richardson). Staircases show at the first; at the second,
+rounding of values to 1e-13 leaves 1e-8."""
+
+OTHERS = {
+    "low coat on paint": (
+        (0.7, 0.05, 0.5),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1])], lj.Lambertian(p[2])),
+    ),
+    "vmf coat on metal": (
+        (1.5, 0.3, 0.3),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1], "vmf")], lj.Conductor(0.2, 3.5, p[2], "vmf")),
+    ),
+    "two coats on metal": (
+        (1.5, 0.3, 1.2, 0.2),
+        lambda p: lj.Stack([lj.Interface(p[0], p[1]), lj.Interface(p[2], p[3])], lj.Conductor(0.2, 3.5, 0.3)),
+    ),
+}
+"""What meets critical angles and horizons otherwise: an index below 1, von Mises-Fisher normals, an inner interface."""
+
+
+REVERSE = ("flakes", "haze on metal", "low coat on paint")
+"""Whose gradients compile fast."""
+
+
+LONG = ("two coats on metal",)
+"""Whose programs do not."""
+
+
+def build_of(kind):
+    return OTHERS[kind][1] if kind in OTHERS else STRUCTURES[kind][1]
+
+
+def numbers_of(kind, seed):
+    return jnp.asarray(OTHERS[kind][0]) if kind in OTHERS else drawn(kind, seed)
+
+
+def pairs(kind):
+    """Near the mirror direction, across, grazing, back; of slabs also through them."""
+    theta_i = jnp.radians(jnp.array([20.0, 20.0, 50.0, 50.0, 70.0, 10.0]))
+    theta_o = jnp.radians(jnp.array([3.0, 75.0, 45.0, 20.0, 68.0, 12.0]))
+    phi = jnp.radians(jnp.array([180.0, 120.0, 90.0, 180.0, 170.0, 0.0]))
+    wi, wo = lj.direction(theta_i, jnp.zeros_like(phi)), lj.direction(theta_o, phi)
+    if kind != "slab":
+        return wi, wo
+    return jnp.concatenate([wi, wi]), jnp.concatenate([wo, wo * jnp.array([1.0, 1.0, -1.0])])
+
+
+def lengths(kind, numbers):
+    """By which slopes are multiplied."""
+    named = leaves_with_names(build_of(kind)(numbers))
+    shares = {float(leaf) for path, leaf in named if path.endswith(("alpha", "thickness"))}
+    return np.array([value if value in shares else 1.0 for value in map(float, numbers)])
+
+
+@cache
+def program(kind, transport, known, reverse):
+    """Values, their Jacobian, the gradient of their weighted sum. known: whether directions are, while tracing."""
+    directions = pairs(kind)
+
+    def values(numbers, wi, wo):
+        wi, wo = directions if known else (wi, wo)
+        return (lj.evaluate(build_of(kind)(numbers), wi, wo, transport)[..., 0],) * 2
+
+    def all_of(numbers, weight, wi, wo):
+        forward, f = jax.jacfwd(values, has_aux=True)(numbers, wi, wo)
+        back = jax.grad(lambda numbers: weight @ values(numbers, wi, wo)[0])(numbers) if reverse else weight @ forward
+        return f, forward, back
+
+    compiled = jax.jit(all_of)
+    return lambda numbers, weight: map(np.asarray, compiled(numbers, weight, *directions))
+
+
+def relative_to(f):
+    return np.maximum(np.abs(f), FLOOR * np.max(np.abs(f)))
+
+
+def wrong(kind, numbers, transport, known=True, reverse=True):
+    """Where analytic slopes are not those of differences to 1e-4, or of the other mode to 1e-7."""
+    run = program(kind, transport, known, reverse)
+    f, forward, _ = run(numbers, np.ones(len(pairs(kind)[0])))
+    scale = relative_to(f)
+    back = list(run(numbers, 1.0 / scale))[2]
+    size = (1.0 / scale) @ np.abs(forward)
+    if np.any(np.abs(back - (1.0 / scale) @ forward) > 1e-7 * (size + 1.0)):
+        yield f"reverse {back}, forward {(1.0 / scale) @ forward} at {numbers}"
+    for k, length in enumerate(lengths(kind, numbers)):
+
+        def central(step, k=k):
+            up, down = (next(run(numbers.at[k].add(sign * step), 1.0 / scale)) for sign in (1, -1))
+            return (up - down) / (2.0 * step)
+
+        for share in STEPS:
+            step = share * length
+            difference = (4.0 * central(0.5 * step) - central(step)) / 3.0
+            off = np.max(np.abs(difference - forward[:, k]) / scale) * length
+            if not off <= 1e-4:
+                yield f"{k}: off by {off:.1e} of |f| at steps of {share:g}, at {numbers}"
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in LONG else ()) for kind in (*STRUCTURES, *OTHERS)]
+)
+def test_slopes_are_those_of_differences(kind):
+    found = list(wrong(kind, numbers_of(kind, 0), SHORT, reverse=kind in REVERSE))
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("kind", STRUCTURES)
+def test_slopes_of_many_stacks_are_those_of_differences(kind, known):
+    transport = lj.AddingDoubling(nodes=12, modes=16)
+    found = [line for seed in range(20) for line in wrong(kind, numbers_of(kind, seed), transport, known)]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", STRUCTURES)
+def test_slopes_at_the_default_resolution(kind):
+    """To 1 % of |f| of those at twice the nodes and modes."""
+    wi, wo = pairs(kind)
+    found = []
+    for seed in range(4):
+        numbers = numbers_of(kind, seed)
+        usual = lj.choose_transport(build_of(kind)(numbers), wi, wo)
+        fine = dataclasses.replace(usual, nodes=2 * usual.nodes, modes=min(2 * usual.modes, 96))
+        ones = np.ones(len(wi))
+        (f, slopes, _), (_, fine_slopes, _) = (program(kind, one, True, False)(numbers, ones) for one in (usual, fine))
+        off = np.max(np.abs(fine_slopes - slopes) / relative_to(f)[:, None], axis=0) * lengths(kind, numbers)
+        if not np.all(off <= 1e-2):
+            found.append(f"{usual.nodes} x {usual.modes}: off by {off} of |f| at {numbers}")
+    assert not found, "\n".join(found)
