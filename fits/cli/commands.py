@@ -33,7 +33,7 @@ from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 DONE, DOUBTFUL = 0, 1

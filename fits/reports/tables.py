@@ -16,7 +16,7 @@ from fits.data.scans import incidences
 from fits.data.totals import Totals
 from fits.optimise.limits import instrument_limits
 from fits.optimise.result import OUTCOMES
-from fits.prediction.prediction import scores
+from fits.prediction.predict import scores
 from fits.reports.diagnostics import ResidualStructure
 from fits.reports.verdicts import identifiability, numerical_error
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.prediction.compare import ComparedFit, Comparison
     from fits.prediction.model_scores import ModelScore
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 

@@ -34,7 +34,7 @@ from fits.reports.plots.data import (
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
     from fits.optimise.result import Fit
-    from fits.prediction.prediction import Prediction
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 BAND_DRAWS = 200  # posterior draws behind an interval

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.data.neighbours import alike, neighbours
+from fits.data.neighbours import correlation, neighbours
 from fits.data.scans import signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.identifiability import Direction
@@ -162,7 +162,7 @@ def test_residuals_of_the_assumed_model_are_independent_standard_normal(fitted: 
     first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
     count = sum(one.count for one in structures)
     assert np.sqrt(np.mean([one.rms**2 for one in structures])) == pytest.approx(1.0, abs=3.0 / np.sqrt(2.0 * count))
-    assert abs(alike(first, second)) < 3.0 / np.sqrt(len(first))
+    assert abs(correlation(first, second)) < 3.0 / np.sqrt(len(first))
 
 
 def test_statements_on_residuals_are_about_the_whitened_ones(fitted: Fit) -> None:
