@@ -66,7 +66,7 @@ class Store:
     def open(
         cls, path: str | Path, fingerprint: Mapping[str, str], *, replace: bool = False, fresh: bool = False
     ) -> Iterator[Self]:
-        """Write a store, as the only process that does, and go on with the records that it holds.
+        """Write a store, as the only process that does, and resume from the records that it holds.
 
         Args:
             path: of the file, which is made if it is not there.
@@ -143,11 +143,11 @@ class Store:
         text, content = _encoded(record)
         checksum = _checksum(key, text, content)
         with self._turn, _errors_of(self.path):
-            total = self._total ^ checksum
+            total = self._total + checksum
             with self._connection:  # a transaction
                 if replace:
                     for (old,) in self._select("SELECT checksum FROM records WHERE key = ?", (key,)):
-                        total ^= old
+                        total -= old
                     self._connection.execute("DELETE FROM records WHERE key = ?", (key,))
                 self._connection.execute(
                     "INSERT INTO records (key, checksum, text, content) VALUES (?, ?, ?, ?)",
@@ -183,7 +183,7 @@ class Store:
         whole, found = checksum == _checksum(text, str(total), b""), 0
         for key, stored, *record in self._connection.execute("SELECT key, checksum, text, content FROM records"):
             whole &= stored == _checksum(key, *record)
-            found ^= stored
+            found += stored
         if not whole or found != total:
             raise ValueError(damaged(self.path))
         return json.loads(text), total
@@ -196,6 +196,13 @@ class Store:
 
     def _select(self, statement: str, values: tuple[Any, ...] = ()) -> list[Any]:
         return self._connection.execute(statement, values).fetchall()
+
+
+def holds_other_files(directory: Path, store: str) -> bool:
+    """Whether there is no store of this name in a directory, but something that is not of one."""
+    if not directory.is_dir() or (directory / store).is_file():
+        return False
+    return any(not one.name.startswith(store) for one in directory.iterdir())
 
 
 def fingerprint(**parts: Any) -> dict[str, str]:
@@ -220,12 +227,12 @@ def differences(stored: Mapping[str, str], given: Mapping[str, str]) -> str:
 
 def another(path: str | Path, different: str) -> str:
     """The message of a place that holds the work of another problem."""
-    return f"{path}: holds the work of another problem ({different}); --force, or force=True, replaces it"
+    return f"{path}: holds the work of another problem ({different})"
 
 
 def damaged(path: str | Path) -> str:
     """The message of a file that is not as it was written."""
-    return f"{path}: damaged, or no store of this version of layerjax; without this file the work begins anew"
+    return f"{path}: damaged, or no store of this version of layerjax"
 
 
 def portable_repr(thing: Any) -> str:

@@ -38,7 +38,7 @@ from fits.reports import tables
 from fits.reports.pages import document, section, sentences
 from fits.reports.results import FIT, REPORT
 from fits.reports.verdicts import listed
-from fits.store import Store, another, differences, fingerprint
+from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search.report import write_report as write_search
 from fits.structure_search.search import search as run_search
 
@@ -64,14 +64,14 @@ class FittedFiles:
             converged" or "failed"), `status` (of the fit, or why there is none), `standing` among the stacks of the
             file; of a fit `criterion` and `loss`, by which stacks are ranked (-2 log predictive density of held-out
             data, else AIC, else the named objective), `reduced_chi_square`, with and without the model discrepancy,
-            values and errors of the parameters, those at a bound, the number of readings, seconds; of a search the
+            values and errors of the parameters, those at a bound, the number of measurements, seconds; of a search the
             `structure` that is best.
-        left_out: files of the folders that hold no measurements.
+        skipped: files of the folders that hold no measurements.
     """
 
     directory: Path
     rows: tuple[Row, ...]
-    left_out: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
 
     @property
     def complete(self) -> bool:
@@ -107,13 +107,13 @@ def fit_files(
 ) -> FittedFiles:
     """Fit every measurement file by every stack, each into a result directory ``out/FILE/STACK``, and tabulate them.
 
-    What is there already is not done again; a run that was interrupted goes on. A file that cannot be read, or a fit
-    that fails, is a row with the reason, and the others go on.
+    What is there already is not done again; a run that was interrupted is resumed. A file that cannot be read, or a fit
+    that fails, is a row with the reason, and the others are fitted.
 
     Args:
-        files: a folder, of which files that hold no measurements are left out, or files and folders.
+        files: a folder, of which files that hold no measurements are skipped, or files and folders.
         stacks: stack files; may be none where a search is asked for.
-        out: directory to write, or to go on with.
+        out: directory to write, or to resume.
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a mapping has the arguments of `fits.search`.
@@ -129,7 +129,7 @@ def fit_files(
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     reading, out, progress = reading or ReadOptions(), Path(out), progress or silent
-    found, left_out = measurement_files(_several(files), reading.format)
+    found, skipped = measurement_files(_several(files), reading.format)
     named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in named_stacks.items()}
     if not given and search is False:
@@ -147,7 +147,7 @@ def fit_files(
         raise ValueError(f"{out}: there is no directory {out.parent}")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file, must be a directory")
-    if out.exists() and any(out.iterdir()) and not (out / STORE).is_file():
+    if holds_other_files(out, STORE):
         raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
@@ -177,7 +177,7 @@ def fit_files(
             for key, row in rows.items():
                 if row["result"] != "failed" and not (out / key / FIT).is_file():
                     row |= {"result": "failed", "status": f"{key}: was removed while others were fitted"}
-            result = FittedFiles(out, ranked(list(rows.values())), left_out)
+            result = FittedFiles(out, ranked(list(rows.values())), skipped)
             write_text(out / TABLE, table_csv(result.rows), force=True)
             write_text(out / PAGE, page(result), force=True)
     return result
@@ -201,7 +201,7 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
             files.append(place)
             continue
         every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))
-        some = [one for one in every if format is not None or _holds_measurements(one)]
+        some = [one for one in every if format or one.suffix.lower() in MEASURED or _has_known_content(one)]
         if not some:
             raise ValueError(f"{place}: holds no measurement file")
         files += some
@@ -211,9 +211,7 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
     return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(beside)
 
 
-def _holds_measurements(path: Path) -> bool:
-    if path.suffix.lower() in MEASURED:
-        return True
+def _has_known_content(path: Path) -> bool:
     try:
         sniff(path)
     except (ValueError, OSError):
@@ -290,22 +288,21 @@ def _planned(job: Job, files: list[Path], out: Path, done: Store | None) -> tupl
     rows: dict[str, Row] = {}
     tasks: list[Task] = []
     for path in files:
-        every, why = [Task(path, "", stack) for stack in job.names], NOT_YET
+        why, content = NOT_YET, ""
         try:
             content = _lines(path)
-            every = [task._replace(content=content) for task in every]
         except OSError as error:
             why = one_line(error)
-        rows |= {task.key: task.failed(why) for task in every}
-        if why == NOT_YET:
-            rows |= {task.key: row for task in every if (row := _done_before(job, task, out, done)) is not None}
-        left = [task for task in every if rows[task.key]["status"] == NOT_YET]
+        every = [Task(path, content, stack) for stack in job.names]
+        known = {task.key: _done_before(job, task, out, done) if content else None for task in every}
+        left = [task for task in every if known[task.key] is None]
         try:
-            if left:
+            if left and content:
                 job.reading.split(path)  # before any is fitted
-            tasks += left
+                tasks += left
         except (ValueError, OSError) as error:
-            rows |= {task.key: task.failed(one_line(error)) for task in left}
+            why = one_line(error)
+        rows |= {task.key: known[task.key] or task.failed(why) for task in every}
     return rows, sorted(tasks, key=lambda task: job.names.index(task.stack))
 
 
@@ -325,7 +322,7 @@ def _done_before(job: Job, task: Task, out: Path, done: Store | None) -> Row | N
         return None
     words = differences(kept["of"], job.fingerprint(task))
     if words and not job.force:
-        raise ValueError(another(directory, words))
+        raise ValueError(f"{another(directory, words)}; --force, or force=True, fits it again")
     try:
         read_json(directory / FIT)
     except (ValueError, OSError) as error:
@@ -392,7 +389,7 @@ def _fitted(job: Job, task: Task) -> Row:
         row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
-    row |= {"at_bound": " ".join(fit.at_bound), "readings": int(fit.problem.data.mask.sum())}
+    row |= {"at_bound": " ".join(fit.at_bound), "measurements": int(fit.problem.data.mask.sum())}
     return row | {"seconds": round(time.monotonic() - began, 2)}
 
 
@@ -416,20 +413,18 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
         excess = max(1.0, np.nan_to_num(best["reduced_chi_square"])) if best["criterion"] == "AIC" else 1.0
         for k in own:
             behind = (rows[k]["loss"] - best["loss"]) / excess
-            alike = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
-            words[k] = (
-                "best"
-                if k == first
-                else "as good"
-                if alike and behind < ComparisonOptions().slight_difference
-                else f"{behind:+.1f}"
-            )
+            close = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
+            close &= behind < ComparisonOptions().slight_difference
+            words[k] = "best" if k == first else "as good" if close else f"{behind:+.1f}"
     return tuple(row | {"standing": word} for row, word in zip(rows, words, strict=True))
 
 
 def table_csv(rows: Sequence[Row]) -> str:
     """A line each; value and error of every parameter that any of them has, empty where it has none."""
-    first, last = ("file", "stack", "structure", "result", "standing"), ("readings", "seconds", "at_bound", "status")
+    first, last = (
+        ("file", "stack", "structure", "result", "standing"),
+        ("measurements", "seconds", "at_bound", "status"),
+    )
     names = dict.fromkeys(name for row in rows for name in row if name not in last)
     out = io.StringIO()
     writer = csv.DictWriter(out, list(dict.fromkeys((*first, *names, *last))), restval="", lineterminator="\n")
@@ -469,7 +464,7 @@ def statements(found: FittedFiles) -> list[str]:
         "No result of": list(dict.fromkeys(row["file"] for row in rows if row["result"] == "failed")),
         "Not converged:": [f"{row['file']} by {row['stack']}" for row in rows if row["result"] == "not converged"],
         "Best of a file:": [f"{name} {_count(best.count(name), 'time')}" for name in stacks if len(stacks) > 1],
-        "Not taken for measurements:": list(found.left_out),
+        "Not taken for measurements:": list(found.skipped),
     }
     return [
         f"{_count(len(files), 'file')} by {_count(len(stacks), 'stack')}: {len(rows) - results.count('failed')} of "

@@ -200,7 +200,7 @@ def _search(commands: Commands) -> None:
         "--budget",
         type=level,
         metavar="MINUTES",
-        help="begin no stack after this time; the same command resumes (default: none)",
+        help="begin no stack after this time, and report what was found; the same command resumes (default: none)",
     )
     parser.add_argument("--layers", type=int, default=3, metavar="N", help="most layers over the base (default: 3)")
     parser.add_argument("--instrument", metavar="TOML", help="a file with an [instrument], such as a stack file")

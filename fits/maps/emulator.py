@@ -252,7 +252,7 @@ def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[n
     # through its middle and some of its corners, near which series are worst
     corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
     through = np.concatenate([np.zeros((1, count)), 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0])
-    found: list[dict[bool, list[Floats]]] = []
+    found: list[dict[bool, Any]] = []
     for coordinate in range(count):
         lines = np.repeat(through, LINE_NODES, axis=0)
         lines[:, coordinate] = np.tile(nodes, len(through))
@@ -265,8 +265,8 @@ def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[n
     best = None
     for offset in OFFSETS:
         shift = offset * np.mean(means, axis=0)
-        terms = [{way: _terms(*lines, shift, tolerance) for way, lines in ways.items()} for ways in found]
-        logs = [min(ways, key=lambda way, ways=ways: ways[way]) for ways in terms]
+        terms = [{way: _terms(lines[0], lines[1], shift, tolerance) for way, lines in ways.items()} for ways in found]
+        logs = [min(ways, key=ways.__getitem__) for ways in terms]
         needed = tuple(ways[way] for ways, way in zip(terms, logs, strict=True))
         if max(needed) < LINE_NODES and (best is None or np.prod(needed) < np.prod(best[0])):
             best = needed, np.array(logs), shift

@@ -4,7 +4,6 @@ import html
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 
 from fits._files import write_together
@@ -50,11 +49,11 @@ def search_table(search: Search, most: int | None = SHOWN) -> tables.Table:
 
 
 def _row(one: Candidate) -> tuple[str, ...]:
-    seen, without = one.model_score, one.fit.without_discrepancy
+    score, without = one.model_score, one.fit.without_discrepancy
     cells = ("", "", "", "")
-    if seen is not None:
-        behind = f"{seen.elpd_diff:.1f} ± {seen.dse:.1f}"
-        cells = (f"{seen.elpd:.1f}", behind, f"{seen.weight:.2f}", f"{seen.model_probability:.2g}")
+    if score is not None:
+        behind = f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
+        cells = (f"{score.elpd:.1f}", behind, f"{score.weight:.2f}", f"{score.model_probability:.2g}")
     ratio = without.chi_square / max(without.degrees_of_freedom, 1) if without else one.fit.reduced_chi_square
     return (one.name, str(_of_stack(one)), f"{ratio:.3g}", f"{one.bic:.1f}", *cells)
 
@@ -83,7 +82,7 @@ def search_sentences(search: Search) -> list[str]:
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
     if search.stopped:
-        words.append("The time budget ended the search before all models were tried. The same command goes on with it.")
+        words.append("The time budget ended the search before all models were tried. The same command resumes it.")
     return [*words, *noise_statements(best.fit.problem)]
 
 
@@ -103,37 +102,29 @@ def _others(search: Search) -> str:
 
 
 def search_picture(search: Search) -> Figure:
-    """Predictive score and BIC against the number of parameters, and probabilities."""
-    close = [(one, one.model_score) for one in search.candidates if one.model_score is not None]
+    """Predictive score and BIC against the number of parameters."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.8), layout="constrained")
-        left, middle, right = figure.subplots(1, 3, width_ratios=[3.0, 3.0, 2.0])
-        middle.plot(
-            [_of_stack(one) for one in search.candidates], [one.bic for one in search.candidates], "o", color=GREY
-        )
-        for number, (one, seen) in enumerate(close):
-            colour = CYCLE[number % len(CYCLE)] if number < NAMED else GREY
-            of_score = {"fmt": "o", "color": colour, "markersize": 5, "label": one.name}
-            left.errorbar(_of_stack(one), max(seen.elpd_diff, 0.0), yerr=seen.dse, **of_score)
-            middle.plot(_of_stack(one), one.bic, "o", color=colour)
-        for number, (_, seen) in enumerate(close[:NAMED]):
-            right.barh(number, seen.model_probability, color=CYCLE[number % len(CYCLE)])
+        figure = Figure(figsize=(8.0, 3.8), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for number, one in enumerate(search.candidates):
+            score, close = one.model_score, one.model_score is not None and number < NAMED
+            colour, label = (CYCLE[number % len(CYCLE)], one.name) if close else (GREY, None)
+            if score is not None:
+                behind = max(score.elpd_diff, 0.0)
+                left.errorbar(_of_stack(one), behind, yerr=score.dse, fmt="o", color=colour, label=label)
+            right.plot(_of_stack(one), one.bic, "o", color=colour)
         left.set(ylabel="score behind the best", title="Held-out data")
-        middle.set(ylabel="BIC above the lowest", title="Fit with independent noise")
-        for axes in (left, middle):
+        right.set(ylabel="BIC above the lowest", title="Fit with independent noise")
+        for axes in (left, right):
             axes.set_yscale("symlog", linthresh=10.0)
             axes.invert_yaxis()
             axes.set_xlabel("parameters of the stack")
             axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(integer=True))
-        right.set(xlabel="probability", title="Posterior", xlim=(0.0, 1.0))
-        right.set_yticks(np.arange(0))
-        right.invert_yaxis()
         figure.legend(loc="outside lower center", ncols=2)
     return figure
 
 
 _CAPTION = (
     "Left: how far the log predictive density of held-out incidences is behind that of the best structure, with its "
-    "standard error. Middle: the Bayesian information criterion of fits with independent noise. Right: probability "
-    "among the cross-validated structures, all as probable beforehand."
+    "standard error. Right: the Bayesian information criterion of fits with independent noise."
 )

@@ -36,7 +36,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.progress import Progress, silent
 from fits.reports.results import load_fit, save_fit
-from fits.store import Store, fingerprint
+from fits.store import Store, fingerprint, holds_other_files
 from fits.structure_search.library import Library, Structure, default_library
 from layerjax._checks import in_short, require_kind
 
@@ -56,7 +56,7 @@ class SearchOptions:
         starts: of each fit, see `fits.fit`.
         beam: so many stacks of the lowest BIC grow and shrink, and the one that predicts best.
         cross_validated: so many of a level, those of its lowest BIC, are cross-validated.
-        bic_gain: a level that does not predict better is gone on from if it lowers the BIC by more than this.
+        bic_gain: a level that does not predict better is followed by another if it lowers the BIC by more than this.
         budget: minutes after which no stack is begun any more, but those that a result needs; what was begun is
             finished. None: without end.
     """
@@ -69,16 +69,15 @@ class SearchOptions:
     budget: float | None = None
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.layers, int) and 0 <= self.layers <= 6):
-            raise ValueError(f"layers is {in_short(self.layers)}; it must be in [0, 6]")
-        for name in ("starts", "beam", "cross_validated"):
+        most = {"layers": (0, 6), "starts": (1, math.inf), "beam": (1, math.inf), "cross_validated": (1, math.inf)}
+        for name, (low, high) in most.items():
             number = getattr(self, name)
-            if not (isinstance(number, int) and number >= 1):
-                raise ValueError(f"{name} is {in_short(number)}; it must be a whole number >= 1")
-        if not self.bic_gain >= 0.0:
-            raise ValueError(f"bic_gain is {in_short(self.bic_gain)}; it must be at least 0")
-        if self.budget is not None and not (math.isfinite(self.budget) and self.budget >= 0.0):
-            raise ValueError(f"budget is {self.budget}; it must be a number of minutes of at least 0")
+            if not (isinstance(number, int) and low <= number <= high):
+                raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
+        for name in ("bic_gain", "budget"):
+            number = getattr(self, name)
+            if number is not None and not 0.0 <= number < math.inf:
+                raise ValueError(f"{name} is {in_short(number)}; it must be a finite number of at least 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,7 @@ def search(
         seed: of the starts, see `fit`.
         options: how far the search goes.
         directory: keeps every fit and every held-out incidence as it is finished: a search that was killed, or whose
-            budget ended it, goes on there. The fits are result directories.
+            budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
@@ -188,7 +187,7 @@ def search(
             used, directory = data.used(), Path(directory)
             numbers = [used.wi, used.wo, used.values, used.sigma]
             whose = fingerprint(data=numbers, library=library, **settings, starts=options.starts, seed=seed)
-            if not (directory / STORE).is_file() and directory.exists() and any(directory.iterdir()):
+            if holds_other_files(directory, STORE):
                 raise ValueError(f"{directory}: is not empty, and holds no search")
             with errors_named(directory):
                 directory.mkdir(parents=True, exist_ok=True)
@@ -273,13 +272,13 @@ class _Run:
         name = named(structure)
         stored = self.store.get(name)
         if stored is None:
-            left, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
-            self.store.put(name, {"left": vars(left), "evidence": vars(evidence)})
+            checked, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
+            self.store.put(name, {"cross-validation": vars(checked), "evidence": vars(evidence)})
         else:
-            kept = stored["left"]
-            left = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
+            kept = stored["cross-validation"]
+            checked = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
             evidence = Evidence(**stored["evidence"])
-        return fit, left, evidence
+        return fit, checked, evidence
 
     def _problem(self, structure: Structure) -> Problem:
         return Problem(self.library.stack(structure), self.data, **self.settings)
@@ -344,7 +343,8 @@ class _Run:
         """Scores side by side, best first."""
         close = {named(one): self.full[one] for one in self.ranked()}
         return rank_models(
-            {name: left for name, (_, left, _) in close.items()}, {name: found for name, (*_, found) in close.items()}
+            {name: checked for name, (_, checked, _) in close.items()},
+            {name: found for name, (*_, found) in close.items()},
         )
 
     def result(self) -> Search:
@@ -357,5 +357,5 @@ class _Run:
             bic = self.bic(one) - lowest
             candidates.append(Candidate(one, len(fit.vector), bic, fit, model_scores.get(named(one))))
         best = candidates[0].name
-        near = tuple(name for name, seen in model_scores.items() if name != best and seen.clear_diff <= 0.0)
+        near = tuple(name for name, one in model_scores.items() if name != best and one.clear_diff <= 0.0)
         return Search(tuple(candidates), near, self.options)

@@ -196,9 +196,7 @@ def test_damage_is_reported_and_never_read(tmp_path: Path) -> None:
     for length in (100, 4096, len(whole) - 4096):
         path.write_bytes(whole[:length])
         for call in (lambda: Store.read(path), lambda: Store.open(path, WHOSE).__enter__()):
-            with pytest.raises(
-                ValueError, match=r"store: damaged, or no store .*; without this file the work begins anew"
-            ):
+            with pytest.raises(ValueError, match="store: damaged, or no store of this version"):
                 call()
     with Store.open(path, WHOSE, fresh=True) as store:
         assert store.keys() == []
@@ -227,7 +225,7 @@ def test_the_work_of_another_problem_is_refused_by_name(tmp_path: Path) -> None:
     before = contents(tmp_path)
     other = fingerprint(data=np.arange(4.0), seed=1)
     for call in (lambda: Store.read(path, other), lambda: Store.open(path, other).__enter__()):
-        with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\); --force"):
+        with pytest.raises(ValueError, match=r"holds the work of another problem \(data, seed 0, not 1\)"):
             call()
     assert contents(tmp_path) == before
     with Store.open(path, other, replace=True) as store:

@@ -172,7 +172,7 @@ def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
     colours = mpl.colors.ListedColormap([state.colour for state in STATES])
     with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure, axes = _figure(drawn.shape, "flags of the texels", legend=0.5)
-        ends = {"vmin": -0.5, "vmax": len(STATES) - 0.5}
+        ends: dict[str, Any] = {"vmin": -0.5, "vmax": len(STATES) - 0.5}
         axes.imshow(image, cmap=colours, interpolation="nearest", **ends, **_placed(image.shape, steps))
         if drawn.ndim == 1:
             axes.set(xlabel="texel", ylabel="", yticks=[])

@@ -49,7 +49,7 @@ def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -
         (file, stack) for file in ("broken.csv", "coated.csv", "paint.csv") for stack in ("coat", "bare")
     ]
     assert not found.complete
-    assert [Path(path).name for path in found.left_out] == ["README.md"]
+    assert [Path(path).name for path in found.skipped] == ["README.md"]
     assert "twenty" in found.rows[0]["status"]
     assert found.best == {"coated.csv": "coat", "paint.csv": "bare"}
     assert len(counted) == 4
@@ -71,7 +71,7 @@ def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -
         density = stats.norm.logpdf(data.values, fit.predicted, data.sigma).sum()
         assert row["criterion"] == "AIC"
         assert row["loss"] == pytest.approx(2 * len(fit.vector) - 2 * density, rel=1e-9)
-        assert row["readings"] == len(data) == int(line["readings"])
+        assert row["measurements"] == len(data) == int(line["measurements"])
         for name, value in fit.values.items():
             assert (row[name], row[f"{name} error"]) == (value, pytest.approx(fit.standard_errors[name], nan_ok=True))
             np.testing.assert_allclose(float(line[name]), value, rtol=1e-7)

@@ -12,14 +12,14 @@ from scipy.optimize import least_squares, minimize
 
 import fits
 import layerjax as lj
-from fits.data.geometry import Geometry
 from fits.maps import spatial
 from fits.maps.options import MapOptions
 from fits.maps.spatial import Edges
+from tests.helpers import quick_maps
+from tests.helpers.quick_maps import NAMES, TRANSPORT, coat
 
-TRANSPORT = lj.SingleScattering()
 SHAPE, CHUNK = (4, 4), 12  # the second chunk begins at an odd column
-THICKNESS, ALBEDO = NAMES = ("layers[0].thickness", "base.albedo")
+THICKNESS, ALBEDO = NAMES
 LOW, HIGH = np.array([np.log(0.05), 0.0]), np.array([np.log(3.0), 1.0])
 MEAN, SD = 0.5, 0.2
 """Of the prior of the albedo."""
@@ -28,23 +28,17 @@ HUBER = 0.1
 """Of a scale: below, a total variation is quadratic."""
 
 
-def coat(thickness, albedo):
-    return lj.Stack([lj.Medium(thickness, 0.8, lj.HenyeyGreenstein(0.3))], lj.Lambertian(albedo))
-
-
 FREE = coat(fits.Free(0.5, 0.05, 3.0, prior=fits.LogUniform()), fits.Free(0.4, 0.0, 1.0, prior=fits.Normal(MEAN, SD)))
 
 
 @pytest.fixture(scope="module")
 def geometry():
-    every = fits.slices(incidence=[10.0, 60.0])
-    places = np.linspace(0, len(every.wi) - 1, 12).astype(int)
-    return Geometry(every.wi[places], every.wo[places])
+    return quick_maps.geometry()
 
 
 @pytest.fixture(scope="module")
 def predict(geometry):
-    """Values (12,) of a texel from its numbers (2,) in the unit box."""
+    """Values (16,) of a texel from its numbers (2,) in the unit box."""
 
     def one(unit):
         natural = LOW + unit * (HIGH - LOW)
@@ -234,8 +228,8 @@ def test_the_plain_fit_stays_and_texels_left_out_stay_out(tmp_path, gaussian, fi
 
 
 def test_what_is_not_named_is_not_smoothed(tmp_path, fitted, mask):
-    map = fitted(tmp_path / "one.zarr", spatial_prior=fits.SpatialPrior("gaussian", {ALBEDO: 0.001}, rounds=2))
-    assert map.smoothing["prior"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 2, "settled": 0.01}
+    map = fitted(tmp_path / "one.zarr", spatial_prior=fits.SpatialPrior("gaussian", {ALBEDO: 0.001}, rounds=4))
+    assert map.smoothing["prior"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 4, "settled": 0.01}
     assert not map.smoothing["settled"]
     rough = {name: np.nanstd(map.smoothed[name]) / np.nanstd(map.values[name]) for name in NAMES}
     assert rough[ALBEDO] < 0.5
@@ -248,33 +242,33 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(found[name][:], expected[name][:], err_msg=name)
 
 
-def test_a_run_that_was_stopped_between_rounds_goes_on_to_the_bit(tmp_path, fitted, gaussian):
+def assert_finished(out, fitted, gaussian):
+    """What was interrupted is not there, and ends as an undisturbed run, in the same files."""
+    assert fits.open_map(out).done == 1.0
+    assert fits.open_map(out).smoothed is None
+    told = []
+    assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2])), gaussian)
+    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+    return [done for stage, done in told if stage == "smoothing"]
+
+
+def test_a_run_that_was_stopped_between_rounds_is_resumed_to_the_bit(tmp_path, fitted, gaussian):
     def stop(stage, done, total=None, info=""):
         if stage == "smoothing" and done == 2:
             raise KeyboardInterrupt
 
-    out, told = tmp_path / "stopped.zarr", []
     with pytest.raises(KeyboardInterrupt):
-        fitted(out, spatial_prior=GAUSSIAN, progress=stop)
-    assert fits.open_map(out).done == 1.0
-    assert fits.open_map(out).smoothed is None
-    found = fitted(out, spatial_prior=GAUSSIAN, progress=lambda *told_of: told.append(told_of[:2]))
-    rounds = [done for stage, done in told if stage == "smoothing"]
-    assert rounds[0] == 2  # not begun anew
-    assert_same(found, gaussian)
-    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+        fitted(tmp_path / "stopped.zarr", spatial_prior=GAUSSIAN, progress=stop)
+    assert assert_finished(tmp_path / "stopped.zarr", fitted, gaussian)[0] == 2  # not begun anew
 
 
-def test_a_run_that_was_killed_in_its_last_moments_goes_on_to_the_bit(tmp_path, fitted, gaussian):
-    out = tmp_path / "killed.zarr"
-    found, rounds = fitted(out, spatial_prior=GAUSSIAN), gaussian.smoothing["rounds"]
+def test_a_run_that_was_killed_in_its_last_moments_is_resumed_to_the_bit(tmp_path, fitted, gaussian):
+    out, rounds = tmp_path / "killed.zarr", gaussian.smoothing["rounds"]
+    fitted(out, spatial_prior=GAUSSIAN)
     os.rename(out / "smoothed", out / f"smoothing_{rounds}")
     (out / "smoothed.partial" / "values").mkdir(parents=True)  # of what was there before
-    (out / f"smoothing_{rounds + 1}.partial").mkdir()
-    assert fits.open_map(out).smoothed is None
-    found = fitted(out, spatial_prior=GAUSSIAN)
-    assert_same(found, gaussian)
-    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+    (out / f"smoothing_{rounds + 1}").mkdir()
+    assert assert_finished(out, fitted, gaussian) == [rounds]
 
 
 def test_a_full_disk_costs_a_round(tmp_path, monkeypatch, fitted, gaussian):
@@ -291,9 +285,7 @@ def test_a_full_disk_costs_a_round(tmp_path, monkeypatch, fitted, gaussian):
     with pytest.raises(OSError, match="No space left"):
         fitted(out, spatial_prior=GAUSSIAN)
     monkeypatch.undo()
-    assert fits.open_map(out).smoothed is None
-    assert_same(fitted(out, spatial_prior=GAUSSIAN), gaussian)
-    assert {one.name for one in out.iterdir()} == {one.name for one in gaussian.path.iterdir()}
+    assert assert_finished(out, fitted, gaussian)
 
 
 def test_data_that_cannot_be_read_again_are_named(tmp_path, monkeypatch, fitted):

@@ -130,7 +130,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     kept = tmp_path / "starts"
 
     def stop(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-        if stage.endswith("shared errors") and done == 2:
+        if stage.endswith("model discrepancy") and done == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -145,7 +145,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
     monkeypatch.setattr(starts_module, "rough_descent", counted)
     found = fit(STACK, readings(0.1), transport=line, noise=NOISE, starts=2, checkpoint=kept)
     np.testing.assert_array_equal(found.vector, wrong.vector)
-    assert len(run) == 1  # of two starts and, with shared errors, three
+    assert len(run) == 1  # of two starts and, with model discrepancy, three
     assert {path.name for path in tmp_path.iterdir()} >= {"starts", "starts-discrepancy"}
 
 
