@@ -64,20 +64,18 @@ def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
     require_free_place(arguments, ".png", "pictures")
     use_jax()
+    from fits.optimise.result import Fit
     from fits.reports.plots.data import as_png
     from fits.reports.render import render as run_render
-    from fits.reports.results import load_fit
     from layerjax import Transport
 
     name = arguments.material
-    if Path(name).is_dir():
-        fit = load_fit(name)
-        fit.require_one("render")
-        used = fit.problem.transport
-        stack, transport = fit.stack, used if isinstance(used, Transport) else None
-    else:
-        stack, transport = _material(name)
-    figure = run_render(stack, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
+    material, transport = _material(name)
+    if isinstance(material, Fit):
+        material.require_one("render")
+        used = material.problem.transport
+        material, transport = material.stack, used if isinstance(used, Transport) else None
+    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
     write_bytes(arguments.out, as_png(figure), force=arguments.force)
     print(f"{arguments.out}: {name}")
     return DONE
@@ -88,14 +86,9 @@ def export(arguments: Namespace) -> int:
     refuse_existing(arguments.out, arguments.force)
     use_jax()
     from fits.exports.export import export as run_export
-    from fits.reports.results import load_fit
 
     name = arguments.material
-    if Path(name).is_dir():
-        material: Fit | Stack | Mixture = load_fit(name)
-        transport = None
-    else:
-        material, transport = _material(name)
+    material, transport = _material(name)
     with show_progress() as progress:
         written = run_export(
             material,
@@ -113,11 +106,14 @@ def export(arguments: Namespace) -> int:
     return DONE
 
 
-def _material(name: str) -> "tuple[Stack | Mixture, Any]":
-    """A material of the gallery, or of a file with free parameters at their start; its transport, None if not given."""
+def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
+    """A saved fit, or a stack of the gallery or of a file, at its start; and its transport, None if not given."""
     from fits.problem.stack_file import read_problem
+    from fits.reports.results import load_fit
     from layerjax import gallery
 
+    if Path(name).is_dir():
+        return load_fit(name), None
     if name in gallery.names():
         return gallery.stack(name), None
     if Path(name).suffix == ".toml":

@@ -164,7 +164,7 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
             sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, used.values))
             noise = float(np.median(sigma[positive] / used.values[positive]))
     fitted = fit.problem.build(fit.vector).correlation
-    if fitted is not None:
+    if likelihood and fitted is not None:
         remaining = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
         whole = float(np.sum(offsets**2))
         discrepancy = fitted, 1.0 - float(np.sum(remaining**2)) / whole if whole > 0.0 else 0.0
