@@ -421,10 +421,8 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 def table_csv(rows: Sequence[Row]) -> str:
     """A line each; value and error of every parameter that any of them has, empty where it has none."""
-    first, last = (
-        ("file", "stack", "structure", "result", "standing"),
-        ("measurements", "seconds", "at_bound", "status"),
-    )
+    first = ("file", "stack", "structure", "result", "standing")
+    last = ("measurements", "seconds", "at_bound", "status")
     names = dict.fromkeys(name for row in rows for name in row if name not in last)
     out = io.StringIO()
     writer = csv.DictWriter(out, list(dict.fromkeys((*first, *names, *last))), restval="", lineterminator="\n")
