@@ -93,7 +93,7 @@ def solve(problem: Problem, units: Floats, texels: Texels, size: int, fresh: boo
     Not `fresh`: the starts lie near minima.
     """
     if texels.wi is not None:  # what is known of a start is each texel's own
-        return _solve_all(problem, units, None, np.arange(texels.number), texels, size, fresh)
+        return solve_near(problem, units, None, np.arange(texels.number), texels, size, fresh)
     distinct, which = np.unique(units, axis=0, return_inverse=True)
     parts, order = [], []
     for first in range(0, len(distinct), TOGETHER):
@@ -109,14 +109,24 @@ def solve(problem: Problem, units: Floats, texels: Texels, size: int, fresh: boo
 def solve_near(
     problem: Problem,
     units: Floats,
-    known: Linearisation,
+    known: Linearisation | None,
     which: Integers,
     texels: Texels,
     size: int,
     fresh: bool = False,
 ) -> Fits:
-    """Fits of M texels from starts (K, P) whose linearisation is known, (K, ...); which: start of each texel, (M,)."""
-    return _solve_all(problem, padded(units), Linearisation(*map(padded, known)), which, texels, size, fresh)
+    """Fits of M texels from starts (K, P) whose linearisation is known, (K, ...); which: start of each texel, (M,).
+
+    Where nothing is known, a start each.
+    """
+    every = np.arange(texels.number)
+    if known is not None:
+        units, known = padded(units), Linearisation(*map(padded, known))
+    parts = [
+        _call(problem, units, known, which, texels, every[first : first + size], size, fresh)[0]
+        for first in range(0, texels.number, size)
+    ]
+    return Fits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def linearise_all(problem: Problem, units: Floats, texels: Texels, size: int) -> Linearisation:
@@ -133,9 +143,8 @@ def linearise_all(problem: Problem, units: Floats, texels: Texels, size: int) ->
 
 def to_units(problem: Problem, vectors: Floats) -> Floats:
     """Vectors (K, P) in the unit box."""
-    return np.clip(np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(padded(vectors))), float), 0.0, 1.0)[
-        : len(vectors)
-    ]
+    units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(padded(vectors))), float)
+    return np.clip(units[: len(vectors)], 0.0, 1.0)
 
 
 def padded(array: Floats) -> Floats:
@@ -159,23 +168,6 @@ def by_size(call: Callable[[Integers, int], Any], count: int, size: int) -> Any:
 def _filled(count: int, size: int) -> Integers:
     """Places of so many rows, the last of them again and again: as many as a program for `size` of them takes."""
     return np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)
-
-
-def _solve_all(
-    problem: Problem,
-    units: Floats,
-    known: Linearisation | None,
-    which: Integers,
-    texels: Texels,
-    size: int,
-    fresh: bool,
-) -> Fits:
-    every = np.arange(texels.number)
-    parts = [
-        _call(problem, units, known, which, texels, every[first : first + size], size, fresh)[0]
-        for first in range(0, texels.number, size)
-    ]
-    return Fits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _call(

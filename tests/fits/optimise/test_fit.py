@@ -168,7 +168,7 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     assert result.unidentified == (Direction(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
     assert result.insensitive == ("['c']",)
     assert result.at_bound == ()
-    assert "the data leave 1 direction(s) unidentified" in result.status
+    assert "1 direction(s) in the space of parameters are not identified" in result.status
     assert verdicts.identifiability(result)["['c']"] == "insensitive: no effect on the data"
 
 

@@ -120,7 +120,7 @@ def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
     assert not sound
     assert "standard errors are those of the best one only" in lines[1]
     assert parameter_table(fitted).note == "Errors are those of the best minimum only."
-    assert "the errors are of this minimum alone" in fitted.status
+    assert "errors are conditional on this local minimum" in fitted.status
 
 
 def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
