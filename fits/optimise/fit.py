@@ -278,10 +278,11 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
     counts: list[int] = []
     outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
-        place = next((place for place, leader in enumerate(leaders) if are_one(index, leader)), len(leaders))
         if not np.isfinite(cost[index]) and index != best:
             outcomes["failed"] += 1
-        elif place < len(leaders) or index == best or ends[index].converged:
+            continue
+        place = next((place for place, leader in enumerate(leaders) if are_one(index, leader)), len(leaders))
+        if place < len(leaders) or index == best or ends[index].converged:
             if place == len(leaders):
                 leaders.append(index)
                 counts.append(0)
