@@ -18,7 +18,6 @@ import numpy as np
 import fits
 import layerjax as lj
 from fits.reports import verdicts
-from fits.reports.diagnostics import residual_structure, standardised
 
 TRUTH = {
     "layers[0].ior": 1.5,
@@ -58,7 +57,7 @@ def main():
     transport = lj.Statistical()
     geometry = fits.slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     data = fits.simulate(coat(*TRUTH.values()), geometry, transport=transport, noise=0.03, seed=SEED)
-    print(f"{len(data)} readings with 3 % noise", flush=True)
+    print(f"{len(data)} measurements with 3 % noise", flush=True)
 
     for number, (known, metal) in enumerate(METALS.items()):
         began = time.perf_counter()
@@ -68,7 +67,7 @@ def main():
             truth, error = TRUTH[name], fit.standard_errors[name]
             off = f"{(value - truth) / error:+5.1f} errors off" if np.isfinite(error) else "at a bound"
             print(f"  {name:20} truth {truth:4.2f}  fit {value:6.4f} ± {error:6.4f}  {off}")
-        for sentence in verdicts.outcome(fit, residual_structure(data, standardised(fit))):
+        for sentence in verdicts.summary(fit):
             print(f"  {sentence}")
         fits.report(fit, path=out / f"{number}.html")
 

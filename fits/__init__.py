@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fits.data.geometry import Geometry as Geometry
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
+    from fits.data.reading import ReadOptions as ReadOptions
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
@@ -63,6 +64,7 @@ if TYPE_CHECKING:
     from fits.reports.results import load_fit as load_fit
     from fits.reports.results import load_posterior as load_posterior
     from fits.reports.results import save_fit as save_fit
+    from fits.reports.verdicts import ReportOptions as ReportOptions
     from fits.sampling.posterior import Mode as Mode
     from fits.sampling.posterior import Posterior as Posterior
     from fits.sampling.sample import sample as sample
@@ -93,6 +95,7 @@ _HOMES = {
     "SpatialPrior": "maps.options",
     "ModelScore": "prediction.model_scores",
     "read": "data.formats",
+    "ReadOptions": "data.reading",
     "write_csv": "data.formats.csv",
     "read_slab": "data.formats.rxt",
     "Slab": "data.formats.rxt",
@@ -134,6 +137,7 @@ _HOMES = {
     "Problem": "problem.problem",
     "render": "reports.render",
     "report": "any_report",
+    "ReportOptions": "reports.verdicts",
     "load_fit": "reports.results",
     "load_posterior": "reports.results",
     "save_fit": "reports.results",

@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, by one process at a time, and so that damage to them is seen."""
+"""Atomic writes, checksums and lock files: a file is written whole or not at all, by one process at a time."""
 
 import errno
 import json
@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 CHECKSUM = "checksum"
-_UMASK = os.umask(0)  # it can be read by setting it alone: once, before other threads make files
+_UMASK = os.umask(0)  # it can only be read by setting it: once, before other threads make files
 os.umask(_UMASK)
 
 
 def require_file(path: Path) -> None:
-    """FileNotFoundError if it is not there, ValueError if it is no file: pipes cannot be read more than once."""
+    """FileNotFoundError if it does not exist, ValueError if it is no file: pipes cannot be read more than once."""
     require_there(path)
     if path.is_dir():
         raise ValueError(f"{path}: is a directory, must be a file")
@@ -29,7 +29,7 @@ def require_file(path: Path) -> None:
 
 
 def require_there(path: str | Path, what: str = "no such file") -> None:
-    """FileNotFoundError, which names it, if nothing is there."""
+    """FileNotFoundError, which names the path, if it does not exist."""
     if not os.path.exists(path):
         raise FileNotFoundError(errno.ENOENT, what, str(path))
 
@@ -40,9 +40,9 @@ def write_text(path: str | Path, text: str, force: bool = False) -> None:
 
 
 def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: bool = False) -> None:
-    """Write a file by way of a temporary one beside it; an existing file is a ValueError unless `force`.
+    """Write a file atomically, by a temporary one beside it; an existing file is a ValueError unless `force`.
 
-    durable: its content has reached the disk before it takes the place of what was there. An OSError names the file.
+    durable: the content has reached the disk before it replaces an existing file. An OSError names the file.
     """
     path = Path(path)
     if path.exists() and not force:
@@ -65,7 +65,7 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
 
 
 def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
-    """Write several files of a folder, in the place of what is there: where one cannot be written, none is."""
+    """Write several files of a folder and replace existing ones: if one cannot be written, none is."""
     with named(folder), tempfile.TemporaryDirectory(prefix=".", suffix=".new", dir=folder) as new:
         for name, content in contents.items():
             write_bytes(Path(new) / name, content)
@@ -80,7 +80,7 @@ def write_json(path: Path, content: Mapping[str, Any], force: bool = False) -> N
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What `write_json` wrote, or anyone else. ValueError for what is no JSON object, or not as it was written."""
+    """Read a JSON object, of `write_json` or another program. ValueError for other content, or a wrong checksum."""
     try:
         content = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
@@ -104,7 +104,7 @@ def _checksum(content: Mapping[str, Any]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON holds it: mappings, lists and words; numbers that are not finite are "nan", "inf", "-inf"."""
+    """The value as JSON holds it: mappings, lists and strings; numbers that are not finite are "nan", "inf", "-inf"."""
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -124,18 +124,18 @@ def named(path: Path) -> Iterator[None]:
 
 
 def write_whole(file: RawIOBase, content: bytes, path: Path) -> None:
-    """Write to an unbuffered file; an OSError names it, also where there was room for a part of the content only."""
+    """Write to an unbuffered file; an OSError names it, also if only a part of the content could be written."""
     rest = memoryview(content)
     with named(path):
-        while rest:  # what is left over from a part that was taken fails with its reason
+        while rest:  # after a partial write the rest fails with its reason
             rest = rest[file.write(rest) :]
 
 
 @contextmanager
 def locked(path: Path, what: str) -> Iterator[None]:
-    """Hold a lock file for the block, for what it guards; it ends with the process, however that ends.
+    """Hold a lock file for the block; it is released when the process ends, in whatever way.
 
-    Raises ValueError, with the number of the process that holds it, if another one does.
+    Raises ValueError, with the number of the process that holds the lock, if another one does.
     """
     import filelock
 
@@ -145,12 +145,12 @@ def locked(path: Path, what: str) -> Iterator[None]:
     except filelock.Timeout:
         raise ValueError(f"{what} is in use by another process ({_holder(path)}): one at a time may write it") from None
     try:
-        with suppress(OSError):  # on a full disk the lock holds without a name in it
+        with suppress(OSError):  # on a full disk the lock holds without a number in it
             path.write_text(f"{os.getpid()}\n")
         yield
     finally:
-        with suppress(OSError):  # Windows keeps what is open
-            path.unlink()  # while it is held: whoever opened it before sees that it is gone
+        with suppress(OSError):  # Windows does not delete open files
+            path.unlink()  # while it is held: a process that opened it before sees that it is deleted
         lock.release()
 
 
@@ -162,5 +162,5 @@ def _holder(path: Path) -> str:
 
 
 def permissions(mode: int) -> int:
-    """The mode less what the user's umask takes away."""
+    """The mode without the bits of the user's umask."""
     return mode & ~_UMASK

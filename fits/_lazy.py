@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used, so that importing the package costs nothing."""
+"""Lazy imports: names of a package are imported on first use, so that importing the package costs nothing."""
 
 import importlib
 import sys
@@ -7,14 +7,14 @@ from typing import Any
 
 
 def names_from(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
-    """The `__getattr__` of a package; homes: the module of the package that each name stands in."""
+    """The `__getattr__` of a package; homes: the module of the package that defines each name."""
 
-    def found(name: str) -> Any:
+    def attribute(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
 
-    return found
+    return attribute
 
 
 def directory_of(package: str, homes: Mapping[str, str]) -> Callable[[], list[str]]:
@@ -22,10 +22,10 @@ def directory_of(package: str, homes: Mapping[str, str]) -> Callable[[], list[st
     return lambda: sorted({*vars(sys.modules[package]), *homes})
 
 
-def shown_by(function: str, of: Any) -> Any:
-    """`function` of what is above, such as ``"fits.reports.notebook:fit_fragment"``, of this result.
+def shown_by(function: str, result: Any) -> Any:
+    """Call a function of a higher room, such as ``"fits.reports.html:fit_fragment"``, with a result.
 
-    Results know only by name what shows them: packages import downward, and a result that is not shown costs nothing.
+    A result refers to it by name, as rooms import downward, and a result that is not displayed imports nothing.
     """
     module, _, name = function.partition(":")
-    return getattr(importlib.import_module(module), name)(of)
+    return getattr(importlib.import_module(module), name)(result)

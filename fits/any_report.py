@@ -8,6 +8,7 @@ from fits.maps.fitted_map import FittedMap
 from fits.maps.report import page
 from fits.optimise.result import Fit
 from fits.reports import html
+from fits.reports.verdicts import DEFAULT, ReportOptions
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
 
@@ -19,18 +20,20 @@ def report(
     *,
     others: Mapping[str, Fit | Posterior] | None = None,
     name: str = "this fit",
-    unseen: Measurements | None = None,
+    held_out: Measurements | None = None,
+    options: ReportOptions = DEFAULT,
     force: bool = True,
 ) -> None:
     """Writes the report of a fit, or of a fitted map, to `path`, whole or not at all.
 
     Args:
-        fit: what the report is about; of a map, finished or not, nothing else is said but `path` and `force`.
-        posterior: what `fits.sample` made of the fit, if it was sampled.
+        fit: a fit, or a map, finished or not, for which only `path` and `force` apply.
+        posterior: of the fit, if it was sampled.
         path: HTML file to write, pictures inside.
         others: further fits of the same data, or their posteriors, by name, to be compared with this one.
         name: what this fit is called beside `others`.
-        unseen: measurements that were not fitted, to be shown with the prediction of them.
+        held_out: measurements that were not fitted, to be shown with their prediction.
+        options: thresholds that decide what the report of a fit says.
         force: replace a file that is there.
 
     Raises:
@@ -39,8 +42,8 @@ def report(
     """
     require_kind("fit", fit, Fit, FittedMap)
     if isinstance(fit, Fit):
-        html.report(fit, posterior, path, others=others, name=name, unseen=unseen, force=force)
+        html.report(fit, posterior, path, others=others, name=name, held_out=held_out, options=options, force=force)
         return
-    if posterior is not None or others or unseen is not None:
-        raise ValueError("posterior, others, unseen: of a map there are none; it is reported by itself")
+    if posterior is not None or others or held_out is not None:
+        raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")
     page.report(fit, path, force)

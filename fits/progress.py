@@ -1,4 +1,4 @@
-"""What a long step shows while it runs: a bar on a terminal, an occasional plain line elsewhere."""
+"""Progress of long steps: a bar on a terminal, an occasional plain line elsewhere."""
 
 import sys
 import time
@@ -10,17 +10,17 @@ SECONDS_BETWEEN_LINES = 10.0
 
 
 class Progress(Protocol):
-    """What long steps call as they go: the stage, steps done, steps in all (None: not known), a note."""
+    """Callback of long steps: the stage, steps done, total steps (None: unknown), a note."""
 
     def __call__(self, stage: str, done: int, total: int | None = None, info: str = "") -> None: ...
 
 
 def silent(stage: str, done: int, total: int | None = None, info: str = "") -> None:
-    """Shows nothing."""
+    """Show nothing."""
 
 
 def named(name: str, progress: Progress) -> Progress:
-    """Tells the same, with a name before each stage."""
+    """The same progress, with a name before each stage."""
 
     def report(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         progress(f"{name}: {stage}", done, total, info)
@@ -29,7 +29,7 @@ def named(name: str, progress: Progress) -> Progress:
 
 
 class _Pace:
-    """Adds to a note how long its stage takes from here on: at its pace so far, less the first step, which compiles."""
+    """Adds the time left of a stage to its note: at its pace so far, without the first step, which compiles."""
 
     def __init__(self) -> None:
         self.marks: dict[str, list[tuple[float, int]]] = {}
@@ -37,15 +37,15 @@ class _Pace:
 
     def noted(self, stage: str, done: int, total: int | None, info: str) -> str:
         now = time.monotonic()
-        if done < self.last.get(stage, done + 1):  # it begins, or begins again
+        if done < self.last.get(stage, done + 1):  # it starts, or starts again
             self.marks[stage] = [(now, done)]
         marks, self.last[stage] = self.marks[stage], done
         if total is None or not marks[0][1] < done < total:
             return info
-        began, first = marks[-1] if done > marks[-1][1] else marks[0]
+        start, first = marks[-1] if done > marks[-1][1] else marks[0]
         if len(marks) == 1:
             marks.append((now, done))
-        left = f"about {in_words((now - began) / (done - first) * (total - done))} left"
+        left = f"about {in_words((now - start) / (done - first) * (total - done))} left"
         return f"{left}; {info}" if info else left
 
 
@@ -68,7 +68,7 @@ class _Lines:
 
 @contextmanager
 def show_progress(stream: TextIO | None = None, name: str = "layerjax") -> Iterator[Progress]:
-    """Yields the callback for `progress=`; the bar is drawn on `stream` (stderr) and goes away when the block ends."""
+    """Yield the callback for `progress=`; the bar is drawn on `stream` (stderr) and removed when the block ends."""
     stream = sys.stderr if stream is None else stream
     if not stream.isatty():
         yield _Lines(stream, name)
@@ -99,7 +99,7 @@ def show_progress(stream: TextIO | None = None, name: str = "layerjax") -> Itera
 
 
 def in_words(seconds: float) -> str:
-    """A time in whole hours, minutes or seconds, at least one."""
+    """A time in whole hours, minutes or seconds, at least 1 s."""
     for length, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 2.0 * length:
             return f"{seconds / length:.0f} {unit}"

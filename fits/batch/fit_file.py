@@ -13,10 +13,8 @@ from fits.optimise.result import Fit
 from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress, silent
 from fits.reports import results
-from fits.reports.directories import replacing, reserved
-from fits.reports.html import Foretold, foretell
-from fits.reports.report_files import write_report
-from fits.reports.stored import HELD_OUT
+from fits.reports.html import HeldOut, predict_held_out, write_report
+from fits.reports.results import HELD_OUT, replacing, reserved
 
 DRAWING = "pictures and report"
 
@@ -25,7 +23,7 @@ class Fitted(NamedTuple):
     """A fit, and its prediction of held-out data; None without any."""
 
     fit: Fit
-    foretold: Foretold | None
+    held_out: HeldOut | None
 
 
 def fit_into(
@@ -110,8 +108,8 @@ def _written(
         if held_out is not None:
             write_csv(held_out, folder / HELD_OUT)
         if report:
-            foretold = write_report(folder, directory.resolve().name, found)
+            predicted = write_report(folder, directory.resolve().name, found)
         else:
-            foretold = None if held_out is None else foretell(found, None, held_out)
+            predicted = None if held_out is None else predict_held_out(found, None, held_out)
     progress(DRAWING, 1, 1)
-    return Fitted(found, foretold)
+    return Fitted(found, predicted)

@@ -24,7 +24,7 @@ import numpy as np
 from fits._files import named, read_json, require_there, write_text
 from fits.batch.fit_file import fit_into, require_posterior, write_into
 from fits.data.formats import sniff
-from fits.data.reading import Reading
+from fits.data.reading import ReadOptions
 from fits.data.totals import Totals
 from fits.engines import Failure, run
 from fits.engines.failures import one_line
@@ -35,9 +35,8 @@ from fits.problem.compilation import make_room
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
 from fits.reports import tables
-from fits.reports.directories import FIT
 from fits.reports.pages import document, section, sentences
-from fits.reports.results import REPORT
+from fits.reports.results import FIT, REPORT
 from fits.reports.verdicts import listed
 from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search.report import write_report as write_search
@@ -97,7 +96,7 @@ def fit_files(
     processes: int = 1,
     client: Any = None,
     search: bool | Mapping[str, Any] = False,
-    reading: Reading | None = None,
+    reading: ReadOptions | None = None,
     objective: Objective | None = None,
     starts: int = 32,
     seed: int = 0,
@@ -118,7 +117,7 @@ def fit_files(
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a mapping has the arguments of `fits.search`.
-        reading: how all files are read, see `fits.data.reading.Reading`.
+        reading: how all files are read, see `fits.ReadOptions`.
         objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
@@ -129,7 +128,7 @@ def fit_files(
         ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
-    reading, out, progress = reading or Reading(), Path(out), progress or silent
+    reading, out, progress = reading or ReadOptions(), Path(out), progress or silent
     found, skipped = measurement_files(_several(files), reading.format)
     named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in named_stacks.items()}
@@ -239,7 +238,7 @@ class Job:
     out: Path
     stacks: Mapping[str, ProblemFile]
     searching: Mapping[str, Any] | None
-    reading: Reading
+    reading: ReadOptions
     fitting: Mapping[str, Any]
     reports: bool
     force: bool
@@ -299,7 +298,7 @@ def _planned(job: Job, files: list[Path], out: Path, done: Store | None) -> tupl
         left = [task for task in every if known[task.key] is None]
         try:
             if left and content:
-                job.reading.parts(path)  # before any is fitted
+                job.reading.split(path)  # before any is fitted
                 tasks += left
         except (ValueError, OSError) as error:
             why = one_line(error)
@@ -361,7 +360,7 @@ def _fitted(job: Job, task: Task) -> Row:
     began, directory, structure = time.monotonic(), job.out / task.key, ""
     if _lines(task.path) != task.content:
         raise ValueError(f"{task.path}: was changed while others were fitted")
-    data, held_out = job.reading.parts(task.path)
+    data, held_out = job.reading.split(task.path)
     with named(directory.parent):
         directory.parent.mkdir(exist_ok=True)
     if task.stack == SEARCH:
@@ -373,10 +372,10 @@ def _fitted(job: Job, task: Task) -> Row:
         found = run_search(data, **(job.searching or {}), directory=stacks)
         write_search(found, stacks)
         structure = found.best.name
-        fit, foretold = write_into(directory, found.best.fit, force=True, report=job.reports)
+        fit, predicted = write_into(directory, found.best.fit, force=True, report=job.reports)
     else:
         given = job.stacks[task.stack]
-        fit, foretold = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
+        fit, predicted = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
     without = fit.without_discrepancy
     row = task.failed(fit.status) | {
         "result": "converged" if fit.converged else "not converged",
@@ -386,7 +385,7 @@ def _fitted(job: Job, task: Task) -> Row:
         "reduced_chi_square": fit.reduced_chi_square,
         "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
     }
-    if foretold is not None and (scores := foretold.prediction.scores) is not None:
+    if predicted is not None and (scores := predicted.prediction.scores) is not None:
         row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
@@ -422,10 +421,8 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
 
 def table_csv(rows: Sequence[Row]) -> str:
     """A line each; value and error of every parameter that any of them has, empty where it has none."""
-    first, last = (
-        ("file", "stack", "structure", "result", "standing"),
-        ("measurements", "seconds", "at_bound", "status"),
-    )
+    first = ("file", "stack", "structure", "result", "standing")
+    last = ("measurements", "seconds", "at_bound", "status")
     names = dict.fromkeys(name for row in rows for name in row if name not in last)
     out = io.StringIO()
     writer = csv.DictWriter(out, list(dict.fromkeys((*first, *names, *last))), restval="", lineterminator="\n")

@@ -1,4 +1,4 @@
-"""What each command of `layerjax` does with its arguments; `cli` says how it is asked for and what errors look like.
+"""What each command of `layerjax` does with its arguments; the parser defines them and reports errors.
 
 Inputs are checked, and outputs refused, before any work begins. Numbers go to stdout, progress to stderr.
 """
@@ -21,111 +21,76 @@ from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
 from fits.cli.materials import write_measurements
-from fits.cli.options import MAX_STEPS, SAMPLING, refuse_alone
+from fits.cli.options import read_options, refuse_alone
 from fits.cli.places import refuse_existing, require_free_place
-from fits.cli.predictions import predict as predict
-from fits.cli.predictions import print_scores
-from fits.cli.reading import measurements, reading
 from fits.cli.setting import use_jax
+from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
+from fits.data.reading import select_channels
+from fits.data.selection import select
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.problem.stack_file import ProblemFile
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
-    from fits.sampling.sample import Sampler
 
 DONE, DOUBTFUL = 0, 1
-SAMPLER: "Sampler" = "emcee"
 
 
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
-    if not arguments.sample:
-        refuse_alone(arguments, SAMPLING, "sample")
     use_jax()
-    from fits.batch.fit_file import fit_into, require_posterior
+    from fits.batch.fit_file import fit_into
     from fits.problem.stack_file import read_problem
     from fits.reports import results, tables, verdicts
-    from fits.reports.diagnostics import residual_structure, standardised
-    from fits.reports.directories import check_directory
 
     directory = Path(arguments.out)
-    check_directory(directory, arguments.force)
-    data, unseen = reading(arguments).parts(arguments.data)
+    results.check_directory(directory, arguments.force)
+    data, held_out = read_options(arguments).split(arguments.data)
     given = read_problem(arguments.stack)
-    require_posterior(arguments.objective or given.objective, "--sample" if arguments.sample else None)
-    if arguments.sample:
-        _require_sampling(given, data, arguments)
-    kept = f"{directory} was not written; the same command again goes on with the starts that are done"
-    with show_progress() as progress, hint(kept):
-        result, foretold = fit_into(
+    resume = f"{directory} was not written; the same command resumes with the starts that are done"
+    with show_progress() as progress, hint(resume):
+        result, predicted = fit_into(
             directory,
             given,
             data,
-            unseen,
-            objective=arguments.objective,
+            held_out,
             starts=arguments.starts,
             seed=arguments.seed,
-            solver=arguments.solver,
             force=arguments.force,
             progress=progress,
         )
     tables.print_table(tables.parameter_table(result), sys.stdout)
-    structure = residual_structure(result.problem.data, standardised(result))
-    for sentence in (*verdicts.outcome(result, structure), f"Report: {directory / results.REPORT}"):
+    for sentence in (*verdicts.summary(result), f"Report: {directory / results.REPORT}"):
         print(sentence)
-    if foretold is not None:
-        print_scores(foretold.prediction, foretold.readings, "Readings that were held out")
-    if arguments.sample:
-        return _sample(directory, arguments)
+    if predicted is not None:
+        tables.print_table(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"), sys.stdout)
     return DONE if result.converged else DOUBTFUL
 
 
-def _require_sampling(given: "ProblemFile", data: Measurements, arguments: Namespace) -> None:
-    """ValueError, before anything is fitted, for settings of a sampler that is to follow."""
-    from fits.problem.problem import Problem
-    from fits.sampling.sample import require_settings
-
-    problem = Problem(given.stack, data, given.transport, given.noise, given.scale, instrument=given.instrument)
-    require_settings(
-        len(problem.names),
-        sampler=SAMPLER if arguments.sampler is None else arguments.sampler,
-        walkers=arguments.walkers,
-        surrogate=arguments.surrogate,
-        ess=arguments.ess,
-        max_steps=arguments.max_steps or MAX_STEPS,
-    )
-
-
 def sample(arguments: Namespace) -> int:
-    """Sample the posterior of a saved fit, going on with the chain that is there."""
+    """Sample the posterior of a saved fit, resuming its chain."""
     use_jax()
-    return _sample(Path(arguments.directory), arguments)
-
-
-def _sample(directory: Path, arguments: Namespace) -> int:
     from fits.reports import results, tables, verdicts
-    from fits.reports.report_files import write_report
+    from fits.reports.html import write_report
     from fits.sampling.sample import sample as run_sampler
 
+    directory = Path(arguments.directory)
     result = results.load_fit(directory)
     if not result.is_posterior:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
     settings = _chain_settings(directory / results.CHAIN, arguments)
-    again = f"the chain is kept, `layerjax sample {directory}` goes on with it"
-    with show_progress() as progress, hint(again):
+    with show_progress() as progress, hint(f"the chain is kept, `layerjax sample {directory}` resumes it"):
         posterior = run_sampler(
             result,
             **settings,
-            surrogate=arguments.surrogate,
             ess=arguments.ess,
-            max_steps=arguments.max_steps or MAX_STEPS,
+            max_steps=arguments.max_steps,
             path=directory / results.CHAIN,
             resume=not arguments.force,
-            allow_unconverged=bool(arguments.allow_unconverged),
+            allow_unconverged=arguments.allow_unconverged,
             progress=progress,
         )
         progress("pictures and report", 0, 1)
@@ -142,34 +107,76 @@ def _sample(directory: Path, arguments: Namespace) -> int:
     reached = float(np.min(posterior.effective_samples))
     enough = posterior.converged and (arguments.ess is None or reached >= arguments.ess)
     if not enough:
-        asked = "" if arguments.ess is None else f" --ess {arguments.ess}"
-        print(f"To go on: layerjax sample {directory}{asked} --max-steps {2 * len(posterior.chain)}")
+        ess = "" if arguments.ess is None else f" --ess {arguments.ess}"
+        print(f"To resume: layerjax sample {directory}{ess} --max-steps {2 * len(posterior.chain)}")
     return DONE if enough else DOUBTFUL
 
 
 def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
-    """Sampler, walkers and seed: those of the chain that is there, which arguments must not contradict, or defaults."""
+    """Sampler and walkers: those of the chain that is kept, which arguments must not contradict, or defaults."""
     from fits.sampling.chain import read_chain
 
     stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
     settings: dict[str, Any] = {}
-    for name, kind, default in (("sampler", str, SAMPLER), ("walkers", int, None), ("seed", int, 0)):
-        wanted, there = getattr(arguments, name), stored.get(name)
-        if wanted is not None and there is not None and wanted != there:
-            raise ValueError(f"--{name} is {wanted}, the chain in {path} has {there} (--force starts it again)")
-        settings[name] = wanted if wanted is not None else default if there is None else kind(there)
+    for name, kind, default in (("sampler", str, "emcee"), ("walkers", int, None)):
+        given, before = getattr(arguments, name), stored.get(name)
+        if given is not None and before is not None and given != before:
+            raise ValueError(f"--{name} is {given}, the chain in {path} has {before} (--force starts it again)")
+        settings[name] = given if given is not None else default if before is None else kind(before)
     return settings
 
 
+def predict(arguments: Namespace) -> int:
+    """Write the prediction at other directions, or print how well measurements are predicted."""
+    if (arguments.incidence is None) == (arguments.score is None):
+        raise ValueError("predict needs one of --incidence and --score")
+    if arguments.score is None and arguments.out is None:
+        raise ValueError("predict --incidence needs --out FILE")
+    if arguments.score is None:
+        refuse_alone(arguments, ("select", "read"), "score")
+    else:
+        refuse_alone(arguments, ("azimuth",), "incidence")
+    if arguments.out is not None:
+        require_free_place(arguments, ".csv", "predictions")
+    use_jax()
+    from fits.prediction.predict import predict as run_prediction
+    from fits.reports import tables
+
+    source = _result(Path(arguments.directory))
+    if arguments.score is None:
+        at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,))
+    else:
+        at, selections = select_channels(read_options(arguments).read(arguments.score), arguments.select)
+        for words in selections:
+            at = at.where(select(at, words))
+        if not at.mask.any():
+            raise ValueError(f"{arguments.score}: --select leaves nothing to predict")
+    found = run_prediction(source, at)
+    if isinstance(at, Measurements):
+        tables.print_table(tables.scores_table(found, at, f"Prediction of {arguments.score}"), sys.stdout)
+    if arguments.out is not None:
+        _write_prediction(found, arguments)
+    return DONE
+
+
+def _write_prediction(found: "Prediction", arguments: Namespace) -> None:
+    from fits.reports import tables
+
+    write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
+    print(
+        f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack without "
+        "model discrepancy (latent_*)"
+    )
+    if not found.reliable:
+        print(tables.UNRELIABLE)
+
+
 def report(arguments: Namespace) -> int:
-    """Write the report of a saved fit again, if asked for beside others; or that of a fitted map."""
+    """Write the report of a saved fit again, beside that of others if given; or that of a fitted map."""
     if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
-    from fits.reports import results
-    from fits.reports.html import report as write_page
-    from fits.reports.report_files import write_report
-    from fits.reports.stored import held_out_of
+    from fits.reports import html, results
 
     refuse_existing(arguments.out, arguments.force)
     directory = Path(arguments.directory)
@@ -181,50 +188,70 @@ def report(arguments: Namespace) -> int:
     with show_progress() as progress:
         progress("pictures and report", 0, 1)
         if arguments.out is None:
-            write_report(directory, name, result, posterior, others)
+            html.write_report(directory, name, result, posterior, others)
         else:
-            unseen = held_out_of(directory)
-            write_page(result, posterior, out, others=others, name=name, unseen=unseen, force=arguments.force)
+            held_out = results.load_held_out(directory)
+            html.report(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
         progress("pictures and report", 1, 1)
     print(f"Report: {out}")
     return DONE
 
 
 def compare(arguments: Namespace) -> int:
-    """Print which of several saved fits explains the data."""
+    """Print which of several saved fits predicts the data best."""
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
     refuse_existing(arguments.out, arguments.force)
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
+    from fits.reports.html import comparison_page
 
     candidates = _candidates([Path(directory) for directory in arguments.directories])
     with show_progress() as progress:
-        compared = run_compare(candidates, refit=arguments.refit, progress=progress)
+        compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
     tables.print_table(tables.comparison_table(compared), sys.stdout)
     for sentence in compared.verdict:
         print(sentence)
     if arguments.out:
-        from fits.reports.html import comparison_page
-
         write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
     return DONE
 
 
+def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":
+    """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
+
+    own: the result that they are compared with, whose name is taken.
+    """
+    places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
+    names = [place.name for place in places]
+    candidates: dict[str, Fit | Posterior] = {}
+    for directory, place in zip(directories, places, strict=False):
+        if places.count(place) > 1:
+            raise ValueError(f"{directory} is given twice")
+        candidates[place.name if names.count(place.name) == 1 else str(directory)] = _result(directory)
+    return candidates
+
+
+def _result(directory: Path) -> "Fit | Posterior":
+    """The posterior of a directory, if there are estimates of it, or else the fit."""
+    from fits.reports import results, verdicts
+
+    posterior = results.load_posterior(directory)
+    return posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
+
+
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
-    from fits.reports.data_statements import data_statements
-    from fits.reports.data_tables import data_table, source_table
-    from fits.reports.plots.data import as_png, data_picture
-    from fits.reports.plots.totals import totals_picture
+    from fits.reports.data_summary import data_statements, data_table, source_table
+    from fits.reports.plots.data import as_png, data_picture, totals_picture
     from fits.reports.tables import print_table
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
         refuse_existing(out, arguments.force)
-    data = measurements(arguments)
+    data = read_options(arguments).read(arguments.data)
     for table in (source_table(data), data_table(data)):
         print_table(table, sys.stdout)
     for sentence in data_statements(data):
@@ -241,23 +268,4 @@ def info(arguments: Namespace) -> int:
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
     require_free_place(arguments, ".csv", "measurements")
-    return write_measurements(measurements(arguments), arguments)
-
-
-def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":
-    """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
-
-    own: a result that they are compared with, whose place and name are taken.
-    """
-    from fits.reports import results, verdicts
-
-    places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
-    names = [place.name for place in places]
-    candidates: dict[str, Fit | Posterior] = {}
-    for directory, place in zip(directories, places, strict=False):
-        if places.count(place) > 1:
-            raise ValueError(f"{directory} is given twice")
-        posterior = results.load_posterior(directory)
-        found = posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
-        candidates[place.name if names.count(place.name) == 1 else str(directory)] = found
-    return candidates
+    return write_measurements(read_options(arguments).read(arguments.data), arguments)

@@ -42,7 +42,7 @@ def _interrupt() -> None:
 
 @contextmanager
 def hint(what: str) -> Iterator[None]:
-    """Says on an interrupt what has become of the work."""
+    """An interrupt in the block says what became of the work."""
     try:
         yield
     except KeyboardInterrupt:

@@ -8,25 +8,27 @@ from typing import Any
 import numpy as np
 
 from fits.cli.interrupts import hint
-from fits.cli.options import refuse_alone
-from fits.cli.reading import measurements, reading
+from fits.cli.options import read_options, refuse_alone
 from fits.cli.setting import use_jax
+from fits.data.totals import Totals
 from fits.progress import show_progress
 
 DONE, DOUBTFUL = 0, 1
 
 
 def search(arguments: Namespace) -> int:
-    """Look for the stack behind the data among those that a library makes, and write the report."""
-    data = measurements(arguments)
+    """Search for the stack behind the data among those of a library, and write the report."""
+    data = read_options(arguments).masked(arguments.data)
+    if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
+        raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
     use_jax()
     from fits.reports import tables
     from fits.structure_search import report
     from fits.structure_search.search import search as run_search
 
     directory = Path(arguments.out)
-    with show_progress() as progress, hint(_goes_on(directory)):
-        settings = search_settings(arguments, starts=arguments.starts, budget=arguments.budget)
+    with show_progress() as progress, hint(_resume(directory)):
+        settings = search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
         found = run_search(data, **settings, directory=directory, progress=progress)
         report.write_report(found, directory)
     tables.print_table(report.search_table(found), sys.stdout)
@@ -36,38 +38,35 @@ def search(arguments: Namespace) -> int:
 
 
 def search_settings(arguments: Namespace, **given: Any) -> dict[str, Any]:
-    """What the options of a search say, as the arguments of `fits.search`; given: further ones of `SearchOptions`."""
+    """Arguments of `fits.search` from the options of a search; given: further ones of `SearchOptions`."""
     from fits.problem.noise import Noise
     from fits.problem.parameters import Free, LogNormal
     from fits.problem.stack_file import read_instrument
     from fits.structure_search.library import read_library
     from fits.structure_search.search import SearchOptions
 
-    if arguments.layers is not None:
-        given["layers"] = arguments.layers
-    sd, reach = arguments.calibration or 0.0, np.exp(4.0 * (arguments.calibration or 0.0))
+    sd = arguments.scale_sd or 0.0
+    bound, instrument = float(np.exp(4.0 * sd)), getattr(arguments, "instrument", None)
     return {
         "library": None if arguments.library is None else read_library(arguments.library),
         "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
-        "scale": Free(1.0, float(1.0 / reach), float(reach), LogNormal(1.0, sd)) if sd > 0.0 else None,
-        "instrument": None if arguments.instrument is None else read_instrument(arguments.instrument),
-        "seed": arguments.seed,
+        "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
+        "instrument": None if instrument is None else read_instrument(instrument),
         "options": SearchOptions(**given),
     }
 
 
 def fit_many(arguments: Namespace) -> int:
-    """Fit every file by every stack, print what became of them, and write the table and its page."""
+    """Fit every file by every stack, print the outcomes, and write the table and its page."""
     use_jax()
     from fits.batch.fit_files import PAGE, SHOWN, TABLE, fit_files, overview, statements
     from fits.problem.compilation import cores
     from fits.reports.tables import print_table
 
     if not arguments.search:
-        only_searches = ("library", "layers", "instrument", "noise", "calibration")
-        refuse_alone(arguments, only_searches, "search: a stack file says it itself")
+        refuse_alone(arguments, ("library", "noise", "scale_sd"), "search: a stack file states it")
     out = Path(arguments.out)
-    with show_progress() as progress, hint(_goes_on(out)):
+    with show_progress() as progress, hint(_resume(out)):
         found = fit_files(
             arguments.data,
             arguments.stacks,
@@ -75,12 +74,8 @@ def fit_many(arguments: Namespace) -> int:
             processes=cores() if arguments.processes is None else arguments.processes,
             client=arguments.scheduler,
             search=search_settings(arguments) if arguments.search else False,
-            reading=reading(arguments),
-            objective=arguments.objective,
+            reading=read_options(arguments),
             starts=arguments.starts,
-            seed=arguments.seed,
-            solver=arguments.solver,
-            reports=not arguments.no_reports,
             force=arguments.force,
             progress=progress,
         )
@@ -90,5 +85,5 @@ def fit_many(arguments: Namespace) -> int:
     return DONE if found.complete else DOUBTFUL
 
 
-def _goes_on(directory: Path) -> str:
-    return f"{directory} keeps what was fitted; the same command again resumes it"
+def _resume(directory: Path) -> str:
+    return f"{directory} keeps what was fitted; the same command resumes it"

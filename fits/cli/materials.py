@@ -1,4 +1,4 @@
-"""What commands do with a material rather than with data: simulate its readings, draw it, write it for renderers."""
+"""Commands on a material: simulate measurements of it, draw it, write it for renderers."""
 
 import tomllib
 from argparse import Namespace
@@ -20,7 +20,7 @@ DONE = 0
 
 
 def simulate(arguments: Namespace) -> int:
-    """Write what a goniometer would measure of a stack; what its file says of readings is left out, and told."""
+    """Write simulated measurements of a stack; names what of its file is not simulated: noise, scale, instrument."""
     require_free_place(arguments, ".csv", "measurements")
     use_jax()
     from fits.data.geometry import slices
@@ -30,38 +30,33 @@ def simulate(arguments: Namespace) -> int:
     given = read_problem(arguments.stack)
     geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
     data = run_simulation(
-        _at_start(given.stack),
-        geometry,
-        transport=given.transport,
-        noise=arguments.noise,
-        floor=arguments.floor,
-        seed=arguments.seed,
+        _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
     )
-    unseen = [f"[{name}]" for name in ("noise", "scale", "instrument") if name in tomllib.loads(given.text)]
-    if not unseen:
+    ignored = [f"[{name}]" for name in ("noise", "scale", "instrument") if name in tomllib.loads(given.text)]
+    if not ignored:
         return write_measurements(data, arguments)
-    note = f"not simulated: {', '.join(unseen)} of {arguments.stack}"
+    note = f"not simulated: {', '.join(ignored)} of {arguments.stack}"
     write_measurements(data.noted(note), arguments)
     print(f"{note[0].upper()}{note[1:]}")
     return DONE
 
 
 def write_measurements(data: Measurements, arguments: Namespace) -> int:
-    """As csv; says what there is of them."""
+    """Write them as csv, and print their number."""
     from fits.data.formats import totals_csv
     from fits.data.formats.csv import write_csv
 
     if isinstance(data, Totals):
         if data.spheres is not None:
             raise ValueError(
-                f"{data.source.path}: integrating spheres read these shares, of which no column of a CSV tells; "
+                f"{data.source.path}: integrating spheres measured these shares, which a CSV cannot describe; "
                 "`layerjax fit` takes the file as it is"
             )
         totals_csv.write(data, arguments.out, force=arguments.force)
-        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the light")
+        print(f"{arguments.out}: {len(data)} totals, {len(data.channels)} channels, shares of the incident flux")
         return DONE
     write_csv(data, arguments.out, force=arguments.force)
-    print(f"{arguments.out}: {len(data)} readings, {len(data.channels)} channels, BRDF in 1/sr")
+    print(f"{arguments.out}: {len(data)} measurements, {len(data.channels)} channels, BRDF in 1/sr")
     return DONE
 
 
@@ -69,20 +64,18 @@ def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
     require_free_place(arguments, ".png", "pictures")
     use_jax()
+    from fits.optimise.result import Fit
     from fits.reports.plots.data import as_png
     from fits.reports.render import render as run_render
-    from fits.reports.results import load_fit
     from layerjax import Transport
 
     name = arguments.material
-    if Path(name).is_dir():
-        fit = load_fit(name)
-        fit.require_one("render")
-        used = fit.problem.transport
-        stack, transport = fit.stack, used if isinstance(used, Transport) else None
-    else:
-        stack, transport = _material(name)
-    figure = run_render(stack, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
+    material, transport = _material(name)
+    if isinstance(material, Fit):
+        material.require_one("render")
+        used = material.problem.transport
+        material, transport = material.stack, used if isinstance(used, Transport) else None
+    figure = run_render(material, transport, title=Path(name).resolve().stem.replace("_", " "), size=arguments.size)
     write_bytes(arguments.out, as_png(figure), force=arguments.force)
     print(f"{arguments.out}: {name}")
     return DONE
@@ -93,14 +86,9 @@ def export(arguments: Namespace) -> int:
     refuse_existing(arguments.out, arguments.force)
     use_jax()
     from fits.exports.export import export as run_export
-    from fits.reports.results import load_fit
 
     name = arguments.material
-    if Path(name).is_dir():
-        material: Fit | Stack | Mixture = load_fit(name)
-        transport = None
-    else:
-        material, transport = _material(name)
+    material, transport = _material(name)
     with show_progress() as progress:
         written = run_export(
             material,
@@ -118,17 +106,20 @@ def export(arguments: Namespace) -> int:
     return DONE
 
 
-def _material(name: str) -> "tuple[Stack | Mixture, Any]":
-    """One of the gallery, or of a file with free parameters at their start, and its transport; None: not said."""
+def _material(name: str) -> "tuple[Fit | Stack | Mixture, Any]":
+    """A saved fit, or a stack of the gallery or of a file, at its start; and its transport, None if not given."""
     from fits.problem.stack_file import read_problem
+    from fits.reports.results import load_fit
     from layerjax import gallery
 
+    if Path(name).is_dir():
+        return load_fit(name), None
     if name in gallery.names():
         return gallery.stack(name), None
     if Path(name).suffix == ".toml":
         given = read_problem(name)
         return _at_start(given.stack), None if given.transport == "auto" else given.transport
-    raise ValueError(f"{name}: neither a .toml file nor one of the gallery: {', '.join(gallery.names())}")
+    raise ValueError(f"{name}: neither a .toml file nor a material of the gallery: {', '.join(gallery.names())}")
 
 
 def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":

@@ -1,8 +1,8 @@
-"""The `layerjax` command: what may be asked for, and how it ends.
+"""The `layerjax` command: its commands and options, its errors and exit codes.
 
-Exit codes: 0 done; 1 done, but not to be relied on (a chain that is too short, a fit that did not converge); 2 bad
-input, bad usage, a full disk or too little memory, named on stderr, with nothing written but what the same command goes
-on with; 130 interrupted.
+Exit codes: 0 done; 1 done, but not to be relied on (a chain or a fit that did not converge); 2 bad input, bad usage, a
+full disk or too little memory, named on stderr, with nothing written but what the same command resumes; 130
+interrupted.
 """
 
 import argparse
@@ -10,27 +10,30 @@ import os
 import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
-from typing import NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 from fits.cli.interrupts import raised_again
 from fits.cli.numbers import count, degrees, length, level, seed
 from fits.cli.options import (
-    add_fitting,
+    DATA,
+    MATERIAL,
     add_force,
-    add_format,
     add_hold_out,
-    add_only,
+    add_read,
     add_reading,
-    add_sampling,
     add_searching,
+    add_select,
+    add_starts,
     command,
 )
 from fits.cli.parser_many import add_fit_many
 from fits.cli.parser_maps import add_fit_map
 from fits.names import EXPORTS
 
-MOST_LETTERS = 1000
-"""Of an error: JAX adds a table of all that it holds to one of memory."""
+MAX_MESSAGE = 1000
+"""Characters of an error that are shown: JAX adds a table of all arrays to one of memory."""
+
+Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -44,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         with raised_again():
             code = int(getattr(commands, arguments.command.replace("-", "_"))(arguments))
-        sys.stdout.flush()  # here, where a full disk or a reader that has gone can still be told
+        sys.stdout.flush()  # while an error can still be reported
         return code
     except KeyboardInterrupt as interrupt:
         print(f"layerjax: interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
@@ -54,18 +57,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except Exception as error:
         _end_output()
-        if arguments.traceback or not _is_of_input(error):
-            raise
+        if arguments.traceback or not (isinstance(error, ValueError | OSError | OverflowError) or _of_memory(error)):
+            raise  # an error of the program needs its traceback
         print(f"layerjax: error: {_one_line(error)}", file=sys.stderr)
         return 2
 
 
 def _end_output() -> None:
-    """What cannot be written to stdout goes nowhere: Python would try again as it ends, and complain."""
+    """Discards what cannot be written to stdout: Python would try again as it ends, and complain."""
     try:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _of_memory(error: Exception) -> bool:
+    """Whether memory was not enough; JAX has an error of its own for it."""
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error))
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+    words = f"{' '.join(str(error).split()):.{MAX_MESSAGE}}" or type(error).__name__
+    if _of_memory(error):
+        return f"memory is not enough: {words}"
+    return f"a number is too large: {words}" if isinstance(error, OverflowError) else words
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -76,127 +93,108 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, help="print the version and exit")
     parser.add_argument("--traceback", action="store_true", help="show where an error comes from (for bug reports)")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (
-        _add_fit,
-        add_fit_map,
-        _add_sample,
-        _add_predict,
-        _add_report,
-        _add_compare,
-        _add_search,
-        add_fit_many,
-        _add_info,
-        _add_convert,
-        _add_simulate,
-        _add_render,
-        _add_export,
-    ):
+    for add in (_fit, add_fit_map, _sample, _predict, _report, _compare, _search, add_fit_many):
+        add(commands)
+    for add in (_info, _convert, _simulate, _render, _export):
         add(commands)
     return parser
 
 
-def _add_fit(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _fit(commands: Commands) -> None:
     parser = command(
         commands,
         "fit",
-        "fit a stack to measured data and write a result directory with a report",
-        "layerjax fit slices.csv --stack coat.toml --out result --mask-grazing 80 --starts 32",
+        "fit a stack to measurements and write a result directory with a report",
+        "layerjax fit slices.csv --stack coat.toml --out result --max-polar-angle 80 --hold-out incidence=30",
     )
-    parser.add_argument(
-        "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
-    )
+    parser.add_argument("data", metavar="DATA", help=DATA)
     parser.add_argument("--stack", required=True, metavar="TOML", help="the stack, with its free parameters")
     parser.add_argument("--out", required=True, metavar="DIR", help="result directory to write")
-    add_fitting(parser)
+    add_starts(parser)
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="random seed (default: %(default)s)")
     add_reading(parser)
-    add_only(parser, "fit")
+    add_select(parser, "fit")
     add_hold_out(parser)
-    parser.add_argument("--sample", action="store_true", help="sample the posterior as well (see `layerjax sample`)")
-    add_sampling(parser)
     add_force(parser, "replace DIR if it holds an earlier result")
 
 
-def _add_sample(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _sample(commands: Commands) -> None:
     parser = command(
         commands,
         "sample",
-        "sample the posterior of a fit; goes on where it stopped when it is run again",
-        "layerjax sample result --walkers 32 --max-steps 50000",
+        "sample the posterior of a fit; run again, it resumes the chain",
+        "layerjax sample result --ess 2000",
     )
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
-    add_sampling(parser)
-    parser.add_argument("--seed", type=seed, metavar="S", help="seed (default: the chain's, or 0)")
-    add_force(parser, "throw an earlier chain away and start again")
+    parser.add_argument(
+        "--sampler", choices=("emcee", "nuts"), help="nuts: for many parameters (default: the chain's, or emcee)"
+    )
+    parser.add_argument(
+        "--walkers", type=count, metavar="N", help="even number (default: the chain's, or 32; 4 chains of nuts)"
+    )
+    parser.add_argument("--ess", type=count, metavar="N", help="least effective sample size of all parameters")
+    parser.add_argument(
+        "--max-steps", type=count, default=20_000, metavar="N", help="most steps (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--allow-unconverged", action="store_true", help="report estimates from a chain that has not converged, too"
+    )
+    add_force(parser, "delete an earlier chain and start again")
 
 
-def _add_predict(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _predict(commands: Commands) -> None:
     parser = command(
         commands,
         "predict",
-        "predict readings elsewhere from a saved result, or score readings",
+        "predict the BSDF and new measurements at other directions, or score the prediction of measurements",
         "layerjax predict result --incidence 30,70 --out predicted.csv",
     )
     parser.add_argument("directory", metavar="DIR", help="result directory of `layerjax fit`")
     parser.add_argument("--incidence", type=degrees, nargs="+", metavar="DEG", help="polar angles of the light")
     parser.add_argument(
-        "--azimuth", type=float, nargs="+", metavar="DEG", help="planes; 0 holds the light (default: 0)"
+        "--azimuth", type=float, nargs="+", metavar="DEG", help="planes; 0 is that of incidence (default)"
     )
-    parser.add_argument("--at", metavar="FILE", help="in place of --incidence: readings, whose prediction is scored")
-    add_format(parser)
-    add_only(parser, "predict")
+    parser.add_argument("--score", metavar="FILE", help="in place of --incidence: measurements to predict and score")
+    add_read(parser)
+    add_select(parser, "score")
     parser.add_argument("--out", metavar="CSV", help="file to write; its name ends in .csv")
-    add_force(parser, "overwrite the file")
+    add_force(parser)
 
 
-def _add_report(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _report(commands: Commands) -> None:
     parser = command(
         commands,
         "report",
         "write the report and the pictures of a result directory again, or the report of a fitted map",
         "layerjax report result --compare other_result",
     )
-    parser.add_argument(
-        "directory", metavar="DIR", help="result directory of `layerjax fit`, or the store of `layerjax fit-map`"
-    )
-    parser.add_argument(
-        "--compare", nargs="+", default=(), metavar="DIR2", help="results for the same data to compare with"
-    )
-    parser.add_argument(
-        "--out",
-        metavar="HTML",
-        help="write the report to this file, and leave DIR as it is (default of a map: beside it)",
-    )
-    add_force(parser, "overwrite the file of --out, or the page beside a map")
+    parser.add_argument("directory", metavar="DIR", help="result of `layerjax fit`, or store of `layerjax fit-map`")
+    parser.add_argument("--compare", nargs="+", default=(), metavar="DIR2", help="results to compare on the same data")
+    parser.add_argument("--out", metavar="HTML", help="file to write (default: in DIR, or beside the store of a map)")
+    add_force(parser, "overwrite the file of --out, or the page of a map")
 
 
-def _add_compare(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _compare(commands: Commands) -> None:
     parser = command(
         commands,
         "compare",
-        "compare fits of the same data: which stack explains it",
+        "compare fits of the same data by out-of-sample prediction",
         "layerjax compare coated bare --out comparison.html",
     )
     parser.add_argument("directories", nargs="+", metavar="DIR", help="two or more result directories")
     parser.add_argument("--out", metavar="HTML", help="write the comparison with its pictures to this file")
-    parser.add_argument(
-        "--refit",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="fit each again without each incidence, and rank by what they foretell of it (default); else by AIC",
-    )
-    add_force(parser, "overwrite the file")
+    parser.add_argument("--no-refit", action="store_true", help="rank by AIC, without cross-validation")
+    add_force(parser)
 
 
-def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _search(commands: Commands) -> None:
     parser = command(
         commands,
         "search",
-        "look for the stack behind data: stacks grow layer by layer, and are ranked by what they foretell",
-        "layerjax search slices.csv --out stacks --noise 0.03 --calibration 0.1",
+        "search for the stack behind data: stacks grow layer by layer and are ranked by out-of-sample prediction",
+        "layerjax search slices.csv --out stacks --noise 0.03 --scale-sd 0.1",
     )
-    parser.add_argument(
-        "data", metavar="DATA", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
-    )
+    parser.add_argument("data", metavar="DATA", help=DATA)
     parser.add_argument("--out", required=True, metavar="DIR", help="directory to write, or to resume")
     parser.add_argument(
         "--budget",
@@ -204,113 +202,94 @@ def _add_search(commands: "argparse._SubParsersAction[_Parser]") -> None:
         metavar="MINUTES",
         help="begin no stack after this time, and report what was found; the same command resumes (default: none)",
     )
+    parser.add_argument("--layers", type=int, default=3, metavar="N", help="most layers over the base (default: 3)")
+    parser.add_argument("--instrument", metavar="TOML", help="a file with an [instrument], such as a stack file")
     add_searching(parser)
-    parser.add_argument("--starts", type=count, default=8, metavar="N", help="of each fit (default: %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the starts (default: %(default)s)")
     add_reading(parser)
 
 
-def _add_info(commands: "argparse._SubParsersAction[_Parser]") -> None:
-    parser = command(
-        commands,
-        "info",
-        "say what is in a measurement file, and draw it",
-        "layerjax info slices.csv",
-    )
-    parser.add_argument(
-        "data", metavar="FILE", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
-    )
-    parser.add_argument(
-        "--out", metavar="PNG", help="picture to draw (default: FILE's name as .png, in the current directory)"
-    )
-    add_reading(parser)
+def _info(commands: Commands) -> None:
+    parser = command(commands, "info", "say what is in a measurement file, and draw it", "layerjax info slices.csv")
+    parser.add_argument("data", metavar="FILE", help=DATA)
+    parser.add_argument("--out", metavar="PNG", help="picture (default: FILE's name as .png, in the current directory)")
+    add_read(parser)
     add_force(parser, "overwrite the picture")
 
 
-def _add_convert(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _convert(commands: Commands) -> None:
     parser = command(
         commands,
         "convert",
         "write measurements as csv in this project's convention",
         "layerjax convert AnoBlackNiTEonSteel.bsdf steel.csv",
     )
-    parser.add_argument(
-        "data", metavar="IN", help="measurements: csv, MERL .binary, .bsdf and others, see docs/formats.md"
-    )
+    parser.add_argument("data", metavar="IN", help=DATA)
     parser.add_argument("out", metavar="OUT", help="file to write; its name ends in .csv")
-    add_reading(parser)
-    add_force(parser, "overwrite the file")
+    add_read(parser)
+    add_force(parser)
 
 
-def _add_simulate(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _simulate(commands: Commands) -> None:
     parser = command(
         commands,
         "simulate",
-        "write what a goniometer would measure of a stack, with noise",
+        "simulate goniometer measurements of a stack, with noise",
         "layerjax simulate --stack coat.toml --incidence 10 30 50 70 --noise 0.05 --out simulated.csv",
     )
     parser.add_argument(
         "--stack",
         required=True,
         metavar="TOML",
-        help="the stack, free parameters at their start; its [noise], [scale] and [instrument] are left out",
+        help="the stack, free parameters at their start; its [noise], [scale] and [instrument] are not simulated",
     )
     parser.add_argument("--out", required=True, metavar="CSV", help="file to write; its name ends in .csv")
-    parser.add_argument(
-        "--incidence", type=float, nargs="+", default=(10, 30, 50, 70), metavar="DEG", help="(default: 10 30 50 70)"
-    )
-    parser.add_argument(
-        "--azimuth", type=float, nargs="+", default=(0,), metavar="DEG", help="planes; 0 holds the light (default: 0)"
-    )
+    for name, default, what in (
+        ("--incidence", (10, 30, 50, 70), "polar angles of the light (default: 10 30 50 70)"),
+        ("--azimuth", (0,), "planes; 0 is that of incidence (default)"),
+    ):
+        parser.add_argument(name, type=float, nargs="+", default=default, metavar="DEG", help=what)
     parser.add_argument("--noise", type=level, default=0.0, metavar="REL", help="relative noise (default: none)")
-    parser.add_argument("--floor", type=level, default=0.0, metavar="ABS", help="absolute noise, 1/sr (default: none)")
-    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="seed of the noise (default: %(default)s)")
-    add_force(parser, "overwrite the file")
+    parser.add_argument("--seed", type=seed, default=0, metavar="S", help="random seed (default: %(default)s)")
+    add_force(parser)
 
 
-def _add_render(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _render(commands: Commands) -> None:
     parser = command(
         commands,
         "render",
         "draw a material: spheres, lobes and a map of its BSDF",
         "layerjax render window_shade --out window_shade.png",
     )
-    parser.add_argument(
-        "material",
-        metavar="DIR|TOML|NAME",
-        help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
-    )
+    parser.add_argument("material", metavar="DIR|TOML|NAME", help=MATERIAL)
     parser.add_argument("--out", required=True, metavar="PNG", help="file to write; its name ends in .png")
-    parser.add_argument(
-        "--size", type=count, default=256, metavar="N", help="pixels a sphere, 16 to 1024 (default: %(default)s)"
-    )
-    add_force(parser, "overwrite the file")
+    parser.add_argument("--size", type=count, default=256, metavar="N", help="pixels a sphere (default: %(default)s)")
+    add_force(parser)
 
 
-def _add_export(commands: "argparse._SubParsersAction[_Parser]") -> None:
+def _export(commands: Commands) -> None:
     parser = command(
         commands,
         "export",
         "write a material for renderers (Mitsuba, pbrt, MaterialX) or for optical design (Zemax, LightTools)",
         "layerjax export result --to rgl --out coat.bsdf",
     )
-    parser.add_argument(
-        "material",
-        metavar="DIR|TOML|NAME",
-        help="result directory of `layerjax fit`, a stack (free parameters at their start), or one of the gallery",
-    )
+    parser.add_argument("material", metavar="DIR|TOML|NAME", help=MATERIAL)
     parser.add_argument(
         "--to", required=True, choices=EXPORTS, help="rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX"
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     parser.add_argument(
-        "--wavelengths", type=length, nargs="+", metavar="NM", help="of the channels: an rgl file is spectral then"
+        "--wavelengths",
+        type=length,
+        nargs="+",
+        metavar="NM",
+        help="wavelengths of the channels, for a spectral rgl file",
     )
-    add_force(parser, "overwrite the file")
+    add_force(parser)
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, as every other error of the command."""
+    """Reports an error in one line, as every other error of the command."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
@@ -327,22 +306,3 @@ class _Version(argparse.Action):
 
         print(f"layerjax {__version__}")
         parser.exit()
-
-
-def _is_of_input(error: Exception) -> bool:
-    """Whether it is of what was given, or of the machine; of a fault of the program a traceback tells."""
-    return isinstance(error, ValueError | OSError | OverflowError) or _is_of_memory(error)
-
-
-def _is_of_memory(error: Exception) -> bool:
-    """JAX says it by the words of an error of its own."""
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error))
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
-    words = f"{' '.join(str(error).split()):.{MOST_LETTERS}}" or type(error).__name__
-    if _is_of_memory(error):
-        return f"memory is not enough: {words}"
-    return f"a number is too large: {words}" if isinstance(error, OverflowError) else words

@@ -1,18 +1,10 @@
-"""What may be asked of many files at once."""
+"""Options of the command for many files."""
 
 import argparse
 from typing import Any
 
 from fits.cli.numbers import count
-from fits.cli.options import (
-    add_fitting,
-    add_force,
-    add_hold_out,
-    add_only,
-    add_reading,
-    add_searching,
-    command,
-)
+from fits.cli.options import add_force, add_hold_out, add_reading, add_searching, add_select, add_starts, command
 
 
 def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
@@ -29,20 +21,15 @@ def add_fit_many(commands: "argparse._SubParsersAction[Any]") -> None:
         "--out", required=True, metavar="DIR", help="directory to write, or to resume: DIR/FILE/STACK is a result"
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--processes", type=count, metavar="N", help="at a time (default: one a core)")
+    where.add_argument("--processes", type=count, metavar="N", help="worker processes (default: one a core)")
     where.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="of a dask.distributed cluster that sees the files, such as tcp://...:8786",
+        "--scheduler", metavar="ADDRESS", help="dask.distributed cluster that sees the files, such as tcp://...:8786"
     )
-    parser.add_argument(
-        "--no-reports", action="store_true", help="leave out the report of each fit, `layerjax report DIR` writes it"
-    )
-    add_fitting(parser)
+    add_starts(parser)
     add_reading(parser)
-    add_only(parser, "fit")
+    add_select(parser, "fit")
     add_hold_out(parser)
-    group = parser.add_argument_group("looking for stacks")
-    group.add_argument("--search", action="store_true", help="look for the stack behind each file as well")
+    group = parser.add_argument_group("searching for stacks")
+    group.add_argument("--search", action="store_true", help="search for the stack behind each file as well")
     add_searching(group)
-    add_force(parser, "fit again what is there of another stack, other settings or another content of the file")
+    add_force(parser, "fit again where stack, settings or the content of the file have changed")

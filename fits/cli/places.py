@@ -1,18 +1,18 @@
-"""Where a command may write: refused before any work begins, not after it."""
+"""Output files, refused before any work begins rather than after it."""
 
 from argparse import Namespace
 from pathlib import Path
 
 
 def require_free_place(arguments: Namespace, ending: str, what: str) -> None:
-    """Before any work: the file of --out can be written, and holds nothing that must stay."""
+    """ValueError unless the file of --out has this ending and can be written; what: the content."""
     if Path(arguments.out).suffix.lower() != ending:
         raise ValueError(f"{arguments.out}: {what} can be written as {ending} only")
     refuse_existing(arguments.out, arguments.force)
 
 
 def refuse_existing(path: str | None, force: bool) -> None:
-    """Before any work: a file can be written there, and none is there that must stay; None is no place at all."""
+    """ValueError unless a file can be written there, and none would be overwritten without `force`."""
     if path is None:
         return
     if Path(path).is_dir():

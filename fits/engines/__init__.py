@@ -1,7 +1,7 @@
-"""Many tasks that do not need each other: by threads of this process, by processes of this machine, or by a cluster.
+"""Parallel execution of independent tasks: by threads, by processes of this machine, or by a Dask cluster.
 
-A function, what all tasks share, and the tasks go in; results come out as they end. A task that fails costs
-itself alone, a worker that is killed what it had in hand, which is done again.
+A function, data that all tasks share, and the tasks go in; results come out as they finish. A task that fails does not
+affect the others; the tasks of a worker that is killed are repeated.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +13,7 @@ from fits.engines.failures import Failure as Failure
 
 @contextmanager
 def connected(client: Any) -> Iterator[Any]:
-    """The client for many calls of `run`: where the address of a scheduler is given, one that ends with the block.
+    """The client for several calls of `run`; for the address of a scheduler, one that is closed with the block.
 
     Raises:
         ValueError: no client and no address, or no `distributed`.
@@ -24,8 +24,8 @@ def connected(client: Any) -> Iterator[Any]:
         return
     from fits.engines.distributed import connected
 
-    with connected(client) as found:
-        yield found
+    with connected(client) as connection:
+        yield connection
 
 
 def run(
@@ -37,27 +37,27 @@ def run(
     client: Any = None,
     threads: int | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Do all tasks; yields the index of each, and what `work` made of it, as they end.
+    """Execute all tasks; yields the index and result of each as it finishes.
 
     Args:
-        work: called as `work(shared, task)`. Of processes and clusters, a function that can be imported there.
-        shared: what all tasks need; each worker gets it once.
+        work: called as `work(shared, task)`; for processes and clusters a function that can be imported there.
+        shared: data of all tasks; each worker receives them once.
         tasks: any number of them.
-        processes: 1: threads of this process, one a core, of which the first task has none beside it (it compiles). Of
-            more each is a process of its own on a core of its own, with one thread: a script that asks for them does
-            so under ``if __name__ == "__main__":``.
+        processes: 1: threads of this process, one a core; the first task runs by itself, as it compiles. More: so many
+            processes, each on a core of its own with one thread: a script then needs
+            ``if __name__ == "__main__":``.
         client: a `distributed.Client`, or the address of a scheduler (``"tcp://..."``), in place of processes. Its
-            workers have layerjax, and take one task at a time: one thread each (``--nthreads 1``).
-        threads: of this process, where they do it; None: one a core. By a single one it is done by whoever calls.
+            workers have layerjax installed and one thread each (``--nthreads 1``).
+        threads: threads of this process; None: one a core. With 1 the calling thread executes the tasks.
 
     Yields:
-        (index, result). In the place of a result stands a `Failure` where `work` raised ValueError or OSError, or its
-        worker died three times. A full disk and all other errors end the run. Whoever leaves the loop ends the workers.
+        (index, result). The result is a `Failure` if `work` raised ValueError or OSError, or its worker died three
+        times. A full disk and all other errors end the run. Leaving the loop ends the workers.
 
     Raises:
         ValueError: processes < 1; `work`, `shared` or a task that cannot be sent to a worker; a worker that cannot
             start; no `distributed`.
-        OSError: no such scheduler, or one that has gone away.
+        OSError: no such scheduler, or one that has stopped.
     """
     if processes < 1:
         raise ValueError(f"processes is {processes}; it must be at least 1")

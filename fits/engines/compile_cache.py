@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between processes: a folder of this host, for its processor and its JAX."""
+"""Cache of compiled programs between processes: a folder of this host, for its processor and its JAX."""
 
 import hashlib
 import os
@@ -10,14 +10,14 @@ from importlib import metadata
 from pathlib import Path
 
 FOLDER, LEAST = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
-"""JAX's settings."""
+"""Names of JAX's settings."""
 
 LEAST_COMPILE = 1.0
-"""Programs that took so many seconds to compile are kept."""
+"""Seconds of compilation from which a program is cached."""
 
 
 def compile_cache() -> str | None:
-    """Where programs compiled by this JAX for this processor are kept, on this host alone; None: they cannot be."""
+    """Folder of programs that this JAX compiled for this processor, on this host only; None: there can be none."""
     try:
         key = "\n".join((metadata.version("jaxlib"), socket.gethostname(), _processor()))
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -29,7 +29,7 @@ def compile_cache() -> str | None:
 
 
 def _processor() -> str:
-    """Its kind and what it can do."""
+    """Kind and features of the processor."""
     with suppress(OSError), open("/proc/cpuinfo") as file:
         for line in file:
             if line.startswith(("flags", "Features")):
@@ -38,7 +38,7 @@ def _processor() -> str:
 
 
 def keep_programs(least: float | None = None) -> bool:
-    """Have this process keep what takes so many seconds to compile (`LEAST_COMPILE` if None), if it keeps nothing yet.
+    """Cache programs that take so many seconds to compile (`LEAST_COMPILE` if None), unless this process has a cache.
 
     Returns whether it kept nothing before, and does now.
     """
@@ -53,7 +53,7 @@ def keep_programs(least: float | None = None) -> bool:
 
 @contextmanager
 def programs_kept() -> Iterator[None]:
-    """Within it, programs are kept for processes that follow, and found that others have kept."""
+    """Cache programs compiled within the block, for later processes, and use cached ones."""
     import jax
     from jax.experimental.compilation_cache.compilation_cache import reset_cache
 

@@ -1,7 +1,7 @@
-"""Tasks by the workers of a dask.distributed cluster, wherever they are.
+"""Execution of tasks by the workers of a dask.distributed cluster.
 
-A worker takes one task at a time, or a few where they are short; those of several threads share a process, which its
-libraries may not bear.
+A worker takes one task at a time, or a group of short ones. Workers with several threads share a process between tasks,
+which some libraries do not support.
 """
 
 import asyncio
@@ -17,31 +17,31 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from fits.engines.failures import MOST_DEATHS, Failure, attempt, one_line
-from fits.engines.worker import precision, take_after
+from fits.engines.worker import configure, precision
 
 IN_FLIGHT = 4
-"""Tasks for each thread of a worker that the scheduler knows of."""
+"""Tasks that are submitted for each thread of a worker."""
 
-WAITED = 60.0
-"""Seconds for the first worker."""
+TIMEOUT = 60.0
+"""Seconds to wait for the first worker."""
 
-COUNTED = 5.0
+RECOUNT = 5.0
 """Seconds after which workers are counted again: some clusters grow."""
 
-ENOUGH = 0.5
-"""Seconds of work that go to a worker at a time, where single tasks are shorter: to hand one out takes milliseconds."""
+GROUP_SECONDS = 0.5
+"""Seconds of work that go to a worker at a time if single tasks are shorter, as submitting takes milliseconds."""
 
 SHORTEST = 1e-3
-"""Seconds that a task takes at least."""
+"""Least seconds that a task counts as."""
 
 RETRIES = 3
-"""Of a task that ends by an error which is neither its own nor the death of its worker."""
+"""Retries of a task that fails neither by its own error nor by the death of its worker."""
 
 WITH_PORT = ("tcp", "tls", "ws", "wss", "ucx")
-"""Kinds of addresses of a scheduler, beside those of threads of this process."""
+"""Schemes of a scheduler's address, besides those of threads of this process."""
 
-AGAIN, LATER = object(), object()
-"""In the place of an outcome, where the task is to be done once more."""
+REPEAT, REPEAT_LATER = object(), object()
+"""Outcomes of tasks that are repeated, at once or at the end."""
 
 
 def run_distributed(
@@ -59,51 +59,52 @@ def run_distributed(
     return _results(payload, packed, client)
 
 
-def _results(payload: bytes, tasks: list[bytes], given: Any) -> Iterator[tuple[int, Any]]:
+def _results(payload: bytes, tasks: list[bytes], client: Any) -> Iterator[tuple[int, Any]]:
     if not tasks:
         return
-    with connected(given) as client:
-        run = _Run(client, payload, tasks)
+    with connected(client) as connection:
+        run = _Run(connection, payload, tasks)
         try:
             yield from run.results()
         finally:
-            with suppress(Exception):  # of a scheduler that has gone
-                client.cancel(list(run.running), force=True)
+            with suppress(Exception):  # of a scheduler that has stopped
+                connection.cancel(list(run.running), force=True)
 
 
-def _require_client(given: Any) -> None:
-    """Refuse what is no client, and no address of a scheduler."""
+def _require_client(client: Any) -> None:
+    """ValueError for what is neither a client nor the address of a scheduler."""
     try:
         from distributed import Client
         from distributed.comm.addressing import parse_address, parse_host_port
     except ImportError:
         raise ValueError('client= needs distributed: pip install "layerjax[distributed]"') from None
     wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
-    if not isinstance(given, str | Client) or getattr(given, "asynchronous", False):
-        raise ValueError(f"client is {given!r}; it must be {wanted}")
-    if isinstance(given, str):
+    if not isinstance(client, str | Client) or getattr(client, "asynchronous", False):
+        raise ValueError(f"client is {client!r}; it must be {wanted}")
+    if isinstance(client, str):
         try:
-            scheme, place = parse_address(given)
+            scheme, place = parse_address(client)
             host = parse_host_port(place)[0] if scheme in WITH_PORT else place if scheme == "inproc" else ""
-        except ValueError:  # a client that meets this waits a minute for itself
+        except ValueError:  # a client would wait a minute for it
             host = ""
         if not host:
-            raise ValueError(f"client is {given!r}; it must be {wanted}")
+            raise ValueError(f"client is {client!r}; it must be {wanted}")
 
 
 @contextmanager
-def connected(given: Any) -> Iterator[Any]:
-    """A client; one of our own for an address, and it ends with the block. Errors as those of `fits.engines.run`."""
-    _require_client(given)
+def connected(client: Any) -> Iterator[Any]:
+    """A client; for an address a new one, which is closed with the block. Errors as those of `fits.engines.run`."""
+    _require_client(client)
     from distributed import Client
 
-    if not isinstance(given, str):
-        yield given
+    if not isinstance(client, str):
+        yield client
         return
+    address = client
     try:
-        client = Client(given, set_as_default=False)
+        client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise OSError(f"{given}: there is no scheduler ({one_line(error)})") from None
+        raise OSError(f"{address}: there is no scheduler ({one_line(error)})") from None
     try:
         yield client
     finally:
@@ -112,7 +113,7 @@ def connected(given: Any) -> Iterator[Any]:
 
 
 class _Run:
-    """Tasks on their way through a scheduler."""
+    """Tasks that are submitted to a scheduler."""
 
     def __init__(self, client: Any, payload: bytes, tasks: list[bytes]):
         self.client, self.payload, self.tasks = client, payload, tasks
@@ -125,47 +126,47 @@ class _Run:
         self.room, self.counted = 1, float("-inf")
 
     def results(self) -> Iterator[tuple[int, Any]]:
-        """Tasks a few at a time; in the end, each alone, those that were in hand where workers died too often."""
-        with self._reached():
-            self.client.wait_for_workers(1, timeout=WAITED)
-        yield from self._through(list(range(len(self.tasks))), alone=False)
+        """Results of all tasks; those that ran on workers which died too often are repeated at the end, one by one."""
+        with self._naming_scheduler():
+            self.client.wait_for_workers(1, timeout=TIMEOUT)
+        yield from self._execute(list(range(len(self.tasks))), single=False)
         for index in self.suspects:
-            yield from self._through([index], alone=True)
+            yield from self._execute([index], single=True)
 
-    def _through(self, indices: list[int], alone: bool) -> Iterator[tuple[int, Any]]:
+    def _execute(self, indices: list[int], single: bool) -> Iterator[tuple[int, Any]]:
         from distributed import as_completed
 
-        left = deque(indices)
+        pending = deque(indices)
 
-        def begin() -> list[Any]:
-            with self._reached():
-                return [self._submit(self._group(left)) for _ in range(self._room() - len(self.running)) if left]
+        def submit() -> list[Any]:
+            with self._naming_scheduler():
+                return [self._submit(self._group(pending)) for _ in range(self._room() - len(self.running)) if pending]
 
-        completed = as_completed(begin(), loop=self.client.loop)
+        completed = as_completed(submit(), loop=self.client.loop)
         for future in completed:
             group = self.running.pop(future)
-            outcomes = self._outcomes(future, group, alone)
+            outcomes = self._outcomes(future, group, single)
             future.release()
-            with self._reached():
+            with self._naming_scheduler():
                 for index, outcome in zip(group, outcomes, strict=True):
-                    if outcome is AGAIN:
+                    if outcome is REPEAT:
                         completed.add(self._submit([index]))
-            completed.update(begin())
+            completed.update(submit())
             yield from (
                 (index, outcome)
                 for index, outcome in zip(group, outcomes, strict=True)
-                if outcome is not AGAIN and outcome is not LATER
+                if outcome is not REPEAT and outcome is not REPEAT_LATER
             )
 
-    def _group(self, left: deque[int]) -> list[int]:
-        """The next tasks that go together: short ones, while there are enough for all workers."""
+    def _group(self, pending: deque[int]) -> list[int]:
+        """The next tasks that are submitted together: several short ones, while there are enough for all workers."""
         size = 1
         if self.seconds is not None:
-            size = max(1, min(int(ENOUGH / max(self.seconds, SHORTEST)), len(left) // self._room()))
-        return [left.popleft() for _ in range(size)]
+            size = max(1, min(int(GROUP_SECONDS / max(self.seconds, SHORTEST)), len(pending) // self._room()))
+        return [pending.popleft() for _ in range(size)]
 
-    def _outcomes(self, future: Any, group: list[int], alone: bool) -> list[Any]:
-        """Of each of the tasks that have ended its result, its failure, or when it is to be done once more."""
+    def _outcomes(self, future: Any, group: list[int], single: bool) -> list[Any]:
+        """For each finished task its result, its failure, or that it is repeated."""
         from distributed import KilledWorker
 
         try:
@@ -174,10 +175,10 @@ class _Run:
             self.seconds = each if self.seconds is None else 0.5 * (self.seconds + each)
             return list(outcomes)
         except KilledWorker as killed:
-            if alone:
+            if single:
                 return [Failure(f"its worker died {getattr(killed, 'allowed_failures', MOST_DEATHS) + 1} times")]
-            self.suspects += group  # the worker may have died of a task beside it
-            return [LATER] * len(group)
+            self.suspects += group  # another task may have killed the worker
+            return [REPEAT_LATER] * len(group)
         except (futures.CancelledError, asyncio.CancelledError):
             self._require_scheduler()
             self.shared = None  # it may be lost as well
@@ -192,32 +193,32 @@ class _Run:
 
     def _lost(self, index: int) -> Any:
         self.losses[index] += 1
-        return AGAIN if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
+        return REPEAT if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
 
     def _submit(self, group: list[int]) -> Any:
-        if self.shared is None:  # a task, not scattered data: it is done again where the workers that had it are killed
+        if self.shared is None:  # a task, not scattered data: it is repeated if the workers that hold it are killed
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="Sending large graph")
                 self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.losses.total()}")
             self._spread()
         first = group[0]
         name = f"{self.name}-{first}-{self.losses[first]}-{self.suspects.count(first)}"
-        given = (self.shared, self.name, [self.tasks[index] for index in group], precision())
-        future = self.client.submit(perform, *given, key=name, retries=RETRIES, pure=False)
+        arguments = (self.shared, self.name, [self.tasks[index] for index in group], precision())
+        future = self.client.submit(perform, *arguments, key=name, retries=RETRIES, pure=False)
         self.running[future] = group
         return future
 
     def _spread(self) -> None:
-        """Give all workers what tasks share: a scheduler gives a task to those alone that have what it needs."""
+        """Replicate the shared data to all workers: a scheduler prefers workers that hold the data of a task."""
         from distributed import wait
 
-        with suppress(Exception):  # of workers that die meanwhile; others come to have it by and by
-            wait([self.shared], timeout=WAITED)
+        with suppress(Exception):  # of workers that die meanwhile; others receive it later
+            wait([self.shared], timeout=TIMEOUT)
             self.client.replicate([self.shared])
 
     def _room(self) -> int:
-        """Tasks that may be on their way."""
-        if time.monotonic() - self.counted > COUNTED:
+        """The number of tasks that may be submitted at a time."""
+        if time.monotonic() - self.counted > RECOUNT:
             self.room = IN_FLIGHT * max(1, sum(self.client.nthreads().values()))
             self.counted = time.monotonic()
         return self.room
@@ -227,41 +228,41 @@ class _Run:
 
     def _require_scheduler(self) -> None:
         if self.client.status != "running":
-            raise OSError(f"{self._address()}: the scheduler has gone away") from None
+            raise OSError(f"{self._address()}: the scheduler has stopped") from None
 
     @contextmanager
-    def _reached(self) -> Iterator[None]:
-        """Errors on the way to the scheduler name it."""
+    def _naming_scheduler(self) -> Iterator[None]:
+        """Errors of the connection name the scheduler."""
         try:
             yield
         except TimeoutError:
             self._require_scheduler()
-            raise OSError(f"{self._address()}: no worker came within {WAITED:g} s") from None
+            raise OSError(f"{self._address()}: no worker came within {TIMEOUT:g} s") from None
         except (OSError, RuntimeError, ValueError) as error:
             self._require_scheduler()
             raise OSError(f"{self._address()}: {one_line(error)}") from None
 
 
-_kept: dict[str, Any] = {}
-_keeping = threading.Lock()
+_jobs: dict[str, Any] = {}
+_jobs_lock = threading.Lock()
 
 
 def perform(payload: bytes, name: str, tasks: list[bytes], double: bool | None) -> tuple[float, list[Any]]:
-    """Tasks in a worker, and their seconds; of each run that has this name it is set up, and unpacks what tasks share,
-    once."""
-    began = time.monotonic()
-    with _keeping:
-        if name not in _kept:
-            take_after(double, _threads())
-            _kept.clear()
-            _kept[name] = pickle.loads(payload)
-        work, shared = _kept[name]
+    """Execute tasks in a worker; returns their seconds and outcomes. The worker is configured, and unpacks the shared
+    data, once for each run of this name."""
+    start = time.monotonic()
+    with _jobs_lock:
+        if name not in _jobs:
+            configure(double, _threads())
+            _jobs.clear()
+            _jobs[name] = pickle.loads(payload)
+        work, shared = _jobs[name]
     outcomes = [attempt(work, shared, pickle.loads(task)) for task in tasks]
-    return time.monotonic() - began, outcomes
+    return time.monotonic() - start, outcomes
 
 
 def _threads() -> int:
-    """Those that this worker may use."""
+    """Threads of this worker."""
     from distributed import get_worker
 
     return int(get_worker().state.nthreads)

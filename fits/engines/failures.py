@@ -1,24 +1,24 @@
-"""What becomes of a task that fails."""
+"""Failures of tasks."""
 
 import errno
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 MOST_DEATHS = 3
-"""A task whose workers died so often is not tried again."""
+"""A task is not repeated after so many deaths of its workers."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a disk that is full: they meet every task."""
+"""Errors of a full disk, which affect every task."""
 
 
 class Failure(NamedTuple):
-    """In the place of a result; error: what the task raised, on one line, or how its workers died."""
+    """Result of a task that failed; error: what it raised, on one line, or how its workers died."""
 
     error: str
 
 
 def attempt(work: Callable[[Any, Any], Any], shared: Any, task: Any) -> Any:
-    """What `work` makes of a task, or its failure. What must end the run is raised."""
+    """The result of a task, or its failure; errors that end the run are raised."""
     try:
         return work(shared, task)
     except (ValueError, OSError) as error:
@@ -28,7 +28,7 @@ def attempt(work: Callable[[Any, Any], Any], shared: Any, task: Any) -> Any:
 
 
 def one_line(error: BaseException) -> str:
-    """An error as the command line says it."""
+    """An error as the command line prints it."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
     return " ".join(str(error).split()) or type(error).__name__

@@ -1,4 +1,4 @@
-"""Tasks by processes of this machine, each on a core of its own: a worker that is killed costs what it had in hand."""
+"""Execution of tasks by processes of this machine, each on a core of its own; tasks of a killed one are repeated."""
 
 import os
 import pickle
@@ -18,16 +18,16 @@ from fits.engines.failures import MOST_DEATHS, Failure
 from fits.engines.worker import READY, Raised, environment, serve
 
 AGAIN = 78
-"""Exit code of a worker that runs its parent's script to the point where that started workers."""
+"""Exit code of a worker that runs its parent's script to the point where that starts workers."""
 
 MOST_FALSE_STARTS = 10
-"""Worker processes that die one after the other before they are ready: no task is to blame, and something is wrong."""
+"""Worker processes in a row that may die before they are ready: no task has caused that."""
 
 SHORT = 1 << 14
-"""Bytes that fit into the pipe by which a process is started; of more there is a file."""
+"""Bytes that fit into the pipe that starts a process; more go by a file."""
 
 PATIENCE = 5.0
-"""Seconds that a worker has to end when there is nothing left to do."""
+"""Seconds that a worker has to end when no task remains."""
 
 _environ = threading.Lock()
 
@@ -43,9 +43,9 @@ def run_processes(
 
 
 def end_if_again() -> None:
-    """End a worker process that runs its parent's script, one without a guard, to where that asks for workers.
+    """End a worker process that runs its parent's script, which has no guard, to where that starts workers.
 
-    To be called before anything is done that must not be done twice.
+    To be called before anything that must not be repeated.
     """
     if getattr(current_process(), "_inheriting", False):
         sys.exit(AGAIN)
@@ -62,24 +62,24 @@ def _pickled(what: Any, called: str) -> bytes:
 
 
 class _Worker:
-    """A process on a core, this end of the pipe to it, and the index of the task that it has or gets first."""
+    """A process on a core, this end of the pipe to it, and the index of its current or first task."""
 
     def __init__(self, payload: bytes | str, core: int | None, index: int):
         self.core, self.index, self.ready = core, index, False
         self.pipe, theirs = connection.Pipe()
         self.process = get_context("spawn").Process(target=serve, args=(theirs, payload, core), daemon=True)
         try:
-            with _as_workers_start():
+            with _worker_environment():
                 self.process.start()
         finally:
-            theirs.close()  # it is theirs alone: once it is closed they have gone
+            theirs.close()  # the worker's end: once it is closed the worker has ended
 
     def send(self, task: bytes) -> None:
-        with suppress(OSError):  # it has gone, as its pipe will tell
+        with suppress(OSError):  # it has ended, as its pipe will show
             self.pipe.send_bytes(task)
 
     def receive(self) -> bytes | None:
-        """What it has sent; None: it has gone."""
+        """Its message; None: it has ended."""
         try:
             return self.pipe.recv_bytes()
         except (EOFError, OSError):
@@ -94,11 +94,11 @@ class _Worker:
 
 
 class _Pool:
-    """Workers, and the tasks that are left for them."""
+    """Workers, and the tasks that remain."""
 
     def __init__(self, payload: bytes | str, tasks: list[bytes]):
         self.payload, self.tasks = payload, tasks
-        self.left = iter(range(len(tasks)))
+        self.remaining = iter(range(len(tasks)))
         self.deaths: Counter[int] = Counter()
         self.false_starts = 0
         self.workers: list[_Worker] = []
@@ -107,8 +107,8 @@ class _Pool:
     def start(self, core: int | None, index: int) -> None:
         self.workers.append(_Worker(self.payload, core, index))
 
-    def hear(self, worker: _Worker) -> tuple[int, Any] | None:
-        """Take what a worker says, or that it has gone, and give it what comes next; returns what has ended."""
+    def receive(self, worker: _Worker) -> tuple[int, Any] | None:
+        """Receive a worker's message, or its death, and send its next task; returns a finished task."""
         index, message = worker.index, worker.receive()
         if message is None:
             return self._replace(worker)
@@ -119,7 +119,7 @@ class _Pool:
         outcome = pickle.loads(message)
         if isinstance(outcome, Raised):
             raise outcome.error
-        following = next(self.left, None)
+        following = next(self.remaining, None)
         if following is None:
             worker.pipe.close()  # it ends by itself
             self.workers.remove(worker)
@@ -130,7 +130,7 @@ class _Pool:
         return index, outcome
 
     def _replace(self, worker: _Worker) -> tuple[int, Any] | None:
-        """Another in the place of one that has gone, with the same task, unless that has cost enough of them."""
+        """Replace a worker that has died by another with the same task, unless that has killed too many."""
         self.workers.remove(worker)
         worker.pipe.close()
         code, index = worker.process.exitcode or 0, worker.index
@@ -142,13 +142,13 @@ class _Pool:
             return None
         self.deaths[index] += 1
         lost = self.deaths[index] >= MOST_DEATHS
-        following = next(self.left, None) if lost else index
+        following = next(self.remaining, None) if lost else index
         if following is not None:
             self.start(worker.core, following)
         return (index, Failure(f"its worker died {MOST_DEATHS} times ({_death(code)})")) if lost else None
 
     def end(self, patience: float) -> None:
-        """Those that have nothing left to do have so many seconds, all others none."""
+        """End all workers; finished ones have so many seconds to end by themselves."""
         end = time.monotonic() + patience
         for worker in self.finished:
             worker.process.join(max(0.0, end - time.monotonic()))
@@ -158,23 +158,23 @@ class _Pool:
 
 def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    with _handed_over(payload) as given:
-        pool, patience = _Pool(given, tasks), 0.0
+    with _passed(payload) as passed:
+        pool, patience = _Pool(passed, tasks), 0.0
         try:
-            for number, index in zip(range(count), pool.left, strict=False):
+            for number, index in zip(range(count), pool.remaining, strict=False):
                 pool.start(cores[number % len(cores)], index)
             while pool.workers:
-                heard = connection.wait([worker.pipe for worker in pool.workers])
-                workers = [worker for worker in pool.workers if worker.pipe in heard]
-                yield from [ended for worker in workers if (ended := pool.hear(worker)) is not None]
+                messages = connection.wait([worker.pipe for worker in pool.workers])
+                workers = [worker for worker in pool.workers if worker.pipe in messages]
+                yield from [done for worker in workers if (done := pool.receive(worker)) is not None]
             patience = PATIENCE
         finally:
             pool.end(patience)
 
 
 @contextmanager
-def _handed_over(payload: bytes) -> Iterator[bytes | str]:
-    """It, or where it is long a file that holds it. Of a parent that is killed, workers take the file away."""
+def _passed(payload: bytes) -> Iterator[bytes | str]:
+    """The payload, or a file that holds a long one; if the parent is killed, workers delete the file."""
     if len(payload) <= SHORT:
         yield payload
         return
@@ -185,13 +185,13 @@ def _handed_over(payload: bytes) -> Iterator[bytes | str]:
 
 
 @contextmanager
-def _as_workers_start() -> Iterator[None]:
-    """Within it, a process starts with what a worker needs, and deaf to Ctrl-C, which is for its parent."""
-    resource_tracker.ensure_running()  # its start would make the process hear again
+def _worker_environment() -> Iterator[None]:
+    """Start processes with the environment of a worker, and with Ctrl-C blocked, which is for the parent."""
+    resource_tracker.ensure_running()  # its start would unblock the signal
     masks = hasattr(signal, "pthread_sigmask")
     with _environ:
         before = dict(os.environ)
-        heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
         try:
             os.environ.update(environment())
             yield
@@ -199,17 +199,17 @@ def _as_workers_start() -> Iterator[None]:
             for name in set(os.environ) - set(before):
                 del os.environ[name]
             os.environ.update(before)
-            if heard is not None:
-                signal.pthread_sigmask(signal.SIG_SETMASK, heard)
+            if blocked is not None:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 def _cannot_start(code: int, tried: int) -> str:
     if code <= 0:
         return f"{tried} worker processes in a row died as they started ({_death(code)})"
-    guard = 'what the script does must stand under `if __name__ == "__main__":`'
+    guard = 'the statements of the script must be under `if __name__ == "__main__":`'
     if code == AGAIN:
-        return f"each worker process runs the script that asks for it: {guard}, or processes must be 1"
-    return f"a worker process cannot start (exit code {code}, and what it says is above): {guard}"
+        return f"each worker process runs the script that starts it: {guard}, or processes must be 1"
+    return f"a worker process cannot start (exit code {code}, its message is above): {guard}"
 
 
 def _death(code: int) -> str:
@@ -217,5 +217,5 @@ def _death(code: int) -> str:
         return f"exit code {code}"
     with suppress(ValueError):
         name = signal.Signals(-code).name
-        return f"{name}, which systems send where memory is short" if name == "SIGKILL" else name
+        return f"{name}, which systems send when memory is short" if name == "SIGKILL" else name
     return f"signal {-code}"

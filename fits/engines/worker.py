@@ -1,7 +1,7 @@
-"""What a worker is set to: one thread on one core, precision as its parent has it, compiled programs that are kept.
+"""Configuration of workers: one thread on one core, the precision of the parent, a cache of compiled programs.
 
-Processes get most of it by their environment, which JAX and LAPACK read as they are imported. A worker of a cluster
-has imported JAX, and is told.
+Processes receive most of it by their environment, which JAX and LAPACK read on import. A worker of a cluster has
+imported JAX and is configured by a call.
 """
 
 import ctypes
@@ -23,14 +23,14 @@ from fits.engines.failures import attempt
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 XLA_THREADS = "NPROC"
-"""A variable that XLA reads when it starts the threads that compute: so many."""
+"""The variable from which XLA reads its number of threads."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-KEPT = 1 << 25
-"""Bytes: the most that glibc comes to by itself for the second of them."""
+THRESHOLD = 1 << 25
+"""Bytes: the largest value that glibc itself adapts the second of them to."""
 
 READY = b""
-"""What a worker sends first."""
+"""First message of a worker."""
 
 
 class Raised(NamedTuple):
@@ -40,31 +40,31 @@ class Raised(NamedTuple):
 
 
 def environment() -> dict[str, str]:
-    """Variables of a worker process that are not those of this one."""
-    found = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # not by XLA_FLAGS, which change results
+    """Environment variables of a worker process that differ from those of its parent."""
+    variables = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # not by XLA_FLAGS, which change results
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
-        found["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
+        variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax = sys.modules.get("jax")
     directory: str | None = os.environ.get(FOLDER.upper())
     if jax is not None:
-        found["JAX_ENABLE_X64"] = str(int(jax.config.jax_enable_x64))
+        variables["JAX_ENABLE_X64"] = str(int(jax.config.jax_enable_x64))
         directory = jax.config.values[FOLDER]
         if directory:
-            found[LEAST.upper()] = str(jax.config.values[LEAST])
+            variables[LEAST.upper()] = str(jax.config.values[LEAST])
     if not directory and (directory := compile_cache()):
-        found[LEAST.upper()] = str(LEAST_COMPILE)
-    return found | ({FOLDER.upper(): directory} if directory else {})
+        variables[LEAST.upper()] = str(LEAST_COMPILE)
+    return variables | ({FOLDER.upper(): directory} if directory else {})
 
 
 def precision() -> bool | None:
-    """Whether this process computes in double precision; None: it has not imported JAX."""
+    """Whether this process computes in double precision; None: JAX is not imported."""
     jax = sys.modules.get("jax")
     return None if jax is None else bool(jax.config.jax_enable_x64)
 
 
-def take_after(double: bool | None, threads: int) -> None:
-    """Set the JAX of a worker that has it already to the precision of who asks, with a cache where it has none; and to
-    so many threads, unless it has computed before."""
+def configure(double: bool | None, threads: int) -> None:
+    """Configure a worker that has imported JAX: precision of the caller, a compilation cache, and this number of
+    threads, unless it has computed before."""
     import jax
 
     quieten()
@@ -76,26 +76,26 @@ def take_after(double: bool | None, threads: int) -> None:
 
 
 def _keep_memory() -> None:
-    """Do not give memory back to the system after every computation, as dask has its workers do: to be given it again
-    costs more than short tasks otherwise do beside their work."""
+    """Do not return memory to the system after every computation, as dask configures its workers: to allocate it again
+    costs more than the overhead of short tasks."""
     if "MALLOC_TRIM_THRESHOLD_" in os.environ:
         with suppress(OSError, AttributeError):  # of another C library
             mallopt = ctypes.CDLL(None).mallopt
-            mallopt(M_TRIM_THRESHOLD, KEPT)
-            mallopt(M_MMAP_THRESHOLD, KEPT)
+            mallopt(M_TRIM_THRESHOLD, THRESHOLD)
+            mallopt(M_MMAP_THRESHOLD, THRESHOLD)
 
 
 def quieten() -> None:
-    """Of what others warn, keep back what is no concern of who reads the results."""
+    """Silence warnings of libraries that do not concern the results."""
     # arviz announces its next version on import; compiled programs that cannot be kept are compiled again
     warnings.filterwarnings("ignore", category=FutureWarning, module="arviz")
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
 
 
 def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None) -> None:
-    """The life of a worker process: tasks come in and results go out until the other end is closed.
+    """Main loop of a worker process: it receives tasks and sends results until the other end is closed.
 
-    payload: `work` and what tasks share, pickled, or the file that holds it.
+    payload: `work` and the shared data, pickled, or the file that holds them.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
     threading.Thread(target=_end_with_parent, args=(payload,), daemon=True).start()
@@ -108,7 +108,7 @@ def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None)
             try:
                 if call is None:
                     call = pickle.loads(payload if isinstance(payload, bytes) else Path(payload).read_bytes())
-                    _settle(core)
+                    _pin(core)
                 work, shared = call
                 outcome = attempt(work, shared, pickle.loads(task))
             except Exception as error:
@@ -131,22 +131,21 @@ def _packed(outcome: Any) -> bytes:
         return pickle.dumps(Raised(ValueError(text)))
 
 
-def _settle(core: int | None) -> None:
-    """Stay on a core, with threads that compile for each that there is.
+def _pin(core: int | None) -> None:
+    """Pin the process to a core, after XLA has started its compilation threads, one a core that it may run on.
 
-    XLA has as many as cores that it may run on when it first compiles. While one of them compiles what the main thread
-    hands to it, half a gigabyte of that piles up.
+    With a single one, half a gigabyte of programs would queue up behind it.
     """
     if "jax" in sys.modules:
         import jax
 
         jax.block_until_ready(jax.jit(jax.numpy.sin)(1.0))
     if core is not None:
-        _stay_on(core)
+        _pin_threads(core)
 
 
-def _stay_on(core: int) -> None:
-    """Keep every thread that there is, and those that they will start, on one core."""
+def _pin_threads(core: int) -> None:
+    """Pin all threads, and those that they will start, to one core."""
     threads = [0]
     with suppress(OSError, ValueError):
         threads = [int(name) for name in os.listdir("/proc/self/task")]
@@ -156,7 +155,7 @@ def _stay_on(core: int) -> None:
 
 
 def _end_with_parent(payload: bytes | str) -> None:
-    """Wait for it, take away the file that it cannot take away any more, and end."""
+    """Wait for the end of the parent, delete the file that it can no longer delete, and end."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])

@@ -1,4 +1,4 @@
-"""Files of materials for renderers and for optical design: one format a file, all of the values of a stack.
+"""Exports of a material to files for renderers and optical design: one format a module.
 
-A stack with its transport goes in, or a fit; what comes out is a file, and sentences on what it holds and loses.
+A stack with its transport, or a fit, goes in; a file comes out, and sentences on what it holds and how accurately.
 """

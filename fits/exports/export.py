@@ -1,4 +1,4 @@
-"""The way from a stack to a file of a material: `fits.export`."""
+"""`fits.export`: write a stack to a file of a material."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,12 +37,12 @@ ENDINGS: dict[str, str] = {
     "openpbr": ".mtlx",
     "csv": ".csv",
 }
-"""What names of files end in."""
+"""Suffixes of file names."""
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """A file that was written. notes: what it holds, how well, and what it does not, one sentence each."""
+    """A written file. notes: what it holds, how accurately, and what it omits, one sentence each."""
 
     path: Path
     to: To
@@ -60,24 +60,24 @@ def export(
     force: bool = False,
     progress: Progress | None = None,
 ) -> ExportReport:
-    """Write a material for renderers or for optical design.
+    """Write a material to a file for renderers or optical design.
 
     Args:
-        material: a stack or a mixture of numbers, or a fit, of which the best values are written.
+        material: a stack or a mixture without free parameters, or a fit, whose best values are written.
         path: the file; its name ends as `ENDINGS` says.
         to: the format. "rgl": RGL's tensor file, which Mitsuba and pbrt read. "merl": a MERL table. "zemax": Zemax and
-            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "openpbr": the OpenPBR surface in
-            MaterialX that resembles it most (extra `materialx`). "csv": slices in this project's convention.
-        transport: carries the light; None: that of the fit, or "auto".
+            LightTools. "klems": matrices in the XML of WINDOW, which Radiance reads. "openpbr": the closest OpenPBR
+            surface in MaterialX (extra `materialx`). "csv": slices in this project's convention.
+        transport: solver of the light transport; None: that of the fit, or "auto".
         wavelengths: (C,) nm, ascending, one for each channel: for "rgl" only, which is then spectral.
-        name: what the material is called in the file; None: after the file.
-        force: replace a file that is there.
+        name: name of the material in the file; None: that of the file.
+        force: replace an existing file.
         progress: called with (stage, done, total, note).
 
     Raises:
         ValueError: the format cannot hold the material (the number of channels, or an axis that breaks the symmetry it
-            needs, or for "openpbr" light that passes), a transport that is random or does not carry the stack, an extra
-            that is not installed, or a file that is there without `force`.
+            needs, or for "openpbr" transmission), a transport that is random or does not support the stack, an extra
+            that is not installed, or an existing file without `force`.
     """
     if not isinstance(to, str) or to not in EXPORTS:
         raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
@@ -95,10 +95,10 @@ def export(
 
 def _stack_and_transport(material: Any, transport: Any) -> tuple[lj.Stack | lj.Mixture, Any]:
     if isinstance(material, Fit):
-        own = material.problem.transport
-        if transport is None and own != "auto" and not isinstance(own, lj.Transport):
+        fitted = material.problem.transport
+        if transport is None and fitted != "auto" and not isinstance(fitted, lj.Transport):
             raise ValueError("transport: the fit's is a function of one's own; give one of layerjax")
-        return material.stack, transport or own
+        return material.stack, transport or fitted
     if not isinstance(material, lj.Stack | lj.Mixture):
         raise ValueError(f"material is {in_short(material)}, must be a Stack, a Mixture or a Fit")
     return material, transport or "auto"
@@ -109,9 +109,9 @@ def _checked(wavelengths: ArrayLike | None, to: str, channels: int) -> Floats | 
         return None
     if to != "rgl":
         raise ValueError(f"wavelengths: a file for {to!r} has none, only one for 'rgl'")
-    given = np.atleast_1d(np.asarray(wavelengths, float))
-    if given.shape != (channels,):
-        raise ValueError(f"wavelengths: {given.size} given, must be one for each of {channels} channels")
-    if not (np.isfinite(given).all() and (given > 0).all() and (np.diff(given) > 0).all()):
-        raise ValueError(f"wavelengths: {', '.join(f'{one:g}' for one in given)} nm, must be above 0 and ascend")
-    return given
+    nanometres = np.atleast_1d(np.asarray(wavelengths, float))
+    if nanometres.shape != (channels,):
+        raise ValueError(f"wavelengths: {nanometres.size} given, must be one for each of {channels} channels")
+    if not (np.isfinite(nanometres).all() and (nanometres > 0).all() and (np.diff(nanometres) > 0).all()):
+        raise ValueError(f"wavelengths: {', '.join(f'{one:g}' for one in nanometres)} nm, must be above 0 and ascend")
+    return nanometres

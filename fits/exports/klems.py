@@ -2,9 +2,9 @@
 
 Top of the stack is WINDOW's front, which is what faces outside; Radiance calls that the back, since its front faces the
 room. Patches are rings of polar angle, cut by azimuth; that of a direction is the azimuth along which light travels, so
-that what passes straight, or is mirrored, stays in its patch. As z does, x of the stack points against x of Radiance. A
-number is the mean of the BSDF over both patches by projected solid angle, so that its sum with that of the patches of
-light that leaves is the share of light which does; unscattered light is in the patch that it stays in.
+that collimated and specular light stays in its patch. As z does, x of the stack points against x of Radiance. A
+number is the mean of the BSDF over both patches by projected solid angle, so that its sum over outgoing patches is the
+hemispherical reflectance or transmittance; collimated light is in its own patch.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -20,13 +20,13 @@ from fits.exports.material import Material
 
 NAME = "LBNL/Klems Full"
 RINGS = ((0.0, 1), (5.0, 8), (15.0, 16), (25.0, 20), (35.0, 24), (45.0, 24), (55.0, 24), (65.0, 16), (75.0, 12))
-"""Where each begins, in degrees, and how many patches it has; the last ends at 90."""
+"""Polar angle, in degrees, at which each ring begins, and its number of patches; the last ends at 90."""
 
 POINTS_IN, POINTS_OUT = (2, 2), (4, 4)
-"""Of a patch, at which the BSDF is read: along its polar angle and its azimuth."""
+"""Points of a patch at which the BSDF is evaluated: along its polar angle and its azimuth."""
 
-POINTS_STRAIGHT = (32, 4)
-"""The same of unscattered light, which costs next to nothing."""
+POINTS_COLLIMATED = (32, 4)
+"""The same for collimated light, which costs next to nothing."""
 
 WAVELENGTHS = {1: ("Visible",), 3: ("CIE-X", "Visible", "CIE-Z")}
 DETECTORS = {"CIE-X": "ASTM E308 1931 X.dsp", "Visible": "ASTM E308 1931 Y.dsp", "CIE-Z": "ASTM E308 1931 Z.dsp"}
@@ -44,7 +44,7 @@ class Patches:
 
 
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
-    """The file: reflection of the front, and where light passes reflection of the back and both transmissions."""
+    """The file: reflection of the front, and unless the stack is opaque that of the back and both transmissions."""
     if material.channels not in WAVELENGTHS:
         raise ValueError(f"matrices of WINDOW are of one channel or three, this stack has {material.channels}")
     material.require_air_below()
@@ -61,15 +61,16 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
             rescaled.append(factor)
     notes = [
         f"{', '.join(blocks).lower()}; the front is the top of the stack, which Radiance calls the back",
-        f"145 by 145 patches; sums over what leaves are those of the stack, by factors up to {max(rescaled):.3f}",
-        *(["opaque: nothing of the back"] if material.opaque else []),
+        "145 by 145 patches; sums over outgoing patches are scaled to those of the stack, by factors up to "
+        f"{max(rescaled):.3f}",
+        *(["opaque: no data of the back"] if material.opaque else []),
         *(["red, green and blue written as XYZ, by a white of D65"] if material.channels == len(XYZ) else []),
     ]
     return Contents(_xml(material, blocks), tuple(notes))
 
 
 def patches(points: tuple[int, int]) -> Patches:
-    """The basis, with points in every patch that stand for equal parts of its projected solid angle."""
+    """The basis, with points in every patch for equal parts of its projected solid angle."""
     directions, projected = [], []
     ends = [*(start for start, _ in RINGS[1:]), 90.0]
     for (start, count), end in zip(RINGS, ends, strict=True):
@@ -84,29 +85,29 @@ def patches(points: tuple[int, int]) -> Patches:
 
 
 def _matrix(material: Material, stage: str, sign: float, through: bool) -> tuple[Floats, float]:
-    """Rows of light that leaves, columns of light that comes, (145, 145, C), and by how much sums were off at most.
+    """Rows of outgoing, columns of incident light, (145, 145, C), and the largest factor that sums are scaled by.
 
-    sign: of the side that the light comes from: 1 for the top.
+    sign: side of the incident light: 1 for the top.
     """
-    come, leave = patches(POINTS_IN), patches(POINTS_OUT)
-    count, inside, outside = len(come.projected), come.directions.shape[1], leave.directions.shape[1]
-    # light travels away from the side that it comes from: it comes from against that
-    wi = come.directions * np.array([1.0, -1.0, sign])
-    wo = leave.directions * np.array([-1.0, 1.0, -sign if through else sign])
+    incident, outgoing = patches(POINTS_IN), patches(POINTS_OUT)
+    count, inside, outside = len(incident.projected), incident.directions.shape[1], outgoing.directions.shape[1]
+    # wi points to where light comes from, against its direction of travel
+    wi = incident.directions * np.array([1.0, -1.0, sign])
+    wo = outgoing.directions * np.array([-1.0, 1.0, -sign if through else sign])
     matrix = np.empty((count, count, material.channels))
     for column in range(count):
         material.progress(stage, column, count)
         light, view = np.broadcast_arrays(wi[column][:, None], wo.reshape(1, -1, 3))
         values = material.values(light.reshape(-1, 3), view.reshape(-1, 3))
         matrix[:, column] = values.reshape(inside, count, outside, -1).mean(axis=(0, 2))
-    shares = material.shares(wi.reshape(-1, 3))[1 if through else 0].reshape(count, inside, -1).mean(axis=1)
-    sums = np.einsum("oic,o->ic", matrix, leave.projected)
-    factor = np.where(sums > 0, shares / np.where(sums > 0, sums, 1.0), 1.0)
+    albedo = material.albedos(wi.reshape(-1, 3))[1 if through else 0].reshape(count, inside, -1).mean(axis=1)
+    sums = np.einsum("oic,o->ic", matrix, outgoing.projected)
+    factor = np.where(sums > 0, albedo / np.where(sums > 0, sums, 1.0), 1.0)
     matrix *= factor
     if through:
-        fine = patches(POINTS_STRAIGHT).directions * np.array([1.0, -1.0, sign])
-        straight = material.unscattered(fine.reshape(-1, 3)).reshape(count, fine.shape[1], -1).mean(axis=1)
-        matrix[np.arange(count), np.arange(count)] += straight / come.projected[:, None]
+        fine = patches(POINTS_COLLIMATED).directions * np.array([1.0, -1.0, sign])
+        collimated = material.unscattered(fine.reshape(-1, 3)).reshape(count, fine.shape[1], -1).mean(axis=1)
+        matrix[np.arange(count), np.arange(count)] += collimated / incident.projected[:, None]
     return matrix, float(np.max(np.maximum(factor, 1.0 / np.maximum(factor, 1e-9)), initial=1.0, where=sums > 1e-6))
 
 

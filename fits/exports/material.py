@@ -1,4 +1,4 @@
-"""What files of materials are made of: the values of a stack at any directions, and where its peaks are."""
+"""The material of an export: BSDF values of a stack along any directions, its albedos, symmetries and lobe widths."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from fits.progress import Progress, silent
 from layerjax.mixture import stacks_of
 from layerjax.phase.contract import Flakes
 
-AT_ONCE = 1 << 16
-"""Pairs of directions that are evaluated together."""
+BATCH = 1 << 16
+"""Pairs of directions that are evaluated at a time."""
 
 VALUES = "values of the material"
-"""What progress calls their evaluation."""
+"""Stage of progress that evaluates them."""
 
 
 @dataclass(frozen=True)
 class Material:
     """A stack, or a mixture of several, prepared for its transport.
 
-    name: what it is called in a file. parts: the stacks. progress: what writers tell how far they are.
+    name: its name in the file. parts: the stacks. progress: called by writers.
     """
 
     name: str
@@ -34,25 +34,25 @@ class Material:
     progress: Progress = silent
 
     def values(self, wi: Floats, wo: Floats, stage: str = "") -> Floats:
-        """BSDF in 1/sr without the cosine, (N, C), at pairs of directions (N, 3). stage: told as it goes; "" not."""
-        found: list[Floats] = []
-        count = -(-len(wi) // AT_ONCE)
+        """BSDF in 1/sr without the cosine, (N, C), at pairs of directions (N, 3). stage: of progress, "" for none."""
+        values: list[Floats] = []
+        count = -(-len(wi) // BATCH)
         for one, other in zip(_batches(wi), _batches(wo), strict=True):
             if stage:
-                self.progress(stage, len(found), count)
-            found.append(np.asarray(lj.evaluate(self.prepared, one, other), float))
-        return np.concatenate(found)[: len(wi)]
+                self.progress(stage, len(values), count)
+            values.append(np.asarray(lj.evaluate(self.prepared, one, other), float))
+        return np.concatenate(values)[: len(wi)]
 
-    def shares(self, wi: Floats) -> tuple[Floats, Floats]:
-        """Of the light from directions (N, 3) what goes back, and what is scattered through, (N, C) each."""
+    def albedos(self, wi: Floats) -> tuple[Floats, Floats]:
+        """Hemispherical reflectance and scattered transmittance of light from directions (N, 3), (N, C) each."""
         reflected, transmitted = lj.albedo(self.prepared, wi)
         shape = (len(wi), self.channels)
         return np.broadcast_to(reflected, shape).astype(float), np.broadcast_to(transmitted, shape).astype(float)
 
     def unscattered(self, wi: Floats) -> Floats:
-        """Of the light from directions (N, 3) what passes straight, (N, C)."""
-        passed = np.asarray(lj.unscattered(self.stack, wi))
-        return np.broadcast_to(passed, (len(wi), self.channels)).astype(float)
+        """Collimated (unscattered) transmittance of light from directions (N, 3), (N, C)."""
+        transmitted = np.asarray(lj.unscattered(self.stack, wi))
+        return np.broadcast_to(transmitted, (len(wi), self.channels)).astype(float)
 
     def require_air_below(self) -> None:
         """ValueError for a stack that ends in another index than that of air."""
@@ -66,26 +66,26 @@ class Material:
 
     @property
     def opaque(self) -> bool:
-        """Whether no light passes."""
+        """Whether no light is transmitted."""
         return all(part.base is not None for part in self.parts)
 
     @property
     def widths(self) -> tuple[float, ...]:
-        """The roughness alpha of all that mirrors light about the normal, each once."""
-        found = {width for part in self.parts for width in _widths(part)}
-        return tuple(sorted(found))
+        """Roughness alpha of all surfaces and flakes about the normal, each once."""
+        widths = {width for part in self.parts for width in _widths(part)}
+        return tuple(sorted(widths))
 
     @property
     def isotropic(self) -> bool:
-        """Whether nothing changes if light and viewer turn about the normal."""
+        """Whether the BSDF is invariant to rotations about the normal."""
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
         return all(medium.phase.is_upright for medium in media)
 
     @property
     def turns_by_half(self) -> bool:
-        """Whether nothing changes by half a turn about the normal: every axis is the normal, or at a right angle to it.
+        """Whether the BSDF is invariant to half a turn about the normal: every axis is parallel or normal to it.
 
-        Only flakes and fibers are known to have such an axis.
+        Only flakes and fibers have a known axis.
         """
         media = [layer for part in self.parts for layer in part.layers if not isinstance(layer, lj.Interface)]
         return all(medium.phase.is_upright or _lies_flat(medium.phase.flakes) for medium in media)
@@ -97,7 +97,7 @@ def material_of(
     name: str = "stack",
     progress: Progress = silent,
 ) -> Material:
-    """Prepare a stack; ValueError for placeholders, a map, and a transport that is random or does not carry it."""
+    """Prepare a stack; ValueError for placeholders, a map, and a transport that is random or does not support it."""
     if isinstance(transport, lj.Transport) and transport.random:
         raise ValueError(f"transport: {type(transport).__name__} is random; use a deterministic one: AddingDoubling()")
     parts = tuple(stacks_of(stack))
@@ -107,7 +107,7 @@ def material_of(
 
 def _batches(w: Floats) -> Iterator[Floats]:
     """Batches of one length, the last filled up with its last direction: one program serves all."""
-    length = min(AT_ONCE, len(w))
+    length = min(BATCH, len(w))
     for start in range(0, len(w), length):
         batch = w[start : start + length]
         yield np.concatenate([batch, np.repeat(batch[-1:], length - len(batch), axis=0)])
@@ -128,4 +128,4 @@ def _lies_flat(flakes: Flakes | None) -> bool:
 
 
 def _number(value: object) -> float:
-    return float(np.min(np.asarray(value)))  # of channels that differ the narrowest
+    return float(np.min(np.asarray(value)))  # the narrowest of the channels

@@ -8,10 +8,10 @@ from fits.exports.contents import Contents, agreement
 from fits.exports.material import VALUES, Material
 
 LIFTED = np.sin(np.radians(0.5))
-"""Cosine of a direction that stands for those below the horizon, in bins that lie across it."""
+"""Cosine that directions below the horizon are raised to, in bins that extend across it."""
 
 WIDE = np.sin(np.radians(2.5))
-"""Bins whose centre lies further below the horizon than this reach above it nowhere."""
+"""Bins whose centre is further below the horizon than this do not extend above it."""
 
 UNMEASURED = -1.0
 SLABS = 10
@@ -39,12 +39,12 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     if material.channels == 1:
         notes.append("one channel, written as grey")
     if not material.opaque:
-        notes.append("what passes through is left out: the format has reflection alone")
+        notes.append("transmission is omitted: the format holds reflection only")
     return Contents(np.array(SHAPE, "<i4").tobytes() + table.astype("<f8").tobytes(), tuple(notes))
 
 
 def _lifted(w: Floats) -> Floats:
-    """Unit vectors that are nowhere nearer to the horizon."""
+    """Unit vectors raised to `LIFTED` where they are lower."""
     lifted = np.where(w[:, 2] < LIFTED, LIFTED, w[:, 2])
     length = np.sqrt((1.0 - lifted**2) / np.maximum(1.0 - w[:, 2] ** 2, 1e-12))
     return np.where((w[:, 2] < LIFTED)[:, None], np.stack([w[:, 0] * length, w[:, 1] * length, lifted], axis=-1), w)

@@ -1,10 +1,10 @@
 """A stack as an RGL tensor file (see `fits.data.formats.rgl_table`), which Mitsuba and pbrt read.
 
-What is tabulated is f cos(theta_o) 4 sigma / D, for a D of our own choice, whose lobes are those of what mirrors light
-in the stack, one as wide as can be, and some between: so the quotient is smooth and finite. Nodes stand at the same
+The table holds f cos(theta_o) 4 sigma / D, for a chosen D whose lobes are those of the surfaces and flakes of the
+stack, the widest one, and some between: so the quotient is smooth and finite. Nodes are at the same
 half vectors for every direction of the light, so that between these the table is linear in the quotient and nothing
 moves, and evenly around the normal in polar coordinates, in which the quotient is smooth there. Beyond the horizon it
-goes on with the opposite sign: f cos(theta_o) is linear where it passes through 0.
+has the opposite sign: f cos(theta_o) is linear where it passes through 0.
 """
 
 from dataclasses import dataclass, replace
@@ -19,14 +19,14 @@ from fits.exports.contents import Contents, agreement
 from fits.exports.material import VALUES, Material
 
 DARK = 1e-3
-"""Of the median light, what at least is drawn where there is none."""
+"""Least light that directions are sampled by, relative to its median."""
 
 WIDEST = 1.0
 CROWDED = 1.6
-"""By which power nodes crowd towards grazing."""
+"""Exponent by which nodes are denser towards grazing."""
 
 GRAZING = np.radians(89.9)
-"""Where the light stands for the last node, in place of 90 degrees."""
+"""Polar angle of the light for the last node, in place of 90 degrees."""
 
 
 @dataclass(frozen=True)
@@ -44,36 +44,36 @@ _FINE, _HALF = 1024, 256
 """Nodes over polar angles of `ndf` and `sigma`, and of `vndf`."""
 
 WIDER = 5.0
-"""How many times at most each lobe of D is as wide as that before it."""
+"""Largest ratio of the widths of neighbouring lobes of D."""
 
 
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
-    """The file: reflection above the surface; spectral, if it is told of wavelengths, else red, green and blue."""
+    """The file: reflection; spectral if wavelengths are given, otherwise red, green and blue."""
     if wavelengths is None and material.channels not in (1, len(RGB)):
         raise ValueError(
             f"an RGL file without wavelengths has red, green and blue, this stack has {material.channels} channels: "
             "give their wavelengths"
         )
-    made = table(material, wavelengths)
+    full = table(material, wavelengths)
     if wavelengths is None and material.channels == 1:
-        made = replace(made, values=np.repeat(made.values, len(RGB), axis=2))
-    sides = "isotropic" if made.isotropic else f"{len(made.phi_i)} azimuths of the light"
-    grid = made.values.shape[-1]
+        full = replace(full, values=np.repeat(full.values, len(RGB), axis=2))
+    sides = "isotropic" if full.isotropic else f"{len(full.phi_i)} azimuths of the light"
+    grid = full.values.shape[-1]
 
     def look_up_bsdf(wi: Floats, wo: Floats) -> Floats:
-        return look_up(made, wi, wo)[:, : material.channels] / wo[:, 2:]
+        return look_up(full, wi, wo)[:, : material.channels] / wo[:, 2:]
 
     notes = (
-        f"{sides}, {len(made.theta_i)} polar angles, grids of {grid} x {grid}, {plural(material.channels, 'channel')}",
+        f"{sides}, {len(full.theta_i)} polar angles, grids of {grid} x {grid}, {plural(material.channels, 'channel')}",
         agreement(material, look_up_bsdf),
-        *([] if material.opaque else ["what passes through is left out: the format has reflection alone"]),
-        *(["one channel, written as grey"] if made.values.shape[2] != material.channels else []),
+        *([] if material.opaque else ["transmission is omitted: the format holds reflection only"]),
+        *(["one channel, written as grey"] if full.values.shape[2] != material.channels else []),
     )
-    return Contents(table_as_bytes(made), notes)
+    return Contents(table_as_bytes(full), notes)
 
 
 def table(material: Material, wavelengths: Floats | None = None, resolution: Resolution | None = None) -> Table:
-    """What the file of a stack holds; above the surface alone.
+    """The table of a stack's reflection.
 
     wavelengths: (C,) nm, ascending, of its channels; None: red, green and blue, or one grey.
     """
@@ -107,7 +107,7 @@ def table(material: Material, wavelengths: Floats | None = None, resolution: Res
 
 
 def _lobes(widths: tuple[float, ...]) -> list[float]:
-    """Roughness of the lobes of D: those of the stack, as wide as can be, and some between that are far apart."""
+    """Roughness of the lobes of D: those of the stack, the widest, and some between where ratios are large."""
     lobes: list[float] = []
     for alpha, wider in pairwise((*(width for width in widths if width < WIDEST), WIDEST)):
         steps = int(np.ceil(np.log(wider / alpha) / np.log(WIDER)))
@@ -116,7 +116,7 @@ def _lobes(widths: tuple[float, ...]) -> list[float]:
 
 
 def crowding(theta: Floats, lobes: list[float]) -> Floats:
-    """How densely nodes stand along polar angles, up to a factor: half of them evenly, half around narrower lobes."""
+    """Density of nodes along polar angles, up to a factor: half of them even, half around narrower lobes."""
     narrow = [alpha / (alpha**2 + theta**2) for alpha in lobes[:-1]]
     return np.full_like(theta, 1.0) if not narrow else 1.0 + np.mean(narrow, axis=0)
 
@@ -128,13 +128,13 @@ def density(theta: Floats, alpha: float) -> Floats:
 
 
 def area(theta: Floats, alpha: float) -> Floats:
-    """Projected area of all facets of GGX that face a direction."""
+    """Projected area of visible facets of GGX."""
     cosine = np.cos(theta)
     return 0.5 * (cosine + np.sqrt(cosine**2 + alpha**2 * np.sin(theta) ** 2))
 
 
 def _filled(material: Material, empty: Table, lobes: list[float]) -> Table:
-    """The table with its values, and with a luminance by which light is drawn as it is scattered."""
+    """The table with its values, and a luminance that samples directions as light is scattered."""
     values = np.empty((len(empty.phi_i) * len(empty.theta_i), *empty.values.shape[2:]))
     luminance = np.empty((len(values), *values.shape[2:]))
     for place in range(len(values)):
@@ -151,7 +151,7 @@ def _filled(material: Material, empty: Table, lobes: list[float]) -> Table:
         bsdf = material.values(np.broadcast_to(wi, (facing.size, 3)), wo.reshape(-1, 3))
         scaled = bsdf * (cosine.ravel() / factor)[:, None]
         values[place] = np.moveaxis(scaled.reshape(*facing.shape, -1), -1, 0)
-        # so that half vectors drawn by it, and by the warp after it, lead where the light goes
+        # so that half vectors sampled by it, and by the warp, lead where the light is scattered
         light = np.maximum(scaled.mean(axis=1) * factor, 0.0).reshape(facing.shape)
         light = np.maximum(light, DARK * np.median(light) or 1.0) * np.maximum(facing, DARK)
         luminance[place] = light * np.sin(theta_m) / crowding(theta_m, lobes)

@@ -1,4 +1,4 @@
-"""A stack as slices in CSV, as a goniometer would read it without noise."""
+"""A stack as slices in CSV, as a goniometer would measure it without noise."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ AZIMUTH = (0.0, 45.0, 90.0, 135.0)
 
 
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
-    """The file: both sides, where light passes."""
+    """The file: reflection, and transmission unless the stack is opaque."""
     outgoing = OUTGOING if material.opaque else np.concatenate([OUTGOING, OUTGOING + 180.0])
     outgoing = np.where(outgoing > 180.0, outgoing - 360.0, outgoing)
     geometry = slices(INCIDENCE, outgoing, AZIMUTH)
@@ -22,4 +22,4 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     source = Source("", "simulated", "brdf", ("values of a stack, without noise",))
     names = channel_names(material.channels)
     data = Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), names, source)
-    return Contents(csv_text(data).encode(), (f"{len(values):,} readings, incidence from 0 to 80 degrees",))
+    return Contents(csv_text(data).encode(), (f"{len(values):,} data points, incidence from 0 to 80 degrees",))

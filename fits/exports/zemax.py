@@ -1,6 +1,6 @@
 """A stack as a tabular BSDF of Zemax (see `fits.data.formats.zemax`), which LightTools reads as well.
 
-Of a stack that lets light pass only what it reflects is written: a file holds one of the two.
+A file holds reflection or transmission: for a transparent stack the reflection is written.
 """
 
 from collections.abc import Iterator
@@ -22,12 +22,12 @@ BLOCKS = {1: ("Monochrome",), 3: ("TristimulusX", "TristimulusY", "TristimulusZ"
 
 
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
-    """The file: reflection above the surface, one channel or XYZ, and the total of each incidence."""
+    """The file: reflection above the surface, one channel or XYZ, and the total scatter of each incidence."""
     if material.channels not in BLOCKS:
         raise ValueError(f"a Zemax file has one channel or three, this stack has {material.channels}")
-    upright = material.isotropic
-    rotation = np.zeros(1) if upright else ROTATION
-    azimuth = AZIMUTH if upright else np.concatenate([AZIMUTH, AZIMUTH[1:-1] + 180.0])
+    isotropic = material.isotropic
+    rotation = np.zeros(1) if isotropic else ROTATION
+    azimuth = AZIMUTH if isotropic else np.concatenate([AZIMUTH, AZIMUTH[1:-1] + 180.0])
     radial = np.concatenate([FINE, COARSE])
     theta_i, phi_i = np.meshgrid(INCIDENCE, LIGHT_AZIMUTH - rotation)
     wi = direction(theta_i, phi_i)
@@ -35,13 +35,13 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     above = wo[..., 2] > 0
     values = np.zeros((*above.shape, material.channels))
     values[above] = material.values(np.broadcast_to(wi[:, :, None, None], wo.shape)[above], wo[above], VALUES)
-    total = material.shares(wi.reshape(-1, 3))[0].reshape(*theta_i.shape, material.channels)
+    total = material.albedos(wi.reshape(-1, 3))[0].reshape(*theta_i.shape, material.channels)
     if material.channels == len(XYZ):
         values, total = values @ XYZ.T, total @ XYZ.T
     lines = [
         f"# {material.name}",
         "Source\tMeasured",
-        f"Symmetry\t{'PlaneSymmetrical' if upright else 'ASymmetrical4D'}",
+        f"Symmetry\t{'PlaneSymmetrical' if isotropic else 'ASymmetrical4D'}",
         f"SpectralContent\t{'Monochrome' if material.channels == 1 else 'XYZ'}",
         "ScatterType\tBRDF",
         *_angles("SampleRotation", rotation),
@@ -56,7 +56,7 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
         f"{above.sum():,} values above the horizon, {len(INCIDENCE)} incidences from 0 to 85 degrees, every "
         f"{AZIMUTH[1]:g} degrees around the mirror direction",
         *(["red, green and blue written as XYZ, by a white of D65"] if material.channels == len(XYZ) else []),
-        *([] if material.opaque else ["what passes through is left out"]),
+        *([] if material.opaque else ["transmission is omitted"]),
     ]
     return Contents(("\n".join(lines) + "\n").encode(), tuple(notes))
 
@@ -66,7 +66,7 @@ def _angles(keyword: str, angles: Floats) -> list[str]:
 
 
 def _block(values: Floats, total: Floats) -> Iterator[str]:
-    for of_rotation, totals in zip(values, total, strict=True):
-        for of_incidence, share in zip(of_rotation, totals, strict=True):
+    for rotation, totals in zip(values, total, strict=True):
+        for incidence, share in zip(rotation, totals, strict=True):
             yield f"TIS\t{share:.6f}"
-            yield from ("\t".join(f"{value:.6e}" for value in row) for row in of_incidence)
+            yield from ("\t".join(f"{value:.6e}" for value in row) for row in incidence)

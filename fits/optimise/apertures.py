@@ -20,10 +20,10 @@ ENOUGH_OF_PEAK = 1e-3
 """Numerical error of measurements, in units of the largest, that no fit needs to fall below."""
 
 NO_BETTER = 0.3
-"""Of an error: a ring more that leaves as much of it is not worth its rays; of a lobe it leaves a fifth or less."""
+"""Share of an error: a ring more that leaves as much of it costs more than it gains; of a lobe it leaves a fifth."""
 
 FAR_RINGS = 2
-"""Of a cone, at most, where starts are fitted."""
+"""The most rings of a cone where starts are fitted."""
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def with_rings(problem: Problem, rings: int) -> Problem:
 
 
 def for_starts(problem: Problem) -> Problem:
-    """The problem with the rings that its start values ask for, if it leaves them open."""
+    """The problem with the rings that its start values ask for, if it gives none."""
     if not leaves_open(problem):
         return problem
     return with_rings(problem, min(_of_lobes(problem, problem.start), FAR_RINGS))
@@ -76,13 +76,13 @@ def needed(
     rings, values = rings_of(problem), predicted
     most = most_rings(problem.instrument.source_aperture, problem.instrument.detector_aperture)
     sigma, peak = spread(problem, vector, predicted), np.max(np.abs(predicted))
-    asked = min(_of_lobes(problem, vector), most)
-    if is_open and asked > rings:
-        rings = asked
+    wanted = min(_of_lobes(problem, vector), most)
+    if is_open and wanted > rings:
+        rings = wanted
         values = np.asarray(with_rings(problem, rings).predict(vector), float)
     before = np.inf
     while True:
-        other = with_rings(problem, max(rings, asked)).with_other_rays()
+        other = with_rings(problem, max(rings, wanted)).with_other_rays()
         apart = np.abs(values - np.asarray(other.predict(vector), float))
         error = float(np.max(apart / sigma))
         progress("numerical error", rings, None, f"{error:.2g} sigma at {in_words(rings)}")

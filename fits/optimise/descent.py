@@ -56,7 +56,7 @@ def descend(model: Model, start: Array, fresh: Array, most_steps: Array, toleran
     varying = likelihood and bool(model.logarithmic)
     solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
     options = {
-        "watch": lambda beside: beside[1],
+        "watch": lambda auxiliary: auxiliary[1],
         "damping": damping,
         **({"tolerance": tolerance} if likelihood else {}),
     }

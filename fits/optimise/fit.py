@@ -73,7 +73,7 @@ def fit(
     Args:
         stack: holds `Free` where a number is to be fitted; or a `Joint` of problems, in which all else is said.
         data: only the samples that its mask leaves in are used.
-        transport: see `Problem`. A resolution that it leaves open is chosen: coarse for the starts, at the end so fine
+        transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
             that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
             within reach. `Fit.problem` has it.
         noise, scale, objective, instrument: see `Problem`.
@@ -91,10 +91,10 @@ def fit(
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
     if isinstance(stack, Joint):
-        beside: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
-        beside |= {"transport": None if transport == "auto" else transport}
-        beside |= {"objective": None if objective == "likelihood" else objective}
-        for name, given in beside.items():
+        arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
+        arguments |= {"transport": None if transport == "auto" else transport}
+        arguments |= {"objective": None if objective == "likelihood" else objective}
+        for name, given in arguments.items():
             if given is not None:
                 raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
         problem: FittingProblem = stack
@@ -278,10 +278,11 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
     counts: list[int] = []
     outcomes = dict.fromkeys(OUTCOMES, 0)
     for index in sorted(range(len(ends)), key=lambda k: (cost[k], k != best)):
-        place = next((place for place, leader in enumerate(leaders) if are_one(index, leader)), len(leaders))
         if not np.isfinite(cost[index]) and index != best:
             outcomes["failed"] += 1
-        elif place < len(leaders) or index == best or ends[index].converged:
+            continue
+        place = next((place for place, leader in enumerate(leaders) if are_one(index, leader)), len(leaders))
+        if place < len(leaders) or index == best or ends[index].converged:
             if place == len(leaders):
                 leaders.append(index)
                 counts.append(0)
@@ -304,7 +305,7 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
 def _status(fit: Fit) -> list[str]:
     total, reached = sum(fit.start_outcomes.values()), fit.start_outcomes["best minimum"]
     words = [
-        f"converged; {reached} of {total} starts converged to this minimum"
+        f"converged; {reached} of {total} starts converged to the best minimum"
         if fit.converged
         else f"not converged: the lowest of {total} starts did not; these are the best values seen"
     ]
@@ -320,7 +321,9 @@ def _status(fit: Fit) -> list[str]:
     if fit.unidentified:
         words.append(f"{len(fit.unidentified)} direction(s) in the space of parameters are not identified")
     if fit.alternatives:
-        words.append(f"the errors are of this minimum alone, and {len(fit.alternatives)} more fit equally well")
+        words.append(
+            f"errors are conditional on this local minimum; {len(fit.alternatives)} more local minima fit equally well"
+        )
     if fit.is_posterior and any(problem.noise_is_assumed for problem in fit.problem.problems.values()):
         words.append(f"a noise of {100.0 * DEFAULT_RELATIVE:g} % of the model's value was assumed, none is stated")
     if not fit.is_posterior:

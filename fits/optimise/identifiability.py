@@ -42,7 +42,7 @@ class Direction:
         return abs(self.weights[name]) * self.error if name in self.weights else 0.0
 
     def renamed(self, names: Mapping[str, str]) -> "Direction":
-        """Of those of its members that have names elsewhere, under these."""
+        """The same direction with those of its members that have other names, under these."""
         weights, errors = (
             {names[name]: value for name, value in part.items() if name in names}
             for part in (self.weights, self.conditional_errors)

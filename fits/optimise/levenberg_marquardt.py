@@ -37,7 +37,7 @@ class _State(eqx.Module):
     full_decrease: Array
     damping: Array
     growth: Array
-    beside: Any
+    auxiliary: Any
     watched: Any
     terminate: Array
     failed: Array
@@ -66,7 +66,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def init(self, fn: Any, y: Array, args: Any, options: Any, f_struct: Any, aux_struct: Any, tags: Any) -> _State:
         """State before the first evaluation."""
         zero = jnp.zeros((), y.dtype)
-        beside = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
+        auxiliary = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
         watched = jax.tree.map(lambda leaf: jnp.zeros((y.size, *leaf.shape), leaf.dtype), _watch(options)(aux_struct))
         return _State(
             steps=jnp.zeros((), int),
@@ -78,7 +78,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             full_decrease=zero + jnp.inf,
             damping=zero + options.get("damping", FIRST_DAMPING),
             growth=zero + FIRST_GROWTH,
-            beside=beside,
+            auxiliary=auxiliary,
             watched=watched,
             terminate=jnp.array(False),
             failed=jnp.array(False),
@@ -87,7 +87,7 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
     def step(self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any) -> tuple[Array, _State, Any]:
         """Evaluate the trial, accept or refuse it, and propose the next one."""
         first = state.steps == 0
-        cost, gradient, normal, beside, watched = _normal_equations(fn, state.trial, args, options)
+        cost, gradient, normal, auxiliary, watched = _normal_equations(fn, state.trial, args, options)
         finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(normal))
         ratio = (state.cost - cost) / jnp.where(state.predicted > 0, state.predicted, 1.0)
         accept = finite & (first | (ratio > SMALLEST_RATIO))
@@ -104,8 +104,8 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             jnp.where(accept, new, old)
             for new, old in ((cost, state.cost), (gradient, state.gradient), (normal, state.normal))
         )
-        beside, watched = jax.tree.map(
-            lambda new, old: jnp.where(accept, new, old), (beside, watched), (state.beside, state.watched)
+        auxiliary, watched = jax.tree.map(
+            lambda new, old: jnp.where(accept, new, old), (auxiliary, watched), (state.auxiliary, state.watched)
         )
         trial, predicted, full_decrease = _projected_step(y, gradient, normal, damping, least)
 
@@ -124,12 +124,12 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
             full_decrease=full_decrease,
             damping=damping,
             growth=growth,
-            beside=beside,
+            auxiliary=auxiliary,
             watched=watched,
             terminate=converged | lost | hopeless,
             failed=hopeless & ~converged,
         )
-        return y, new_state, beside
+        return y, new_state, auxiliary
 
     def terminate(
         self, fn: Any, y: Array, args: Any, options: Any, state: _State, tags: Any
@@ -145,12 +145,12 @@ class BoxLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         self, fn: Any, y: Array, aux: Any, args: Any, options: Any, state: _State, tags: Any, result: Any
     ) -> tuple[Array, Any, dict[str, Any]]:
         """The solution, and what is known there."""
-        return y, state.beside, {"cost": state.cost, "gradient": state.gradient, "watched": state.watched}
+        return y, state.auxiliary, {"cost": state.cost, "gradient": state.gradient, "watched": state.watched}
 
 
 def _watch(options: Any) -> Callable[[Any], Any]:
-    """What picks the part of the auxiliary output whose Jacobian is kept: nothing, unless it is asked for."""
-    return options.get("watch", lambda beside: None)
+    """What picks the part of the auxiliary output whose Jacobian is kept: nothing by default."""
+    return options.get("watch", lambda auxiliary: None)
 
 
 def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array, Array, Array, Any, Any]:
@@ -159,10 +159,10 @@ def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array
     logarithmic, watch = options.get("logarithmic", ()), _watch(options)
 
     def push(tangent: Array) -> tuple[Any, Any, Any, Any]:
-        (residuals, beside), (tangents, moved) = jax.jvp(lambda z: fn(z, args), (y,), (tangent,))
-        return residuals, beside, tangents, watch(moved)
+        (residuals, auxiliary), (tangents, moved) = jax.jvp(lambda z: fn(z, args), (y,), (tangent,))
+        return residuals, auxiliary, tangents, watch(moved)
 
-    residuals, beside, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
+    residuals, auxiliary, columns, watched = jax.vmap(push, out_axes=(None, None, 0, 0))(jnp.eye(y.size, dtype=y.dtype))
     cost, gradient, normal = jnp.zeros((), y.dtype), jnp.zeros_like(y), jnp.zeros((y.size, y.size), y.dtype)
     for index, (residual, column) in enumerate(zip(jax.tree.leaves(residuals), jax.tree.leaves(columns), strict=True)):
         flat, rows = residual.reshape(-1), column.reshape(y.size, -1)
@@ -171,7 +171,7 @@ def _normal_equations(fn: Any, y: Array, args: Any, options: Any) -> tuple[Array
         if index in logarithmic:  # half the square of r is a logarithm L, whose derivative is r dr
             rows = rows * flat
         normal += rows @ rows.T
-    return cost, gradient, normal, beside, watched
+    return cost, gradient, normal, auxiliary, watched
 
 
 def _projected_step(

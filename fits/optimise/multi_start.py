@@ -1,7 +1,7 @@
 """The starts of a fit: where they begin, and where each of them ends.
 
-A start that reaches the maximum of steps goes on for as long as that is worth something: the number of steps says
-nothing about how good its end is.
+A start that reaches the maximum of steps is continued while it gains something: the number of steps says nothing
+about how good its outcome is.
 """
 
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -29,13 +29,13 @@ Floats = NDArray[np.float64]
 MOST_STEPS = 200
 MOST_ROUNDS = 20
 EARLY, FRONT = 20, 3
-"""Steps, with sigma held and with it free, after which starts of a race are looked at, and how many of them go on."""
+"""Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
 LEAST_GAIN = 1e-3
-"""A start that reached the maximum of steps goes on while a round of them gains this in the log-posterior."""
+"""A start that reached the maximum of steps is continued while a round of them gains this in the log-posterior."""
 LEAST_STEP_GAIN = 1e-5
 """The check by L-BFGS-B ends where a step of it gains less than this in the log-posterior."""
 LEAST_RELATIVE_GAIN = 1e-6
-"""With a named objective such a start goes on while a round gains this share of the cost."""
+"""The same for a named objective, as a share of the cost."""
 
 
 class StartOutcome(NamedTuple):
@@ -138,15 +138,15 @@ def least_squares_descent(
         found = descent(problem, point, fresh, MOST_STEPS, tolerance)
         steps += int(found.steps)
         end = StartOutcome(found.vector, float(found.cost), steps, bool(found.converged), bool(found.max_steps_reached))
-        worth = LEAST_GAIN if problem.objective == "likelihood" else LEAST_RELATIVE_GAIN * end.cost
-        if not end.max_steps_reached or not before - end.cost > worth:
+        least_gain = LEAST_GAIN if problem.objective == "likelihood" else LEAST_RELATIVE_GAIN * end.cost
+        if not end.max_steps_reached or not before - end.cost > least_gain:
             break
         point, fresh = unit_of(problem, end.vector), False
     return end
 
 
 def rough_descent(problem: FittingProblem, point: Floats, fresh: bool = True) -> StartOutcome:
-    """As `least_squares_descent`, so near a minimum that it can be told from others."""
+    """As `least_squares_descent`, so near a minimum that it is distinguished from others."""
     return least_squares_descent(problem, point, fresh, ROUGH_TOLERANCE)
 
 

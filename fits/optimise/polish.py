@@ -1,4 +1,4 @@
-"""The lowest of the ends of all starts, and what is known there."""
+"""The best outcome of all starts, followed to its very minimum, with its uncertainties."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 
 
 class Optimum(NamedTuple):
-    """The ends of all starts, the place of the lowest among them, and what is known there.
+    """The outcomes of all starts, the place of the lowest among them, and what is known there.
 
     improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
     differences in cost count in, see `FitOptions`.
@@ -53,7 +53,7 @@ def polish(
     """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
 
     check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
-    minimum that was checked goes without. promise: how far it is followed, see `descend`.
+    minimum that was checked goes without. tolerance: how far it is followed, see `descend`.
     """
     best = int(np.argmin([end.cost for end in ends]))
     lowest, improved = ends[best], False
@@ -87,7 +87,7 @@ def _closer(problem: FittingProblem, end: StartOutcome, tolerance: float) -> Sta
 def _leave_plateau(
     problem: FittingProblem, end: StartOutcome, found: Uncertainty, tolerance: float
 ) -> tuple[StartOutcome, bool]:
-    """The end, or where it goes on to if what has no influence there, or is at a bound, begins anew; and whether it is.
+    """The outcome, or a lower one from where insensitive parameters and those at a bound begin anew; and whether it is.
 
     No step leads off a plateau: every start may end on one though another minimum is far lower.
     """

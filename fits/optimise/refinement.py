@@ -1,4 +1,4 @@
-"""From the ends of starts at a coarse resolution to the optimum at the one that the noise of the data asks for.
+"""Refinement: from the outcomes of starts at a coarse resolution to the optimum at the one that the noise needs.
 
 Programs of a finer resolution take seconds to compile: which one is needed is found out by values alone, and only the
 minima that may be the best or as good as it are fitted again.

@@ -1,6 +1,6 @@
 """How finely the transport of a fit solves the stack: as finely as the noise of the data asks for.
 
-A resolution that is left open is that of the start values where starts run, but no finer than is worth having far away
+A resolution that is left open is that of the start values where starts run, but no finer than is useful far away
 from the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise.
 One that is given is compared with a finer one, and stays.
 """
@@ -40,7 +40,7 @@ class Resolutions:
     """The resolutions that a transport may take for a problem.
 
     Attributes:
-        given: the transport, with what it leaves open.
+        given: the transport, with what it does not state.
         chosen: the same with nothing left open, for the start values.
         tilted: whether the stack is solved by ordinates, not by nodes and modes, as is decided while tracing.
     """
@@ -63,7 +63,7 @@ class Resolutions:
     def finer(self, transport: lj.AddingDoubling) -> lj.AddingDoubling | None:
         """The transport at the next finer resolution; None beyond the finest that is chosen."""
         finer = self._as_given(transport.finer())
-        if self.open and not self.tilted:  # what is as fine as it gets stays, the other goes on
+        if self.open and not self.tilted:  # what is as fine as it gets stays, the other is refined
             nodes, modes = transport.nodes or 0, transport.modes or 0
             finer = replace(
                 transport,
@@ -138,7 +138,7 @@ def _chosen(stack: Any, transport: Any, directions: Any) -> lj.Transport:
 
 
 def at_start(problem: Problem) -> Problem:
-    """The problem with the resolution that its start values ask for, if it leaves one open."""
+    """The problem with the resolution that its start values ask for, if none is given."""
     known = resolutions(problem)
     return replace(problem, transport=known.chosen) if known is not None and known.open else problem
 

@@ -57,14 +57,14 @@ class Fit:
     Attributes:
         problem: what was fitted to what.
         vector: (P,), best values in the problem's order, in physical units.
-        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data leave it open; those of
-            the others hold with the parameters in `at_bound` kept there.
+        errors: (P,), standard errors, NaN for a parameter at a bound, infinite where the data do not identify it; those
+            of the others hold with the parameters in `at_bound` kept there.
         covariance: (P, P), of the parameters.
         cost: half the sum of squared residuals.
         at_bound: names of the parameters that ended on a bound.
         converged: whether the best start did.
         status: how the fit ended, in words.
-        iterations: steps of the solver to this minimum.
+        iterations: steps of the solver to the best minimum.
         condition_number: of the information about the parameters, each scaled to unit length.
         unidentified: the directions in the space of parameters that the data alone do not identify, worst first.
         minima: the minima that starts reached, best first.
@@ -116,7 +116,7 @@ class Fit:
         return f"<Fit to {self.problem.count} measurements: {values}; {self.status}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reports.notebook:fit_fragment", self))
+        return str(shown_by("fits.reports.html:fit_fragment", self))
 
     def part(self, name: str = "") -> "Fit":
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.

@@ -65,9 +65,11 @@ def uncertainty(problem: FittingProblem, vector: Floats, cost: float) -> Uncerta
     scatter = 1.0  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         scatter = max(2.0 * cost / max(problem.count - count, 1), np.finfo(float).tiny)
-    data_root, pull = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
+    data_root, least_gradient = data_root / np.sqrt(scatter), LEAST_GRADIENT * scatter
     idle = insensitive(data_root, problem.names)
-    at_bound = ((unit <= ON_BOUND) & (gradient > pull)) | ((unit >= 1 - ON_BOUND) & (gradient < -pull))
+    at_bound = ((unit <= ON_BOUND) & (gradient > least_gradient)) | (
+        (unit >= 1 - ON_BOUND) & (gradient < -least_gradient)
+    )
     at_bound &= ~np.isin(problem.names, idle)
     free = np.flatnonzero(~at_bound)
     width = np.asarray(box.slope(jnp.asarray(vector)), float)

@@ -64,7 +64,7 @@ class Comparison:
     options: ComparisonOptions
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reports.notebook:comparison_fragment", self))
+        return str(shown_by("fits.reports.html:comparison_fragment", self))
 
 
 def compare(

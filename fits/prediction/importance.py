@@ -51,7 +51,7 @@ class ImportanceDraws:
 
     @property
     def effective_sample_size(self) -> float:
-        """How many independent draws of the posterior are as informative."""
+        """Effective sample size of the weighted draws."""
         total = logsumexp(self.log_weights)
         return float(np.exp(-logsumexp(2.0 * (self.log_weights - total)))) if np.isfinite(total) else 0.0
 

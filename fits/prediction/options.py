@@ -1,4 +1,4 @@
-"""What decides the verdicts of a comparison of models."""
+"""Thresholds of the verdicts of a model comparison."""
 
 from dataclasses import dataclass, fields
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_RINGS = 8
-"""Of a cone."""
+"""The most rings of a cone."""
 
 MOST_PAIRS = 1500
 """Of rays that stand for a measurement: more rings are not taken for two cones."""
@@ -24,7 +24,7 @@ PER_RING, AT_NONE = 0.41, 0.16
 """Radius of a disc in widths of a lobe that n rings resolve: the first times n, less the second."""
 
 BOTH_WIDE = 1.2
-"""By how much radii of two cones count more than that of one."""
+"""Factor by which radii of two cones count more than that of one."""
 
 Floats = NDArray[np.float64]
 Counts = tuple[int, int, int]
@@ -44,7 +44,7 @@ def resolved_radius(rings: int) -> float:
 
 
 def both_wide(source: float, detector: float) -> float:
-    """By how much the radius of the two cones together counts more than if there were one."""
+    """The factor by which the radius of two cones together counts more than that of one."""
     return BOTH_WIDE if source > 0.0 and detector > 0.0 else 1.0
 
 
@@ -140,7 +140,7 @@ def _turns(first: int, second: int) -> tuple[int, int]:
 
 
 def _radii(rings: int) -> tuple[Floats, Floats]:
-    """Of rings on the unit disc, and their shares of it; a single direction is its middle."""
+    """Radii of rings on the unit disc, and their shares of it; a single direction is its middle."""
     if not rings:
         return np.zeros(1), np.ones(1)
     x, weights = np.polynomial.legendre.leggauss(rings)

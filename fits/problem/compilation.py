@@ -94,7 +94,7 @@ def make_room() -> None:
 def devices_of_cores() -> None:
     """Make each core a device of JAX, over which layerjax splits large batches; before the first computation.
 
-    Left as it is where that is too late, or the user has asked for devices.
+    Left as it is where that is too late, or the user has set devices.
     """
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return

@@ -24,14 +24,14 @@ class Totalling(eqx.Module):
     Attributes:
         transport: a layerjax transport, or "auto".
         kinds: of the N measurements.
-        asked: rows with different lights, which are solved for.
+        solved_rows: those with different lights, which are solved for.
         light: the place among these of each measurement's.
         spheres: that read them; None: shares of the sample alone.
     """
 
     transport: Any = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
-    asked: tuple[int, ...] = eqx.field(static=True)
+    solved_rows: tuple[int, ...] = eqx.field(static=True)
     light: tuple[int, ...] = eqx.field(static=True)
     spheres: Spheres | None = eqx.field(static=True)
 
@@ -40,12 +40,14 @@ class Totalling(eqx.Module):
         """The totals of these measurements, by a transport that is no function of the user's own."""
         if not isinstance(transport, lj.Transport) and transport != "auto":
             raise ValueError(f"transport is {transport!r}; totals take a layerjax transport, or 'auto'")
-        _, asked, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)
-        return cls(transport, totals.kinds, tuple(asked.tolist()), tuple(np.ravel(light).tolist()), totals.spheres)
+        _, solved_rows, light = np.unique(totals.wi, axis=0, return_index=True, return_inverse=True)
+        return cls(
+            transport, totals.kinds, tuple(solved_rows.tolist()), tuple(np.ravel(light).tolist()), totals.spheres
+        )
 
     def __call__(self, stack: lj.Stack | lj.Mixture, wi: Array, wo: Array) -> Array:
         require_single(stack, "inference")
-        lights = jnp.asarray(wi)[np.array(self.asked)]
+        lights = jnp.asarray(wi)[np.array(self.solved_rows)]
         sides: dict[Kind, Array] = {}
         if not {"reflectance", "transmittance"}.isdisjoint(self.kinds):
             near, far = self._sides(stack, lights)
@@ -64,7 +66,7 @@ class Totalling(eqx.Module):
         share = jnp.asarray(2.0 * cosine * weight)
         above, below = slice(-2 * DIFFUSE, -DIFFUSE), slice(-DIFFUSE, None)
         mean = [jnp.tensordot(share, part[side], 1) for part in (near, far) for side in (above, below)]
-        count = len(self.asked)
+        count = len(self.solved_rows)
         return self.spheres.measured(Shares(near[:count], far[:count], *mean))
 
 
@@ -77,10 +79,10 @@ def _unscattered(stack: lj.Stack | lj.Mixture, lights: Array, transport: Any) ->
     """What leaves on the other side of stacks whose media only absorb: interfaces may turn it, media do not."""
     if isinstance(stack, lj.Mixture):
         return stack.mean(lambda part, _: _unscattered(part, lights, transport))
-    straight = lj.unscattered(stack, lights)
+    unscattered = lj.unscattered(stack, lights)
     if stack.base is not None or not any(isinstance(layer, lj.Interface) for layer in stack.layers):
-        return straight
+        return unscattered
     absorbing = [
         lj.Medium(layer.thickness, 0.0) if isinstance(layer, lj.Medium) else layer for layer in simplify(stack).layers
     ]
-    return straight + lj.albedo(lj.Stack(absorbing), lights, transport)[1]
+    return unscattered + lj.albedo(lj.Stack(absorbing), lights, transport)[1]

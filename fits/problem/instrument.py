@@ -100,7 +100,7 @@ class Optics(eqx.Module):
     incidence: Array | None
     known: KnownDirections | None
 
-    def seen(self, values: Any, setting: Setting, count: int) -> Array:
+    def measured(self, values: Any, setting: Setting, count: int) -> Array:
         """Measurements (N, C), where values(wi, wo, known) is the BSDF (K, C)."""
         wi, wo = self.wi, self.wo
         if self.forward is not None:
@@ -154,7 +154,9 @@ def optics_of(
         and (spread := spread_over_lobes(*widths, stack, wi, wo, tilt, instrument.rings)).matters.any()
     ):
         pairs, row, share = _cones(instrument, wi, wo, spread, other)
-        forward = None if forward is None else forward[row]  # a sample leans one way, whichever ray of a cone it meets
+        forward = (
+            None if forward is None else forward[row]
+        )  # the sample is tilted one way, whichever ray of a cone it meets
     return Optics(
         wi=jnp.asarray(pairs[0]),
         wo=jnp.asarray(pairs[1]),
@@ -248,7 +250,7 @@ def _forward(wi: Floats) -> Floats:
 
 
 def _tilted(w: Any, forward: Any, offset: Any) -> Array:
-    """Directions (K, 3) as a sample sees them whose normal leans forward by so many degrees."""
+    """Directions (K, 3) in the frame of a sample whose normal is tilted forward by so many degrees."""
     angle = jnp.radians(offset)
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     along = jnp.sum(w[:, :2] * forward, axis=-1)

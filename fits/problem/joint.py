@@ -44,7 +44,7 @@ class JointModel(Density):
 
     @property
     def objective(self) -> Objective:
-        """Data sets are weighed against each other by their noise alone."""
+        """Data sets are weighed against each other by their noise."""
         return "likelihood"
 
     @property
@@ -276,7 +276,7 @@ class Joint(FittingProblem):
 
 
 def _begins(name: str, with_: str) -> bool:
-    """Whether a parameter's name is this, or begins with it and goes on."""
+    """Whether a parameter's name is this, or that of a part of it."""
     return name == with_ or name.startswith((f"{with_}.", f"{with_}["))
 
 

@@ -17,10 +17,10 @@ SHIFT = 1e-3
 """Relative difference between a mean over a cone and its middle that does not count."""
 
 STEEPEST = np.radians(85.0)
-"""Of a half vector."""
+"""The steepest angle of a half vector."""
 
 LEAST = 1e-6
-"""Of the squared sum of two directions."""
+"""The least squared sum of two directions."""
 
 SOONER = 0.6
 """Share of the distance from the peak that counts for how steep a lobe is beside its own value."""
@@ -64,7 +64,7 @@ def spread_over_lobes(
     radii = np.radians(0.5 * source), np.radians(0.5 * detector)
     most = np.inf if rings is None else resolved_radius(rings) / both_wide(source, detector)
     if not isinstance(stack, lj.Stack | lj.Mixture):
-        # nothing is known of it: one ring, or what was asked for
+        # nothing is known of it: one ring, or what was given
         return _spread(seen, np.full(len(wi), resolved_radius(rings or 1) / both_wide(source, detector)), radii)
     facets, others = _narrowest(stack)
     half = wi + wo
@@ -82,7 +82,7 @@ def spread_over_lobes(
 
 
 def _spread(matters: NDArray[np.bool_], both: Floats, radii: tuple[float, float]) -> Spread:
-    """Of cones that are so wide together, (N,), in widths of the lobe, and have these radii."""
+    """Rays of cones that are so wide together, (N,), in widths of the lobe, and have these radii."""
     whole = max(float(np.hypot(*radii)), np.finfo(float).tiny)
     both = np.maximum(both, LEAST)  # where cosines alone matter there are cones nonetheless
     return Spread(matters, both * radii[0] / whole, both * radii[1] / whole)
@@ -107,5 +107,5 @@ def _least(alpha: Any) -> float:
 
 
 def _at(phase: lj.PhaseFunction, end: int) -> lj.PhaseFunction:
-    """With free parameters at their lower (1) or upper (2) bounds."""
+    """A stack with free parameters at their lower (1) or upper (2) bounds."""
     return jax.tree.map(lambda leaf: leaf.arrays()[end] if is_free(leaf) else leaf, phase, is_leaf=is_free)

@@ -227,7 +227,7 @@ class Model(Density):
         if self.optics is None:
             found = parts.scale * values(self.wi, self.wo, self.known)
         else:
-            found = parts.scale * self.optics.seen(values, cast(Setting, parts.instrument), len(self.wi))
+            found = parts.scale * self.optics.measured(values, cast(Setting, parts.instrument), len(self.wi))
         return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
     def sigma_at(self, vector: Array, predicted: Array) -> Array:

@@ -47,7 +47,7 @@ class Noise:
     Gaussian tails. False: none. None leaves it to the residuals: a stack is fitted without; where residuals of
     neighbours along a scan are correlated by more than 0.2 and 3 standard errors, it is fitted again with it, and the
     fit keeps both (`Fit.without_discrepancy`). A `Problem` by itself has none then.
-    Left out, `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
+    By default `relative` is 0 if the measurement's sigma is used or `floor` is given, else 0.05; with relative noise
     `floor` becomes 1e-4 of the median |value|, without it 0. Relative noise refers to the model, not to the datum,
     because weights taken from noisy data bias the fit downwards by twice the relative variance.
     """
@@ -174,7 +174,7 @@ class Levels(NamedTuple):
         return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
 
     def softness(self, values: Floats) -> Floats:
-        """Of the logarithms of measurements (N, C), see `fits.problem.discrepancy.logarithm`."""
+        """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy.logarithm`."""
         return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
 
     def gram(self, process: Process, values: Floats) -> Array | None:
@@ -192,7 +192,7 @@ def is_assumed(noise: Noise, used: Measurements) -> bool:
 
 
 def noise_levels(noise: Noise, used: Measurements) -> Levels:
-    """The levels that `Noise` leaves out, filled in as it says."""
+    """The levels of noise, with the defaults that `Noise` states."""
     sigma = used.sigma if noise.use_sigma else None
     relative, floor = noise.relative, noise.floor
     if relative is None:

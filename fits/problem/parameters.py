@@ -32,7 +32,7 @@ from fits.problem.values import shown
 class Free:
     """A number to be fitted: a placeholder that may stand anywhere in a stack where a number may stand.
 
-    `start`, `low`, `high` are numbers or one per channel (then a prior holds for each channel alike); the unit is that
+    `start`, `low`, `high` are numbers or one per channel (then a prior holds for each channel); the unit is that
     of the number it stands for. Requires low < high, start in [low, high], and low > 0 for `LogNormal` and
     `LogUniform`. A `Normal` must have its mean within 37 standard deviations of the bounds, and a standard deviation
     above 1e-15 of the distance from the mean to either bound, so that its density can be computed (`LogNormal`: the

@@ -173,7 +173,7 @@ class Problem(FittingProblem):
             of a BSDF in 1/sr).
         transport: a layerjax transport that is not random, "auto" (see `layerjax.prepare`), or any callable
             (stack, wi, wo) -> values, of unit directions (N, 3) and a BSDF (N, C) in 1/sr; the stack may then be any
-            pytree. A resolution that it leaves open is what is known while tracing asks for, and for a fit see `fit`.
+            pytree. A resolution that is not given is what is known while tracing asks for, and for a fit see `fit`.
         noise: how a datum scatters about the model.
         scale: a unitless factor common to all values: a number above 0, `Free`, or None for 1.
         objective: "likelihood", or a named residual: "cosine_l2", "log1p_cos" or "cube_root".
@@ -270,7 +270,7 @@ UNITS = {
     "noise.discrepancy.length_difference": "deg",
     **{"thickness": "optical depth", "thickness_mm": "mm", "mu_s": "1/mm", "mu_a": "1/mm"},
 }
-"""Of parameters by their names, or by what these end with; all others are plain ratios."""
+"""Units of parameters by their names, or by what these end with; all others are plain ratios."""
 
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
 """How names begin of what stands in each place of `Parts`."""
@@ -379,7 +379,7 @@ def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, 
         raise ValueError(f"noise.{fitted[0]} is free, but objective {objective!r} has no noise model")
     weighted = [entry.prior for entry in free if isinstance(entry.prior, Normal | LogNormal)]
     if weighted:
-        raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; leave it out")
+        raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; omit it")
     smooth = [entry.random_walk_sd for entry in free if entry.random_walk_sd is not None]
     if smooth:
         raise ValueError(f"Free.random_walk_sd is {shown(smooth[0])}, but has no weight beside objective {objective!r}")
@@ -438,7 +438,8 @@ def with_floor(noise: Noise, instrument: Instrument | None) -> Noise:
 
 
 def polar_angles(data: Measurements) -> Floats:
-    """Of the light, (K,), those of the used samples, in degrees; within `SAME_ANGLE` they are one, at all azimuths."""
+    """Polar angles of the light, (K,), of the used samples, in degrees; within `SAME_ANGLE` they are one, at all
+    azimuths."""
     theta = data.used().theta_i
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
@@ -468,7 +469,7 @@ def _require_same_channels(model: Model, start: Floats, used: Measurements) -> N
 
 
 def unit(name: str) -> str:
-    """Of a parameter of this name; "1" for plain ratios."""
+    """The unit of a parameter of this name; "1" for plain ratios."""
     known = UNITS.get(name)
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
     return known or UNITS.get(whole.rpartition(".")[2], "1")

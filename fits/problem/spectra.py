@@ -24,7 +24,7 @@ class PowerLaw(Shown):
 
     amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of
     reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; the geometric mean of
-    the wavelengths if left out.
+    the wavelengths by default.
 
     Raises:
         ValueError: nothing is free, a number a channel, fewer than two wavelengths, or one that is not above 0.

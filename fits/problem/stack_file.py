@@ -1,6 +1,6 @@
 """Stacks and fitting problems as TOML: a table for each layer and the base, and a table where a number is free.
 
-    transport = "SingleScattering"             # optional, "auto" if left out; { kind = "AddingDoubling", nodes = 16 }
+    transport = "SingleScattering"             # optional, "auto" by default; { kind = "AddingDoubling", nodes = 16 }
     objective = "likelihood"                   # optional
     about = { source = "..." }                 # optional: a table of texts that are kept and not looked at
     gallery = "fabric"                         # optional: a material by name, in place of layers and base
@@ -16,7 +16,7 @@
     albedo = [0.1, 0.2, 0.3]                   # one number, or one a channel
 
     [mixture.bare]                             # in place of layers and base: parts, each with layers and a base, a name
-    weight = 0.3                               # of the gallery, or a mixture; left out in one, which covers the rest
+    weight = 0.3                               # of the gallery, or a mixture; omitted in one, which covers the rest
 
     [noise]                                    # optional: relative, floor, use_sigma, tails, degrees_of_freedom,
                                                # discrepancy: true, or a table of its amplitude and lengths
@@ -123,7 +123,7 @@ def write_problem(
     instrument: Instrument | None = None,
     force: bool = False,
 ) -> None:
-    """Write a TOML file that `read_problem` reads back to the same. What is left out of the call is left out there.
+    """Write a TOML file that `read_problem` reads back to the same. What the call omits is omitted there.
 
     Args:
         path: the file.

@@ -175,7 +175,7 @@ def _value(where: str, value: Any, hint: Any, name: str) -> Any:
     if get_origin(hint) is Literal:
         return choice(where, value, get_args(hint))
     alternatives = [kind for kind in get_args(hint) if kind is not NoneType]
-    if isinstance(hint, UnionType) and len(alternatives) == 1:  # an option that may be left out
+    if isinstance(hint, UnionType) and len(alternatives) == 1:  # an optional value
         (hint,) = alternatives
     if hint is bool:
         return truth(where, value)
@@ -254,9 +254,9 @@ def instrument_from_dict(table: Any) -> Instrument:
         raise ValueError(str(error).replace("Instrument.", "instrument.")) from None
 
 
-def changed_to_dict(of: Noise | Instrument) -> dict[str, Any]:
+def changed_to_dict(thing: Noise | Instrument) -> dict[str, Any]:
     """What is not as it is by default, of plain numbers, strings, lists and dictionaries."""
-    every = {entry.name: (getattr(of, entry.name), entry.default) for entry in fields(of)}
+    every = {entry.name: (getattr(thing, entry.name), entry.default) for entry in fields(thing)}
     return {name: to_plain(value) for name, (value, default) in every.items() if value != default}
 
 
@@ -285,7 +285,7 @@ def transport_to_dict(transport: lj.Transport | Literal["auto"]) -> str | dict[s
 
 
 def _module_to_dict(module: Any) -> dict[str, Any]:
-    """The table of a layer, base, phase function, transport or prior; what is None is left out."""
+    """The table of a layer, base, phase function, transport or prior; what is None is omitted."""
     names = inspect.signature(type(module)).parameters
     entries = {_key(name): to_plain(getattr(module, name)) for name in names if getattr(module, name) is not None}
     return {"kind": type(module).__name__, **entries}

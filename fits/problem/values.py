@@ -57,7 +57,7 @@ def _with_fewer_digits(number: re.Match[str]) -> str:
 
 
 class _Shown(reprlib.Repr):
-    """Python's notation, with the middle left out where it is long."""
+    """Python's notation, with the middle omitted where it is long."""
 
     def __init__(self) -> None:
         super().__init__()

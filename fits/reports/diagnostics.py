@@ -1,8 +1,8 @@
-"""What structure the residuals of a fit have left along the angles of its measurements.
+"""The structure of the residuals of a fit along the angles of its measurements.
 
 White residuals are what the error bars assume, where a model discrepancy is fitted once they are whitened by its
-covariance. Here is the evidence: per incidence their mean and size, and over all of them the correlation of neighbours
-in angle (lag one), which a wrong model or a smooth instrument error leaves behind.
+covariance. The evidence is, per incidence, their mean and size, and over all of them the correlation of neighbours in
+angle (lag one), which a wrong model or a smooth instrument error leaves behind.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class ResidualGroup:
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What the standardised residuals of a fit look like, over the rows and channels that were fitted."""
+    """Summary of the standardised residuals of a fit, over the rows and channels that were fitted."""
 
     count: int
     mean: float
@@ -49,7 +49,7 @@ class ResidualStructure:
 
     @property
     def independent_share(self) -> float:
-        """Independent readings per reading, (1 - r) / (1 + r) for neighbours correlated by r; 1 where r <= 0."""
+        """Effective number of residuals over their number, (1 - r) / (1 + r) for a lag-one correlation r; at most 1."""
         if not self.lag_one > 0.0:
             return 1.0
         return (1.0 - self.lag_one) / (1.0 + self.lag_one)
@@ -78,7 +78,7 @@ def residual_label(fit: "Fit") -> str:
 
 
 def bsdf(fit: "Fit") -> np.ndarray:
-    """What the fit says of the BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
+    """Predicted BSDF at every row, with the model discrepancy, (N, C), in 1/sr; NaN in unused rows."""
     from fits.prediction.predict import with_discrepancy
 
     used = fit.problem.data.used()
@@ -86,12 +86,12 @@ def bsdf(fit: "Fit") -> np.ndarray:
 
 
 def misfit(fit: "Fit") -> np.ndarray:
-    """What every reading is off the `bsdf` by, in units of the noise, (N, C); NaN in rows that were not used.
+    """Measurements less `bsdf`, in units of the noise, (N, C); NaN in rows that were not used.
 
-    With a model discrepancy these are smaller than the noise, since it follows the readings: `standardised` are not.
+    With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
     """
-    left = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
-    return over_all_rows(fit, left / _unit(fit))
+    independent = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+    return over_all_rows(fit, independent / _unit(fit))
 
 
 def misfit_label(fit: "Fit") -> str:

@@ -1,13 +1,17 @@
-"""A fit as a directory: written whole or not at all, and opened again as the same fit.
+"""A fit as a result directory: written whole or not at all, and opened again as the same fit.
 
-data.csv       the measurements that were fitted, with the rows that were left out marked
+data.csv       the measurements, with a mask of those that were fitted
+held_out.csv   the held-out data, if any
 problem.toml   the stack with its free parameters, noise and scale, as given
 fitted.toml    the same stack with the fitted values
 fit.json       every number of the fit, its settings, and the versions that made it; checksums of it and of these files
 chain.h5       the posterior's chain, once sampled, and summary.json with its estimates
-report.html    all of it to read, and its pictures as *.png
+report.html    the report, and its pictures as *.png
 """
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from importlib import metadata
 from pathlib import Path
@@ -15,32 +19,34 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import read_json, require_there, text_checksum, write_json, write_text
+from fits._files import locked, read_json, require_there, text_checksum, write_json, write_text
 from fits.data.formats import read, totals_csv
 from fits.data.formats.csv import write_csv
-from fits.data.measurements import Measurements
-from fits.data.spheres import Spheres
+from fits.data.measurements import Measurements, Source
+from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import Totals
-from fits.reports.directories import FIT, replacing, reserved
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
+    from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 
-SCHEMA = 3
-REPORT, SUMMARY = "report.html", "summary.json"
+SCHEMA = 4
+FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.h5"
-_STORED = (
-    "vector",
-    "errors",
-    "covariance",
-    "cost",
-    "at_bound",
+_NUMBERS = ("vector", "errors", "covariance", "cost", "condition_number")
+_PLAIN = (
     "converged",
     "status",
     "iterations",
-    "condition_number",
+    "at_bound",
+    "insensitive",
+    "dataset",
+    "settings",
+    "start_outcomes",
+    "resolution",
 )
+"""Fields of a fit that are stored as they are: numbers, which may be infinite, and all else."""
 _DERIVED = (
     "scale",
     "chi_square",
@@ -90,7 +96,12 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
     scale = problem.scale if isinstance(problem.scale, Free) else None
-    spheres = _write_data(problem.data, folder / DATA)
+    spheres = None
+    if isinstance(problem.data, Totals):
+        totals_csv.write(problem.data.used(), folder / DATA)
+        spheres = problem.data.spheres  # which the file cannot hold
+    else:
+        write_csv(problem.data, folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
@@ -107,50 +118,31 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
-        "settings": fit.settings,
-        "start_outcomes": fit.start_outcomes,
         "transport": transport_to_dict(transport),
-        "resolution": fit.resolution,
-        "numerical_error": fit.numerical_error,
-        "without_discrepancy": None if fit.without_discrepancy is None else asdict(fit.without_discrepancy),
-        "dataset": fit.dataset,
         "source": asdict(problem.data.source),
         "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
-        "parameters": _parameters(fit),
-        "fit": {name: getattr(fit, name) for name in _STORED},
-        "insensitive": fit.insensitive,
-        "unidentified": [asdict(combination) for combination in fit.unidentified],
+        "parameters": [
+            {
+                "name": name,
+                "value": value,
+                "standard_error": fit.standard_errors[name],
+                "unit": fit.units[name],
+                "low": float(problem.low[index]),
+                "high": float(problem.high[index]),
+                "at_bound": name in fit.at_bound,
+            }
+            for index, (name, value) in enumerate(fit.values.items())
+        ],
+        "fit": {name: getattr(fit, name) for name in (*_NUMBERS, *_PLAIN, "numerical_error")},
+        "without_discrepancy": None if fit.without_discrepancy is None else asdict(fit.without_discrepancy),
+        "unidentified": [asdict(direction) for direction in fit.unidentified],
         "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
         "alternatives": [list(map(id, fit.minima)).index(id(one)) for one in fit.alternatives],
         "derived": {name: getattr(fit, name) for name in _DERIVED},
         "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
     write_json(folder / FIT, content)
-
-
-def _write_data(data: Measurements, path: Path) -> Spheres | None:
-    """What was fitted; and spheres that its file does not tell of."""
-    if isinstance(data, Totals):
-        totals_csv.write(data.used(), path)
-        return data.spheres
-    write_csv(data, path)
-    return None
-
-
-def _parameters(fit: "Fit") -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "value": value,
-            "standard_error": fit.standard_errors[name],
-            "unit": fit.units[name],
-            "low": float(fit.problem.low[index]),
-            "high": float(fit.problem.high[index]),
-            "at_bound": name in fit.at_bound,
-        }
-        for index, (name, value) in enumerate(fit.values.items())
-    ]
 
 
 def load_fit(directory: str | Path) -> "Fit":
@@ -160,64 +152,75 @@ def load_fit(directory: str | Path) -> "Fit":
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
     from fits.optimise.identifiability import Direction
-    from fits.optimise.result import Fit, Minimum
-    from fits.problem.stack_file import read_problem
-    from fits.reports.stored import (
-        stored_array,
-        stored_number,
-        stored_problem,
-        stored_spheres,
-        stored_without_discrepancy,
-    )
+    from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
 
     directory = Path(directory)
     content = _content(directory)
-    given, data = read_problem(directory / PROBLEM), read(directory / DATA)
     try:
-        if isinstance(data, Totals):
-            data = replace(data, spheres=stored_spheres(content["spheres"]))
-        problem = stored_problem(content, given, data)
-        stored, count, error = content["fit"], len(problem.names), content["numerical_error"]
+        problem = _problem(directory, content)
+        stored, count, found = content["fit"], len(problem.names), content["without_discrepancy"]
+        shapes: dict[str, Any] = {"vector": count, "errors": count, "covariance": (count, count)}
+        numbers: dict[str, Any] = {name: float(stored[name]) for name in ("cost", "condition_number")}
+        numbers |= {name: np.array(stored[name], float).reshape(shape) for name, shape in shapes.items()}
+        plain: dict[str, Any] = {name: tuple(x) if isinstance(x := stored[name], list) else x for name in _PLAIN}
         minima = tuple(
-            Minimum(
-                values, stored_number(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack
-            )
+            Minimum(values, float(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack)
             for one in content["minima"]
-            for values in ({name: stored_number(value) for name, value in one["values"].items()},)
+            for values in (_numbers(one["values"]),)
         )
+        without: Any = None if found is None else WithoutDiscrepancy(**{key: _numbers(found[key]) for key in found})
         return Fit(
             problem=problem,
-            vector=stored_array(stored["vector"], count),
-            errors=stored_array(stored["errors"], count),
-            covariance=stored_array(stored["covariance"], count, count),
-            cost=stored_number(stored["cost"]),
-            at_bound=tuple(stored["at_bound"]),
-            converged=stored["converged"],
-            status=stored["status"],
-            iterations=stored["iterations"],
-            condition_number=stored_number(stored["condition_number"]),
+            **numbers,
+            **plain,
+            numerical_error=None if stored["numerical_error"] is None else float(stored["numerical_error"]),
             unidentified=tuple(
-                Direction(
-                    stored_number(one["error"]),
-                    one["weights"],
-                    {name: stored_number(e) for name, e in one["conditional_errors"].items()},
-                )
+                Direction(float(one["error"]), one["weights"], _numbers(one["conditional_errors"]))
                 for one in content["unidentified"]
             ),
             minima=minima,
             alternatives=tuple(minima[index] for index in content["alternatives"]),
-            insensitive=tuple(content["insensitive"]),
-            dataset=content["dataset"],
-            settings=content["settings"],
-            start_outcomes=content["start_outcomes"],
-            numerical_error=None if error is None else stored_number(error),
-            resolution=content["resolution"],
-            without_discrepancy=stored_without_discrepancy(content["without_discrepancy"]),
+            without_discrepancy=without,
         )
     except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
     except ValueError as error:
+        if str(error).startswith(str(directory)):
+            raise
         raise ValueError(f"{directory / FIT}: {error}") from None
+
+
+def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
+    """The fitting problem: the stack file and the data, with what the fit chose beside them."""
+    from fits.problem.problem import Problem
+    from fits.problem.stack_file import read_problem
+    from fits.problem.toml import transport_from_dict
+
+    given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
+    source = Source(**content["source"] | {"notes": tuple(content["source"]["notes"])})
+    if isinstance(data, Totals):
+        if spheres is not None:
+            both = ("reflection", "transmission")
+            spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
+        data = replace(data, spheres=None if spheres is None else Spheres(**spheres))
+    transport = transport_from_dict(content["transport"])  # with the resolution that the fit chose
+    noise = given.noise if content["without_discrepancy"] is None else replace(given.noise, discrepancy=True)
+    scale = given.scale if given.scale is not None else content["fixed_scale"]
+    data = replace(data, source=source)
+    return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
+
+
+def _numbers(value: Any) -> Any:
+    """Numbers, by name or by itself; one that is not finite is stored as a word."""
+    if isinstance(value, dict):
+        return {name: _numbers(one) for name, one in value.items()}
+    return value if isinstance(value, int) else float(value)
+
+
+def load_held_out(directory: str | Path) -> Measurements | None:
+    """The held-out data of a result directory; None if there are none."""
+    path = Path(directory) / HELD_OUT
+    return read(path, format="csv") if path.is_file() else None
 
 
 def load_posterior(directory: str | Path) -> "Posterior | None":
@@ -284,7 +287,7 @@ def versions() -> dict[str, str]:
 
 
 def _content(directory: Path) -> dict[str, Any]:
-    """What fit.json holds, if it and the files that it has checksums of are as they were written."""
+    """What fit.json holds, if it and the files with checksums in it are as they were written."""
     require_there(directory, "no such directory")
     if not (directory / FIT).is_file():
         raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
@@ -292,8 +295,76 @@ def _content(directory: Path) -> dict[str, Any]:
     version = content.get("layerjax_result")
     if version != SCHEMA:
         raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
-    for name, checksum in content.get("checksums", {}).items():  # layerjax 0.1.0 wrote none
+    for name in (DATA, PROBLEM):
         path = directory / name
-        if path.is_file() and text_checksum(path) != checksum:
+        require_there(path)
+        if text_checksum(path) != content.get("checksums", {}).get(name):
             raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
     return content
+
+
+def check_directory(directory: Path, force: bool) -> None:
+    """Refuses a place where a result cannot be written, or is being sampled: ValueError that says why."""
+    if not directory.resolve().parent.is_dir():
+        raise ValueError(f"{directory}: there is no directory {directory.resolve().parent}")
+    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+        return
+    if not (directory / FIT).is_file():
+        raise ValueError(f"{directory}: exists and is not a result directory (it holds no {FIT}), will not be replaced")
+    if not force:
+        raise ValueError(f"{directory}: holds a result already (--force, or force=True, replaces it)")
+    if (directory / LOCK).exists():
+        with locked(directory / LOCK, str(directory)):
+            pass
+
+
+@contextmanager
+def reserved(directory: str | Path, force: bool = False) -> Iterator[None]:
+    """While the block lasts, no other process writes this result: a ValueError where one does, or as `replacing`."""
+    directory = Path(directory)
+    check_directory(directory, force)
+    target = directory.resolve()
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
+        new, old = _beside(target)  # as a killed process left them
+        if old.exists() and not target.exists():
+            old.rename(target)
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+        yield
+
+
+def _beside(target: Path) -> tuple[Path, Path]:
+    return target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
+
+
+@contextmanager
+def replacing(directory: str | Path, force: bool = False) -> Iterator[Path]:
+    """A new folder beside `directory` that takes its place when the block ends well, and is removed when it does not.
+
+    The directory must be `reserved`. Raises ValueError for one that is not empty, unless `force` is given and it is an
+    earlier result.
+    """
+    directory = Path(directory)
+    check_directory(directory, force)
+    target = directory.resolve()
+    folder, old = _beside(target)
+    try:
+        folder.mkdir()
+        yield folder
+        check_directory(directory, force)  # someone else may have written there in the meantime
+        if not target.exists():
+            folder.rename(target)
+            return
+        with locked(target / LOCK, str(directory)):
+            target.rename(old)
+            try:
+                folder.rename(target)
+            except OSError:
+                old.rename(target)
+                raise
+        shutil.rmtree(old)
+    except BaseException as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
+            error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+        raise

@@ -1,264 +1,608 @@
-"""What a fit is worth, in plain sentences: how well the model explains the data, what the data cannot tell, how sure
-the minimum is. The report prints them; the thresholds are stated in the sentences or here."""
+"""What a report says of a fit: every statement with the condition under which it is made, in one list.
+
+`assess` collects the facts of a fit, and statements depend on these alone. Each says what it claims of the errors, the
+residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
+statements of a report contradict each other. With a model discrepancy, statements on residuals are about those whitened
+by the fitted covariance.
+"""
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from fits.data.checks import repeats
+from fits.data.totals import Totals
 from fits.optimise.identifiability import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
-from fits.optimise.options import DEFAULT
-from fits.optimise.result import OUTCOMES
-from fits.reports.agreement import (
-    MISFIT_SIGMAS,
-    agreement,
-    describes,
-    discrepancy,
-    excess,
-    misdescribed,
-    noise_notes,
-    without_discrepancy,
-)
-from fits.reports.diagnostics import ResidualStructure
-from fits.reports.modes import errors_of_one, modes
-from fits.sampling.convergence import MIXED
+from fits.optimise.options import FitOptions
+from fits.problem.model import Density
+from fits.problem.noise import DEFAULT_RELATIVE
+from fits.problem.parameters import is_free
+from fits.reports.diagnostics import ResidualStructure, residual_structure, standardised
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 
-STRONG = 0.95  # correlation from which two parameters are said to trade against each other
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Thresholds that decide what a report says."""
+
+    significance: float = 3.0
+    """Standard errors from which a chi-square, or a correlation of residuals, is not chance."""
+
+    misfit: float = 1.5
+    """Median misfit, in standard deviations of the stated noise, above which a significant misfit means that the stack
+    does not describe the sample; that of the true stack is 0.67."""
+
+    factor: float = 1.5
+    """Ratio of model and data from which a misfit is quoted as a factor instead of in percent."""
+
+    correlated: float = 0.95
+    """Absolute correlation from which the table of parameters names the partner of a parameter."""
+
+    prior_dominated: float = 0.3
+    """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
+
+    r_hat: float = 1.01
+    """R-hat above which the shares of the modes of a posterior are called uncertain."""
+
+    peak_points: int = 3
+    """Measurements above half the height of a peak from which its width is called sampled."""
 
 
-def identifiability(fit: "Fit") -> dict[str, str]:
-    """For each parameter, in a few words, whether the data determines it; directions count from 1, worst first.
+DEFAULT = ReportOptions()
 
-    What counts is a parameter's own error along the directions that the data leave open, in units of its prior range: a
-    parameter with a small share in a badly known direction may be well known itself.
+
+@dataclass(frozen=True)
+class Assessment:
+    """The facts of a fit that decide what is said of it.
+
+    Attributes:
+        structure: of the residuals in units of the noise, whitened by the covariance with a model discrepancy.
+        ratio, freedom: chi-square per degree of freedom, and their number.
+        excess: chi-square above its expectation, in its own standard deviations.
+        likelihood: whether the objective is one.
+        noise_assumed: whether no noise was stated.
+        described: whether the stack without discrepancy is as near to the data as noise and options allow.
+        misfit: factors within which half and 95 % of the data are of that stack; None if no value is above zero.
+        noise: median of the stated noise as a share of the value; NaN if none is above zero.
+        discrepancy: fitted parameters of the model discrepancy, and the share of the residual sum of squares that it
+            absorbs; None without one.
+        limits: roughnesses that the instrument limits, and the least that it resolves.
+        limited: other parameters that these limit, with the roughness and the shift in standard errors.
+        words: of each parameter, what the data say of it.
+        numerical_error: of the model, in standard deviations of the data; None where there is no resolution.
+        numerical_limit: of it, see `FitOptions`.
+    """
+
+    options: ReportOptions
+    structure: ResidualStructure
+    count: int
+    objective: str
+    ratio: float
+    freedom: int
+    excess: float
+    converged: bool
+    likelihood: bool
+    noise_assumed: bool
+    described: bool
+    misfit: tuple[float, float] | None
+    noise: float
+    discrepancy: tuple[Any, float] | None
+    unidentified: tuple[Direction, ...]
+    insensitive: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    limits: Mapping[str, float]
+    limited: Mapping[str, tuple[str, float]]
+    words: Mapping[str, str]
+    alternatives: int
+    numerical_error: float | None
+    numerical_limit: float
+
+    @property
+    def size(self) -> float:
+        """Root mean square of the residuals over its expectation, where that is not chance; else 1."""
+        return math.sqrt(self.ratio) if self.large or self.small else 1.0
+
+    @property
+    def independent_share(self) -> float:
+        """Independent residuals a residual, where neighbours are correlated and that is not chance; else 1."""
+        significant = self.structure.lag_one_sigma > self.options.significance
+        return self.structure.independent_share if significant else 1.0
+
+    @property
+    def large(self) -> bool:
+        """Whether the residuals are significantly larger than expected."""
+        return self.excess > self.options.significance
+
+    @property
+    def small(self) -> bool:
+        """Whether the residuals are significantly smaller than expected."""
+        return self.excess < -self.options.significance
+
+    @property
+    def correlated(self) -> bool:
+        """Whether neighbouring residuals are significantly correlated."""
+        return self.independent_share < 1.0
+
+    @property
+    def error_factor(self) -> float:
+        """By what the standard errors are too small, for size and correlation of the residuals together."""
+        return self.size / math.sqrt(self.independent_share)
+
+    @property
+    def identified(self) -> bool:
+        """Whether the data identify every parameter of stack and scale; those of the noise are nuisance parameters."""
+        return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical(self.words).values())
+
+    def physical(self, words: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of parameters by name that are not of the noise."""
+        return {name: word for name, word in words.items() if not name.startswith("noise.")}
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the numerical error of the model is small beside that of the data."""
+        return self.numerical_error is None or self.numerical_error <= self.numerical_limit
+
+
+def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
+    """The facts of a fit."""
+    used, likelihood = fit.problem.data.used(), fit.is_posterior
+    positive = used.values > 0.0
+    described, noise, discrepancy = True, math.nan, None
+    if likelihood:
+        offsets = np.abs(np.asarray(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted), float))
+        significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > options.significance
+        described = not (significant and float(np.median(offsets)) > options.misfit)
+        if positive.any():
+            sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, used.values))
+            noise = float(np.median(sigma[positive] / used.values[positive]))
+    fitted = fit.problem.build(fit.vector).correlation
+    if likelihood and fitted is not None:
+        remaining = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+        whole = float(np.sum(offsets**2))
+        discrepancy = fitted, 1.0 - float(np.sum(remaining**2)) / whole if whole > 0.0 else 0.0
+    return Assessment(
+        options=options,
+        structure=residual_structure(fit.problem.data, standardised(fit)),
+        count=used.values.size,
+        objective=fit.problem.objective,
+        ratio=fit.reduced_chi_square,
+        freedom=fit.degrees_of_freedom,
+        excess=excess(fit.chi_square, fit.degrees_of_freedom),
+        converged=fit.converged,
+        likelihood=likelihood,
+        noise_assumed=likelihood and fit.problem.noise_is_assumed,
+        described=described,
+        misfit=_misfit(fit.predicted[positive], used.values[positive]) if positive.any() else None,
+        noise=noise,
+        discrepancy=discrepancy,
+        unidentified=fit.unidentified,
+        insensitive=fit.insensitive,
+        at_bound=fit.at_bound,
+        limits=instrument_limits(fit),
+        limited=limited_with(fit),
+        words=identifiability(fit, options),
+        alternatives=len(fit.alternatives),
+        numerical_error=fit.numerical_error,
+        numerical_limit=float(fit.settings.get("numerical_error", FitOptions().numerical_error)),
+    )
+
+
+def excess(square: float, freedom: int) -> float:
+    """Chi-square above its expectation, in its own standard deviations."""
+    return (square / freedom - 1.0) / math.sqrt(2.0 / freedom) if freedom > 0 else math.nan
+
+
+def _misfit(predicted: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    """Within which factor of the model half, and 95 %, of positive values are; infinite where the model is 0."""
+    with np.errstate(divide="ignore", over="ignore"):
+        ratio = np.where(predicted > 0.0, predicted / values, 0.0)
+        ordered = np.sort(np.maximum(ratio, 1.0 / ratio))  # no interpolation: it would make NaN of two infinite ones
+    half, most = (float(ordered[min(int(share * len(ordered)), len(ordered) - 1)]) for share in (0.5, 0.95))
+    return half, most
+
+
+IDENTIFIED, CORRELATED = "identified", "correlated with"
+
+
+def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, str]:
+    """What the data say of each parameter, in a few words; directions count from 1, worst first.
+
+    What counts is a parameter's own error along the unidentified directions, in units of its prior range: a parameter
+    with a small share in an unidentified direction may be well known itself.
     """
     names, correlation = list(fit.values), np.array(fit.correlation, dtype=float)
     np.fill_diagonal(correlation, 0.0)
     limits, limited = instrument_limits(fit), limited_with(fit)
     words = {}
     for index, name in enumerate(names):
-        width = float(fit.problem.high[index] - fit.problem.low[index])
-        error = fit.standard_errors[name]
+        width, error = float(fit.problem.high[index] - fit.problem.low[index]), fit.standard_errors[name]
         partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
+        along = [direction.error_of(name) for direction in fit.unidentified]
         if name in fit.insensitive:
-            words[name] = "NO INFLUENCE on the data"
+            words[name] = "insensitive: no effect on the data"
         elif name in limits:
-            words[name] = f"LIMITED by the instrument: alpha below {limits[name]:.2g}"
+            words[name] = f"limited by the instrument: alpha below {limits[name]:.2g}"
         elif name in fit.at_bound:
-            words[name] = "AT BOUND"
+            words[name] = "at a bound"
         elif name in limited:
-            words[name] = f"LIMITED by the instrument: moves with {limited[name][0]}"
-        elif math.hypot(*(own := [one.error_of(name) for one in fit.unidentified])) > UNIDENTIFIED_BEYOND:
-            kind = "unconstrained by the data" if math.hypot(*own) > UNCONSTRAINED_BEYOND else "weakly constrained"
-            words[name] = f"{kind}: see direction {int(np.argmax(own)) + 1}"
+            words[name] = f"limited by the instrument: correlated with {limited[name][0]}"
+        elif math.hypot(*along) > UNIDENTIFIED_BEYOND:
+            kind = "unidentified" if math.hypot(*along) > UNCONSTRAINED_BEYOND else "weakly identified"
+            words[name] = f"{kind}: see direction {int(np.argmax(along)) + 1}"
         elif not math.isfinite(error):
-            words[name] = "not determined"
-        elif error > 0.3 * width:
-            words[name] = "weakly constrained: error near the width of the bounds"
-        elif abs(correlation[index, partner]) >= STRONG:
-            words[name] = f"trades with {names[partner]} {correlation[index, partner]:+.2f}"
+            words[name] = "unidentified"
+        elif error > options.prior_dominated * width:
+            words[name] = "prior-dominated: error near the width of the bounds"
+        elif abs(correlation[index, partner]) >= options.correlated:
+            words[name] = f"{CORRELATED} {names[partner]} {correlation[index, partner]:+.2f}"
         else:
-            words[name] = "yes"
+            words[name] = IDENTIFIED
     return words
 
 
-def in_short(fit: "Fit", structure: ResidualStructure) -> tuple[list[str], bool]:
-    """The verdict in a few sentences, and whether it is without reservation."""
-    sentences = [] if fit.converged else ["The fit did not converge: these are the best values seen, not a minimum."]
-    close, undescribed, notes = agreement(fit), misdescribed(fit), noise_notes(fit.problem)
-    if not fit.is_posterior:
-        sentences.append("Fitted with a named residual, not a likelihood: the errors are only indicative.")
-    elif excess(fit.chi_square, fit.degrees_of_freedom) > MISFIT_SIGMAS:
-        sentences.append(
-            f"The model does not explain the data to within its noise (chi-square per degree of freedom "
-            f"{fit.reduced_chi_square:.3g}): the quoted errors are too small."
-        )
-    elif structure.lag_one_sigma > MISFIT_SIGMAS and not fit.problem.noise.discrepancy:
-        sentences.append(
-            "The residuals are of the expected size, but neighbours are correlated: the quoted errors are too small."
-        )
-    sentences += discrepancy(fit)
-    if fit.numerical_error is not None and not fit.numerical_error <= DEFAULT.numerical_error:
-        sentences.append(f"The numerical error of the model is {numerical_error(fit)}: a finer resolution may differ.")
-    for name, least in instrument_limits(fit).items():
-        sentences.append(f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved.")
-    for name, (roughness, errors) in limited_with(fit).items():
-        sentences.append(
-            f"{name} is limited by the instrument with {roughness}: up to that width it moves by {errors:.2g} of its "
-            "standard errors."
-        )
-    if fit.at_bound:
-        sentences.append(f"At a bound: {', '.join(fit.at_bound)}.")
-    if fit.insensitive:
-        sentences.append(f"Without influence on the data: {', '.join(fit.insensitive)}.")
-    for combination in fit.unidentified[:1]:
-        sentences.append(f"{_not_separated(combination)}{' (and more)' if len(fit.unidentified) > 1 else ''}.")
-    if not undescribed:
-        sentences += errors_of_one(fit)
-    if undescribed or sentences:
-        return [*undescribed, *close, *notes, *sentences], False
-    return [
-        *close,
-        *notes,
-        "The model explains the data to within its noise, and the data resolve every parameter.",
-    ], True
+class Statement(NamedTuple):
+    """A sentence, and what it claims of "errors", "residuals", "noise" and so on, in a word each."""
+
+    sentence: str
+    claims: Mapping[str, str]
 
 
-def outcome(fit: "Fit", structure: ResidualStructure) -> list[str]:
-    """A few lines for the terminal: the verdict, how good, how sure, and what the data leave open."""
-    lines, _ = in_short(fit, structure)
+def _say(sentence: str, **claims: str) -> Statement:
+    return Statement(sentence, claims)
+
+
+def description(f: Assessment) -> Statement:
+    """First sentence of the verdict: how well the model describes the data."""
+    near, expected = "None of the measurements is above zero", _expected(f)
+    if f.misfit is not None:
+        half, most = (in_words(factor, f.options) for factor in f.misfit)
+        which = "stack without model discrepancy" if f.discrepancy else "model"
+        near = f"Half of the {f.count:,} measurements are within {half} of the {which}, 95 % within {most}"
+    if not f.likelihood:
+        return _say(f"{near}; the objective is {f.objective}, which has no noise model to judge this by.")
+    if not f.described:
+        return _say(not_described(f), description="no")
+    if f.large:
+        what = f"which {expected} does not explain"
+        return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="no", size="large")
+    if f.small:
+        what = f"closer than {expected} predicts"
+        return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="yes", size="small")
+    what = f"as {expected} predicts"
+    return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="yes", size="expected")
+
+
+def not_described(f: Assessment) -> str:
+    """That the stack does not describe the sample."""
+    if f.misfit is None:
+        return "This stack does not describe the sample."
+    median = in_words(f.misfit[0], f.options)
+    return f"This stack does not describe the sample: median misfit {median}, stated noise {100.0 * f.noise:.2g} %."
+
+
+def errors(f: Assessment) -> Statement:
+    """Second sentence of the verdict: what the standard errors mean."""
+    if not f.converged:
+        words = "The fit did not converge: values are the best found, not a minimum, and have no valid errors."
+        return _say(words, errors="invalid")
+    if not f.likelihood:
+        return _say("The errors are scaled by the remaining scatter and are only indicative.", errors="indicative")
+    if not f.described:
+        words = "Values and standard errors hold only within this model, which does not describe the data."
+        if f.discrepancy is not None:
+            words = "The standard errors include the model discrepancy, and hold only if it accounts for the misfit."
+        return _say(words, errors="conditional", description="no")
+    if f.alternatives:
+        others = "Another local minimum" if f.alternatives == 1 else f"{f.alternatives} other local minima"
+        words = f"{others} of the same model {'fits' if f.alternatives == 1 else 'fit'} equally well"
+        return _say(f"{words}: the standard errors are those of the best one only, sampling covers all.", errors="one")
+    if f.error_factor != 1.0:
+        parts = [f"{f.size:.2g} for the size of the {_residuals(f)}"] if f.size != 1.0 else []
+        if f.correlated:
+            effective = max(1.0, f.structure.count * f.independent_share)
+            parts.append(
+                f"{f.independent_share**-0.5:.2g} for their correlation: {f.structure.count} of them are equivalent to "
+                f"{effective:.0f} independent ones"
+            )
+        wrong, factor = ("small", f.error_factor) if f.error_factor > 1.0 else ("large", 1.0 / f.error_factor)
+        words = f"The standard errors are too {wrong} by a factor of about {factor:.2g} ({' times '.join(parts)})."
+        return _say(words, errors=f"too {wrong}", residuals="misfit")
+    if f.discrepancy is not None:
+        return _say("The standard errors include the model discrepancy.", errors="valid", residuals="as assumed")
+    if f.noise_assumed:
+        words = f"The standard errors are proportional to the noise, assumed to be {100.0 * DEFAULT_RELATIVE:g} %."
+        return _say(words, errors="valid", residuals="as assumed")
+    return _say("The standard errors follow from the stated noise.", errors="valid", residuals="as assumed")
+
+
+def parameters(f: Assessment) -> Statement:
+    """Third sentence of the verdict: which parameters the data do not identify, and why."""
+    words = f.physical(f.words)
+    if f.identified:
+        every = "every parameter" if len(words) == len(f.words) else "every parameter of the stack"
+        return _say(f"The data identify {every}.", parameters="all")
+    directions = [one for one in f.unidentified if any(_weak(one, name) for name in words)]
+    parts = [f"{not_identified(one)}{' (and more)' if directions[1:] else ''}" for one in directions[:1]]
+    for begins, what in (
+        ("insensitive", "without effect on the data"),
+        ("at a bound", "at a bound"),
+        ("limited", "limited by the instrument"),
+        ("prior-dominated", "prior-dominated"),
+        *(() if directions else (("unidentified", "unidentified"), ("weakly", "weakly identified"))),
+    ):
+        names = [name for name, word in words.items() if word.startswith(begins)]
+        if names:
+            parts.append(f"{listed(names)} {'is' if len(names) == 1 else 'are'} {what}")
+    return _say(f"{'; '.join(parts)}.", parameters="not all")
+
+
+def not_identified(direction: Direction) -> str:
+    """What is not identified along a direction: the parameters with a large error along it."""
+    names = [name for name in direction.weights if _weak(direction, name)] or [next(iter(direction.weights))]
+    if len(names) > 1:
+        return f"{listed(names)} are not identified separately"
+    return f"{names[0]} is {'unidentified' if direction.unconstrained else 'weakly identified'}"
+
+
+def _weak(direction: Direction, name: str) -> bool:
+    return direction.error_of(name) > UNIDENTIFIED_BEYOND
+
+
+def remarks(f: Assessment) -> list[Statement]:
+    """Statements that qualify the verdict."""
+    found = []
+    if f.discrepancy is not None:
+        term, absorbed = f.discrepancy
+        amplitude, exponent = 100.0 * float(term.amplitude), float(term.grazing_exponent)
+        grazing = f" at normal incidence, {amplitude * 2.0**exponent:.2g} % at 60°" if exponent > 0.0 else ""
+        found.append(
+            _say(
+                f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales "
+                f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)."
+                f" It absorbs {100.0 * absorbed:.3g} % of the residual sum of squares."
+            )
+        )
+    if not f.resolved:
+        error = numerical_error(f.numerical_error)
+        found.append(_say(f"The numerical error of the model is {error}: a finer resolution may give other values."))
+    for name, least in f.limits.items():
+        words = f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved."
+        found.append(_say(words, parameters="not all"))
+    for name, (roughness, shift) in f.limited.items():
+        words = (
+            f"{name} is limited by the instrument with {roughness}: up to that width it shifts by {shift:.2g} of its"
+        )
+        found.append(_say(f"{words} standard errors.", parameters="not all"))
+    return found
+
+
+def residuals(f: Assessment) -> list[Statement]:
+    """Whether the residuals are what the noise model predicts; with a discrepancy, all is about the whitened ones."""
+    which, expected, structure, found = _residuals(f), _expected(f), f.structure, []
+    if f.likelihood:
+        chance = math.sqrt(2.0 / max(f.freedom, 1))
+        of = " of the whitened residuals" if f.discrepancy else ""
+        found.append(
+            _say(
+                f"The reduced chi-square{of} is {f.ratio:.3g} with {f.freedom} degrees of freedom; the true model and "
+                f"noise give 1 ± {chance:.2g}."
+            )
+        )
+        if f.large:
+            found.append(_say(f"The {which} are larger than {expected} predicts.", size="large", residuals="misfit"))
+        elif f.small and f.correlated:
+            words = f"The {which} are smaller than {expected} predicts, but correlated."
+            found.append(_say(words, size="small", residuals="misfit"))
+        elif f.small:
+            words = f"The {which} are smaller than {expected} predicts: sigma is too large, or holds a common error."
+            found.append(_say(words, size="small", residuals="misfit", noise="too large"))
+        else:
+            found.append(_say(f"The size of the {which} is what {expected} predicts.", size="expected"))
+    else:
+        found.append(_say("Residuals are in units of their own scatter: a named residual has no noise model."))
+    if math.isfinite(structure.lag_one):
+        found.append(
+            _say(
+                f"Neighbouring {which} are correlated by {structure.lag_one:+.2f} ± {structure.pairs**-0.5:.2g} "
+                f"({structure.pairs} pairs); their root mean square is {structure.rms:.2f}. Independent ones of unit "
+                "variance have 0 and 1."
+            )
+        )
+    if f.correlated:
+        words = "Correlated residuals come from structure that the model lacks, or from a smooth calibration error."
+        found.append(_say(words, residuals="misfit"))
+    if len(structure.by_incidence) > 1:
+        worst = structure.worst
+        words = f"The worst incidence is {worst.theta:g}°: root mean square {worst.rms:.2f} sigma"
+        found.append(_say(f"{words}, mean {worst.mean:+.2f} sigma."))
+    words = f"{structure.beyond_three:.1%} of the {which} are beyond 3 sigma (normal distribution: 0.3 %); their"
+    distance = f"{structure.normal_distance:.2f}"
+    return [*found, _say(f"{words} Kolmogorov-Smirnov distance from the unit normal distribution is {distance}.")]
+
+
+def identification(f: Assessment) -> list[Statement]:
+    """What the data identify: directions of parameter space, insensitive parameters and those at a bound."""
+    limit, found = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range", []
+    if f.insensitive:
+        words = f"Insensitive: {', '.join(f.insensitive)}. The data do not depend on them."
+        found.append(_say(words))
+    if f.unidentified:
+        words = f"{len(f.unidentified)} of {len(f.words)} principal directions of parameter space have a standard error"
+        found.append(_say(f"{words} above {limit}; there, priors dominate.", directions="not all"))
+    else:
+        words = "The standard error along every principal direction of parameter space is at most"
+        found.append(_say(f"{words} {limit}.", directions="all"))
+    if f.at_bound:
+        found.append(
+            _say(
+                f"At a bound: {', '.join(f.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
+                "standard error; the other errors are conditional on them."
+            )
+        )
+    return found
+
+
+def _residuals(f: Assessment) -> str:
+    return "whitened residuals" if f.discrepancy else "residuals"
+
+
+def _expected(f: Assessment) -> str:
+    return "the fitted covariance" if f.discrepancy else "the stated noise"
+
+
+class Verdict(NamedTuple):
+    """The three sentences that open a report, remarks that qualify them, and whether there is no reservation."""
+
+    sentences: list[str]
+    remarks: list[str]
+    sound: bool
+
+
+def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
+    """How well the model describes the data, what the errors mean, and what the data identify."""
+    facts = facts or assess(fit)
+    opening = [description(facts), errors(facts), parameters(facts)]
+    sound = opening[0].claims.get("description") == "yes" and opening[1].claims["errors"] == "valid"
+    notes = [*sentences(remarks(facts)), *automatic_discrepancy(fit), *noise_statements(fit.problem)]
+    return Verdict(sentences(opening), notes, sound and facts.identified and facts.resolved)
+
+
+def sentences(statements: Iterable[Statement]) -> list[str]:
+    """The sentences of statements."""
+    return [one.sentence for one in statements]
+
+
+def summary(fit: "Fit") -> list[str]:
+    """A few lines for the terminal: the verdict, chi-square, starts and numerical error."""
+    found = verdict(fit)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
     if fit.problem.noise.discrepancy:
-        good = f"{good} with the discrepancy term, {without_discrepancy(fit):.4g} without"
-    starts = f"{fit.minima[0].count} of {_started(fit)} ended here"
-    others = f", other local minima that fit equally well: {len(fit.alternatives)}" if describes(fit) else ""
-    accurate = f"; numerical error of the model: {numerical_error(fit)}" if fit.resolution else ""
-    return [*lines, f"{good}; {starts}{others}{accurate}"]
+        good = f"{good} with the discrepancy term, {ratio_without_discrepancy(fit):.4g} without"
+    starts = f"{fit.minima[0].count} of {started(fit)} reached the best minimum"
+    accurate = f"; numerical error of the model: {numerical_error(fit.numerical_error)}" if fit.resolution else ""
+    return [*found.sentences, *found.remarks, f"{good}; {starts}{accurate}"]
 
 
-def noise_in_words(problem: "Problem") -> str:
-    """The noise model of a problem in one line."""
-    noise, parts = problem.noise, []
-    if noise.use_sigma and problem.data.sigma is not None:
-        parts.append("the file's own sigma")
-    for level, unit in (("relative", "of the model's value"), ("floor", "1/sr")):
-        value = float(np.asarray(getattr(problem.build(problem.start), level)))
-        if f"noise.{level}" in problem.names:
-            parts.append(f"a fitted {level} part")
-        elif value > 0.0:
-            assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
-            parts.append(f"{value:.3g} {unit}{assumed}")
-    if noise.discrepancy:
-        parts.append("a model discrepancy (Gaussian process)")
-    tails = (
-        "Gaussian" if noise.tails == "gaussian" else f"Student-t with {noise.degrees_of_freedom:g} degrees of freedom"
-    )
-    return f"{', '.join(parts)}, added in quadrature; {tails}" if len(parts) > 1 else f"{''.join(parts)}; {tails}"
+def automatic_discrepancy(fit: "Fit") -> list[str]:
+    """Why a model discrepancy was added to a fit, if it was."""
+    found = fit.without_discrepancy
+    if found is None:
+        return []
+    return [
+        "The discrepancy term was added automatically because, with independent noise, neighbouring residuals correlate"
+        f" by {found.residual_autocorrelation:+.2f} ({found.pairs} pairs; reduced chi-square "
+        f"{ratio_without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
+    ]
 
 
-def scale_in_words(problem: "Problem") -> str:
-    """What the common calibration factor of a problem is, in a few words."""
-    if problem.scale is None:
-        return "fixed at 1"
-    return (
-        f"fixed at {problem.scale:g}" if isinstance(problem.scale, int | float) else "fitted, see the table of values"
-    )
+def ratio_without_discrepancy(fit: "Fit") -> float:
+    """Chi-square per degree of freedom with independent noise: as fitted so, else with these parameters."""
+    if fit.without_discrepancy is not None:
+        square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
+    else:
+        square = float(np.sum(np.square(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted))))
+        freedom = fit.degrees_of_freedom
+    return square / freedom if freedom > 0 else math.nan
 
 
-def transport_in_words(fit: "Fit") -> str:
-    """The transport of a fit, and its resolution."""
-    transport = fit.problem.transport
-    name = transport if isinstance(transport, str) else type(transport).__name__
-    return name if fit.resolution is None else f"{name}, {fit.resolution}"
+def noise_statements(problem: "Problem") -> list[str]:
+    """Which part of the noise was assumed, or adds to the file's own sigma."""
+    noise, used = problem.noise, problem.data.used()
+    if problem.objective != "likelihood":
+        return []
+    if problem.noise_is_assumed:
+        found = None if isinstance(used, Totals) else repeats(used)
+        words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
+        if found is not None and found.noise > 0.0:
+            return [
+                f"{words} {found.count:,} repeated measurements scatter by about {100.0 * found.noise:.2g} %: "
+                f"`relative = {found.noise:.2g}` under [noise], or `--noise` of a search, states that."
+            ]
+        return [
+            f"{words} State it as `relative` under [noise], or `--noise` of a search; with start, low and high it is "
+            "fitted."
+        ]
+    if used.sigma is None or not noise.use_sigma or noise.relative in (None, 0):
+        return []
+    positive = used.values > 0.0
+    median = float(np.median(used.sigma[positive] / used.values[positive])) if positive.any() else math.nan
+    own = f", {100.0 * median:.2g} % in the median" if positive.any() else ""
+    more = "a fitted relative part" if is_free(noise.relative) else f"relative = {noise.relative:g}"
+    return [
+        f"Noise: the data's own sigma{own}, and {more}, added in quadrature. Leave `relative` out if sigma holds it "
+        "already; `use_sigma = false` leaves sigma out."
+    ]
 
 
-def numerical_error(fit: "Fit") -> str:
-    """How far the resolution keeps the model from what it should be, in a few words."""
-    error = fit.numerical_error
+def minima(fit: "Fit") -> list[str]:
+    """How many starts agree on the minimum."""
+    best, total = fit.minima[0], sum(fit.start_outcomes.values()) or sum(minimum.count for minimum in fit.minima)
+    starts = started(fit) if fit.start_outcomes else f"{total} starts"
+    found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
+    only = ["Only one start found it: more starts may find a better one."] if best.count == 1 and total > 1 else []
+    return [f"{best.count} of {starts} reached the best minimum; {found}.", *only]
+
+
+def started(fit: "Fit") -> str:
+    """How many starts led to the fit."""
+    refitted = " with the discrepancy term" if fit.without_discrepancy is not None else ""
+    return f"{sum(fit.start_outcomes.values())} starts{refitted}"
+
+
+def sampled(posterior: "Posterior", options: ReportOptions = DEFAULT) -> list[str]:
+    """How long the chain is, whether that is long enough for its estimates, and which modes it has."""
+    steps, walkers = posterior.chain.shape[:2]
+    longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
+    words = [
+        f"{walkers} walkers made {steps} steps; the first {posterior.burn_in} are burn-in, the others are "
+        f"{(steps - posterior.burn_in) / longest:.0f} times the longest autocorrelation time of {longest:.0f} steps.",
+        f"The effective sample size is at least {float(np.min(posterior.effective_samples)):.0f}; "
+        f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
+    ]
+    if posterior.modes:
+        places = [
+            f"{100.0 * mode.share:.2g} ± {100.0 * mode.error:.1g} % at "
+            + ", ".join(f"{name} {value:.4g}" for name, value in mode.values.items())
+            for mode in posterior.modes
+        ]
+        words.append(f"The posterior has {len(places)} modes: {'; '.join(places)}. Estimates cover all of them.")
+        if worst > options.r_hat:
+            words.append(f"R-hat is above {options.r_hat:g}: the shares of the modes are uncertain.")
+    if posterior.status:
+        words.append(f"The sampler: {posterior.status}.")
+    if not posterior.converged:
+        words.append(
+            "The chain has not converged: "
+            + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
+        )
+    return words
+
+
+def reportable(posterior: "Posterior") -> bool:
+    """Whether estimates may be had from the chain."""
+    return posterior.converged or posterior.allow_unconverged
+
+
+def in_words(factor: float, options: ReportOptions = DEFAULT) -> str:
+    """A factor in words: in percent while it is near 1."""
+    if factor < options.factor:
+        return f"{100.0 * (factor - 1.0):.2g} %"
+    return f"a factor of {factor:.2g}" if math.isfinite(factor) else "an infinite factor (the model is 0 there)"
+
+
+def numerical_error(error: float | None) -> str:
+    """How far the resolution keeps the model from its limit, in a few words."""
     return "not known" if error is None or not math.isfinite(error) else f"{error:.2g} sigma at most"
 
 
 def listed(names: Sequence[str]) -> str:
     """Names as words: "a, b and c"."""
     return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part)
-
-
-def _not_separated(combination: Direction) -> str:
-    error = {name: combination.error_of(name) for name in combination.weights}
-    names = [name for name in error if error[name] > UNIDENTIFIED_BEYOND] or [max(error, key=lambda name: error[name])]
-    if len(names) > 1:
-        return f"The data do not separate {listed(names)}"
-    return f"The data {'do not determine' if combination.unconstrained else 'weakly constrain'} {names[0]}"
-
-
-def determines(fit: "Fit") -> list[str]:
-    """What the data leave open: condition number, combinations they do not separate, parameters at a bound."""
-    sentences = [f"The condition number of the scaled problem is {fit.condition_number:.3g}."]
-    if fit.insensitive:
-        sentences.append(
-            f"Without influence on the data: {', '.join(fit.insensitive)}. Any value explains them as well."
-        )
-    if fit.unidentified:
-        sentences.append(
-            f"{len(fit.unidentified)} of {len(fit.vector)} principal directions of parameter space are constrained by "
-            f"the data to no better than {100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range; there, priors dominate."
-        )
-    else:
-        sentences.append(
-            "The data constrain every principal direction of parameter space to better than "
-            f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range."
-        )
-    if fit.at_bound:
-        sentences.append(
-            f"At a bound: {', '.join(fit.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
-            "standard error; the other errors are conditional on them being fixed there."
-        )
-    return sentences
-
-
-def starts_in_words(fit: "Fit") -> str:
-    """How many starts there were, and where they ended, in one line."""
-    if not fit.start_outcomes:
-        return "not recorded"
-    run = ", ".join(f"{name} {fit.settings[name]}" for name in ("seed", "solver") if name in fit.settings)
-    where = ", ".join(f"{fit.start_outcomes[key]} {word}" for key, word in OUTCOMES.items() if fit.start_outcomes[key])
-    ran = sum(fit.start_outcomes.values())
-    if not _refitted(fit):
-        return f"{ran} ({run}): {where}"
-    given = fit.settings.get("starts", "?")
-    return f"{given} with independent noise ({run}), then {ran} with the discrepancy term: {where}"
-
-
-def _refitted(fit: "Fit") -> bool:
-    """Whether it was fitted once more, with a model discrepancy, from starts of its own: see `shared_errors.points`."""
-    return fit.without_discrepancy is not None
-
-
-def _started(fit: "Fit") -> str:
-    """How many starts led to the fit, in words."""
-    return f"{sum(fit.start_outcomes.values())} starts{' with the discrepancy term' if _refitted(fit) else ''}"
-
-
-def minima(fit: "Fit") -> list[str]:
-    """How many starts agree on the minimum, and whether another local minimum fits equally well."""
-    best, total = fit.minima[0], sum(fit.start_outcomes.values()) or sum(minimum.count for minimum in fit.minima)
-    starts = _started(fit) if fit.start_outcomes else f"{total} starts"
-    found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
-    sentences = [f"{best.count} of {starts} reached the best minimum; {found}."]
-    if best.count == 1 and total > 1:
-        sentences.append("Only one start found it: more starts may find a better one.")
-    return [*sentences, *errors_of_one(fit)] if describes(fit) else sentences
-
-
-def sampled(posterior: "Posterior") -> list[str]:
-    """How long the chain is, and whether that is long enough for its estimates to mean anything."""
-    steps, walkers = posterior.chain.shape[:2]
-    longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
-    sentences = [
-        f"{walkers} walkers made {steps} steps; the first {posterior.burn_in} are left out, and the rest is "
-        f"{(steps - posterior.burn_in) / longest:.0f} times the longest autocorrelation time of {longest:.0f} steps.",
-        f"The effective sample size is at least {float(np.min(posterior.effective_samples)):.0f}; "
-        f"{posterior.acceptance:.0%} of the proposals were accepted; R-hat is at most {worst:.3f}.",
-        *modes(posterior),
-    ]
-    if posterior.status:
-        sentences.append(f"The sampler: {posterior.status}.")
-    if not posterior.converged:
-        sentences.append(
-            "The chain is too short (under 50 autocorrelation times, or these still change), or walkers do not tell "
-            f"the same (R-hat above {MIXED:g}): "
-            + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
-        )
-    return sentences
-
-
-def reportable(posterior: "Posterior") -> bool:
-    """Whether estimates may be had from the chain."""
-    return posterior.converged or posterior.allow_unconverged

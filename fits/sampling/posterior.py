@@ -85,7 +85,7 @@ class Posterior:
         return f"<Posterior of {', '.join(self.names)}: {steps} steps of {walkers} walkers, {ended}{modes}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.reports.notebook:posterior_fragment", self))
+        return str(shown_by("fits.reports.html:posterior_fragment", self))
 
     def part(self, name: str) -> "Posterior":
         """What the posterior of a `Joint` says of one measurement. ValueError for a name that none has."""

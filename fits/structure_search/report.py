@@ -8,11 +8,10 @@ from matplotlib.figure import Figure
 
 from fits._files import write_together
 from fits.reports import tables
-from fits.reports.agreement import misdescribed, noise_notes, without_discrepancy
 from fits.reports.html import source_name
 from fits.reports.pages import document, image, section, sentences
 from fits.reports.plots.data import CYCLE, GREY, STYLE, as_png
-from fits.reports.verdicts import listed
+from fits.reports.verdicts import assess, listed, noise_statements, not_described, ratio_without_discrepancy
 from fits.structure_search.search import Candidate, Search
 
 PAGE, PICTURE = "search.html", "search.png"
@@ -67,8 +66,9 @@ def _of_stack(one: Candidate) -> int:
 def search_sentences(search: Search) -> list[str]:
     """One verdict, by the predictive score, and its caveats."""
     best = search.best
+    facts = assess(best.fit)
     words = [
-        *misdescribed(best.fit),
+        *([] if facts.described else [not_described(facts)]),
         f"Of {len(search.candidates)} models, {best.name} has the best cross-validated predictive score. "
         f"{_others(search)}",
     ]
@@ -76,14 +76,14 @@ def search_sentences(search: Search) -> list[str]:
     if term is not None:
         words.append(
             f"Even the best model needs a correlated discrepancy term of {100.0 * float(term.amplitude):.2g} %; "
-            f"chi2/dof without it is {without_discrepancy(best.fit):.3g}."
+            f"chi2/dof without it is {ratio_without_discrepancy(best.fit):.3g}."
         )
     unsure = [one.name for one in search.candidates if one.model_score and not one.model_score.evidence.reliable]
     if unsure:
         words.append(f"Probabilities are unreliable for {listed(unsure)}.")
     if search.stopped:
         words.append("The time budget ended the search before all models were tried. The same command resumes it.")
-    return [*words, *noise_notes(best.fit.problem)]
+    return [*words, *noise_statements(best.fit.problem)]
 
 
 def _others(search: Search) -> str:

@@ -22,7 +22,7 @@ from benchmarks.studies.maps.work import Meeting, Timed, redo, timed, warm_up
 from benchmarks.suite.maps import readings
 from fits.engines import run as run_tasks
 from fits.engines.processes import run_processes
-from fits.engines.worker import take_after
+from fits.engines.worker import configure
 from fits.maps import search
 from fits.maps.chunk import Task
 
@@ -81,7 +81,7 @@ def by_workers(one: Given, size: Size, report: Report) -> list[Figure]:
             rates["two"].append(steady(run_processes(timed, job, all_of_them, PROCESSES)))
         if missing is None:
             with cluster() as client:
-                client.run(take_after, bool(jax.config.values["jax_enable_x64"]), threads=1)  # before it unpacks arrays
+                client.run(configure, bool(jax.config.values["jax_enable_x64"]), threads=1)  # before it unpacks arrays
                 client.run(warm_up, job, tasks[0])
                 rates["dask"].append(steady(run_tasks(timed, job, tasks * PROCESSES * size.repeats, client=client)))
         told = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)

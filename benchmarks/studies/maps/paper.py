@@ -61,7 +61,7 @@ def run(rows: Sequence[Row], size: Size, report: Report) -> tuple[list[Engine], 
 def on_paper(row: Row, chunk: int, handed: float | None, texels: int = TEXELS) -> Paper:
     """One map; handed: how often a second a scheduler hands out something, of short chunks a few."""
     seconds, chunks = chunk * PROCESSES / row.rate, texels / chunk
-    handed = None if handed is None else handed * max(1, int(distributed.ENOUGH / seconds))
+    handed = None if handed is None else handed * max(1, int(distributed.GROUP_SECONDS / seconds))
     least = 0.0 if handed is None else chunks / handed
     times = tuple(row.pilot + max(chunks * seconds / cores, least) for cores in CORES)
     return Paper(row.name, seconds, None if handed is None else handed * seconds, times)

@@ -75,7 +75,7 @@ def study(
         free=FREE,
         chunk=size.chunk,
         processes=PROCESSES,
-        enough=distributed.ENOUGH,
+        enough=distributed.GROUP_SECONDS,
         rounding=fitting.ROUNDING,
         other=fitting.OTHER,
         checked=size.checked,

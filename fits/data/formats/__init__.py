@@ -30,13 +30,15 @@ from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
 from fits.names import FORMATS, Quantity, Strata
 
-_TOLD: dict[str, Callable[[Path, Quantity], Measurements]] = {  # what they hold is told, or else the BSDF
+_QUANTITY_GIVEN: dict[
+    str, Callable[[Path, Quantity], Measurements]
+] = {  # the caller says which quantity, BSDF by default
     "zemax": zemax.read,
     "lighttools": lighttools.read,
     "fred": fred.read,
     "astm": astm.read,
 }
-_SAYING: dict[str, Callable[[Path], Measurements]] = {  # the file says what it holds
+_QUANTITY_STATED: dict[str, Callable[[Path], Measurements]] = {  # the file says what it holds
     "klems": window_xml.read,
     "tensortree": window_xml.read,
     "pab": pab.read,
@@ -132,12 +134,12 @@ def _read_as(
         if checked not in (None, "brdf_cos"):
             raise ValueError(f"{path}: quantity is {checked!r}, an RGL file always holds 'brdf_cos'")
         return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
-    if kind in _TOLD:
-        return _TOLD[kind](path, checked or "brdf")
+    if kind in _QUANTITY_GIVEN:
+        return _QUANTITY_GIVEN[kind](path, checked or "brdf")
     if kind == "alta":
         return alta.read(path, checked)
-    if kind in _SAYING:
-        found = _SAYING[kind](path)
+    if kind in _QUANTITY_STATED:
+        found = _QUANTITY_STATED[kind](path)
         if checked not in (None, found.source.quantity):
             raise ValueError(f"{path}: quantity is {checked!r}, this {kind} file says {found.source.quantity!r}")
         return found
@@ -145,7 +147,7 @@ def _read_as(
 
 
 def sniff(path: Path) -> str:
-    """Which of `FORMATS` a file is in, by its content and then by its name; ValueError that names what was seen."""
+    """The one of `FORMATS` that a file has, by its content and then by its name; ValueError that names the content."""
     with path.open("rb") as file:
         head = file.read(1 << 16)
     if not head.strip():

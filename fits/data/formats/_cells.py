@@ -8,11 +8,11 @@ from fits.data.formats._text import ANY_NUMBER, Line, plural
 from fits.data.geometry import Floats
 
 MISSING = ("", "nan", "-nan", "na", "n/a", "null")
-"""Of what was not measured, in lower case, as programs write it."""
+"""Cells of values that were not measured, in lower case, as programs write them."""
 
 
 class Table:
-    """The cells below a header line; columns are parsed when asked for, so that unused ones may hold anything."""
+    """The cells below a header line; columns are parsed on request, so that unused ones may hold anything."""
 
     def __init__(self, header: Line, body: list[Line]) -> None:
         self.header, self.body = header, body
@@ -28,7 +28,7 @@ class Table:
             if len(cells) != len(self.names):
                 raise line.error(f"{plural(len(cells), 'cell')}, must be {len(self.names)} as in the header")
 
-    def leave_out_missing(self, names: list[str]) -> int:
+    def skip_missing(self, names: list[str]) -> int:
         """Drop rows with a missing number in one of these columns, and say how many; ValueError if none is left."""
         places = [self.names.index(name) for name in names]
         keep = [not any(_missing(cells[place]) for place in places) for cells in self.cells]
@@ -64,7 +64,7 @@ def _cells(line: Line, delimiter: str) -> list[str]:
 
 
 def delimiter_of(header: str) -> str:
-    """What divides the cells of a header line."""
+    """The delimiter of the cells of a header line."""
     return max(",;\t", key=header.count)
 
 

@@ -9,7 +9,7 @@ from fits.data.geometry import Floats
 
 
 class Rows:
-    """What is left of the lines of a file. Errors say what was expected, or name the line."""
+    """The lines of a file that remain to be read. Errors say what was expected, or name the line."""
 
     def __init__(self, path: Path, lines: list[Line]) -> None:
         self._path, self._lines, self._next = path, lines, 0
@@ -42,13 +42,13 @@ class Rows:
         return line
 
     def numbers(self, count: int, wanted: str, allowed: tuple[float, float] = ANY_NUMBER) -> Floats:
-        """So many numbers of the closed range `allowed`, on one line that is not blank, or on several."""
-        found: list[float] = []
-        while len(found) < count:
-            found += self.filled(wanted).numbers(allowed)
-        if len(found) != count:
-            raise self.last.error(f"{plural(len(found), 'number')} for {wanted}, must be {count}")
-        return np.array(found)
+        """The next `count` numbers, in the closed range `allowed`, on one or several lines, without blank ones."""
+        values: list[float] = []
+        while len(values) < count:
+            values += self.filled(wanted).numbers(allowed)
+        if len(values) != count:
+            raise self.last.error(f"{plural(len(values), 'number')} for {wanted}, must be {count}")
+        return np.array(values)
 
     def whole(self, wanted: str, allowed: tuple[float, float]) -> int:
         """One whole number."""
@@ -62,7 +62,7 @@ class Rows:
         return self.numbers(self.whole(f"the number of {wanted}", (1, 100_000)), wanted, allowed)
 
     def table(self, count: int, columns: int, wanted: str) -> tuple[list[Line], Floats]:
-        """So many lines of so many numbers, (count, columns), blank lines before them left out."""
+        """The next `count` lines of `columns` numbers, (count, columns), without blank lines before them."""
         self.filled(wanted)
         start = self._next - 1
         body = self._lines[start : start + count]

@@ -1,7 +1,7 @@
 """Tables over the unit square, bilinear between their nodes, and densities among them, whose inverse draws points.
 
 A density is drawn from by its rows first, by their integrals, and then along the row, as RGL's materials are drawn from
-(Dupuy & Jakob 2018). Several tables stand one behind the other; between them everything is linear, the integrals too.
+(Dupuy & Jakob 2018). Several tables form a stack, which is interpolated linearly, the integrals too.
 """
 
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ Whole = NDArray[np.int_]
 
 
 @dataclass(frozen=True)
-class Between:
-    """Which tables count at each of N points, (N, K), and for how much, (N, K)."""
+class Interpolation:
+    """Tables that are interpolated at each of N points, (N, K), and their weights, (N, K)."""
 
     table: Whole
-    share: Floats
+    weight: Floats
 
 
-def bilinear(tables: Floats, x: Floats, y: Floats, between: Between | None = None) -> Floats:
+def bilinear(tables: Floats, x: Floats, y: Floats, interpolation: Interpolation | None = None) -> Floats:
     """Values (N,) of tables (S, h, w) at points of the unit square, x along a row, clamped to it."""
     row, v = _cell(y, tables.shape[1])
     column, u = _cell(x, tables.shape[2])
-    return _mean(tables, between, row, column, u, v)
+    return _mean(tables, interpolation, row, column, u, v)
 
 
 def _cell(place: Floats, nodes: int) -> tuple[Whole, Floats]:
@@ -36,16 +36,18 @@ def _cell(place: Floats, nodes: int) -> tuple[Whole, Floats]:
     return cell, scaled - cell
 
 
-def _at(tables: Floats, between: Between | None, *index: Whole) -> Floats:
-    """Entries (N,) of tables, between them where they are several."""
-    if between is None:
+def _at(tables: Floats, interpolation: Interpolation | None, *index: Whole) -> Floats:
+    """Entries (N,) of tables, interpolated if there are several."""
+    if interpolation is None:
         return tables[(0, *index)]
-    return np.sum(between.share * tables[(between.table, *(one[:, None] for one in index))], axis=1)
+    return np.sum(interpolation.weight * tables[(interpolation.table, *(one[:, None] for one in index))], axis=1)
 
 
-def _mean(tables: Floats, between: Between | None, row: Whole, column: Whole, u: Floats, v: Floats) -> Floats:
-    low = (1 - u) * _at(tables, between, row, column) + u * _at(tables, between, row, column + 1)
-    high = (1 - u) * _at(tables, between, row + 1, column) + u * _at(tables, between, row + 1, column + 1)
+def _mean(
+    tables: Floats, interpolation: Interpolation | None, row: Whole, column: Whole, u: Floats, v: Floats
+) -> Floats:
+    low = (1 - u) * _at(tables, interpolation, row, column) + u * _at(tables, interpolation, row, column + 1)
+    high = (1 - u) * _at(tables, interpolation, row + 1, column) + u * _at(tables, interpolation, row + 1, column + 1)
     return (1 - v) * low + v * high
 
 
@@ -64,30 +66,32 @@ class Density:
     def drawn(self, sx: Floats, sy: Floats) -> tuple[Floats, Floats]:
         """Points x and y, (S, B, A), that the grid of A numbers sx and B numbers sy of [0, 1] draws from each."""
         count, height, width = self.tables.shape
-        row, rest = _found(self.down, np.broadcast_to(sy, (count, len(sy))))
+        row, rest = _invert(self.down, np.broadcast_to(sy, (count, len(sy))))
         whole = self.along[:, :, -1]
         v = _solved(np.take_along_axis(whole, row, 1), np.take_along_axis(whole, row + 1, 1), rest)
         each = np.arange(count)[:, None]
         along = (1 - v)[..., None] * self.along[each, row] + v[..., None] * self.along[each, row + 1]
         table = (1 - v)[..., None] * self.tables[each, row] + v[..., None] * self.tables[each, row + 1]
         flat, values = along.reshape(-1, width), table.reshape(-1, width)
-        column, rest = _found(flat, sx * flat[:, -1:])
+        column, rest = _invert(flat, sx * flat[:, -1:])
         u = _solved(np.take_along_axis(values, column, 1), np.take_along_axis(values, column + 1, 1), rest)
         x = ((column + u) / (width - 1)).reshape(count, len(sy), len(sx))
         y = np.broadcast_to(((row + v) / (height - 1))[..., None], x.shape)
         return x, y
 
-    def undrawn(self, x: Floats, y: Floats, between: Between | None = None) -> tuple[Floats, Floats, Floats]:
+    def undrawn(
+        self, x: Floats, y: Floats, interpolation: Interpolation | None = None
+    ) -> tuple[Floats, Floats, Floats]:
         """The numbers sx and sy (N,) that draw points, and the density there: the inverse of drawing."""
         _, height, width = self.tables.shape
         row, v = _cell(y, height)
         column, u = _cell(x, width)
         whole, last = self.along[:, :, -1:], np.zeros_like(row)
-        first, second = _at(whole, between, row, last), _at(whole, between, row + 1, last)
-        sy = _at(self.down, between, row) + v * (first + 0.5 * v * (second - first))
+        first, second = _at(whole, interpolation, row, last), _at(whole, interpolation, row + 1, last)
+        sy = _at(self.down, interpolation, row) + v * (first + 0.5 * v * (second - first))
 
         def across(tables: Floats, column: Whole) -> Floats:
-            return (1 - v) * _at(tables, between, row, column) + v * _at(tables, between, row + 1, column)
+            return (1 - v) * _at(tables, interpolation, row, column) + v * _at(tables, interpolation, row + 1, column)
 
         start, end = across(self.tables, column), across(self.tables, column + 1)
         part = across(self.along, column) + u * (start + 0.5 * u * (end - start))
@@ -102,8 +106,8 @@ def _integrated(values: Floats) -> Floats:
     return np.concatenate([np.zeros_like(steps[..., :1]), np.cumsum(steps, axis=-1)], axis=-1)
 
 
-def _found(integral: Floats, wanted: Floats) -> tuple[Whole, Floats]:
-    """The cells (R, N) in which integrals (R, n) reach what is wanted, (R, N), and what is left of it there."""
+def _invert(integral: Floats, wanted: Floats) -> tuple[Whole, Floats]:
+    """The cells (R, N) in which integrals (R, n) reach `wanted`, (R, N), and its remainder in them."""
     rows, nodes = integral.shape
     total = np.maximum(integral[:, -1:], np.finfo(float).tiny)
     # one search for all rows: each begins where the one before it ends
@@ -114,7 +118,7 @@ def _found(integral: Floats, wanted: Floats) -> tuple[Whole, Floats]:
 
 
 def _solved(start: Floats, end: Floats, wanted: Floats) -> Floats:
-    """Where in a cell the integral of a density that goes from start to end is what is wanted."""
+    """Position in a cell at which the integral of a density, linear from `start` to `end`, is `wanted`."""
     root = np.sqrt(np.maximum(start * start + 2.0 * wanted * (end - start), 0.0))
     bottom = start + root
     return np.clip(np.where(bottom > 0, 2.0 * wanted / np.where(bottom > 0, bottom, 1.0), 0.0), 0.0, 1.0)

@@ -53,7 +53,7 @@ def read_fields(path: Path) -> Fields:
 
 
 class _Header:
-    """What stands before the data, read from front to back."""
+    """The header before the data, read from front to back."""
 
     def __init__(self, path: Path, content: bytes) -> None:
         self.path, self.content, self.place = path, content, 0

@@ -1,4 +1,4 @@
-"""What the text readers share: numbered lines, numbers, and one-line errors that say where."""
+"""Common parts of the text readers: numbered lines, numbers, and one-line errors that name the line."""
 
 import math
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ def rows(lines: list[Line], columns: int) -> Floats:
     return np.array(parsed, np.float64).reshape(-1, columns)
 
 
-def within(lines: list[Line], values: Floats, column: str | int, allowed: tuple[float, float]) -> None:
+def require_range(lines: list[Line], values: Floats, column: str | int, allowed: tuple[float, float]) -> None:
     """ValueError at the first of values (lines,) that is out of the closed range `allowed`."""
     low, high = allowed
     bad = ~((values >= low) & (values <= high))

@@ -1,4 +1,4 @@
-"""What the readers of XML files of LBNL WINDOW and Radiance share: the layer, its blocks, and texts in it."""
+"""Common parts of the readers of XML files of LBNL WINDOW and Radiance: the layer, its blocks, and texts in it."""
 
 import re
 import xml.etree.ElementTree as ElementTree

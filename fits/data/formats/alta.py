@@ -7,7 +7,7 @@
     ...
 
 Angles are radians, azimuths counter-clockwise about the normal; view and light as in `params::to_cartesian` of ALTA
-(`sources/core/params.cpp`), the layout as in its page "Data File Formats". Coordinates that leave something open get
+(`sources/core/params.cpp`), the layout as in its page "Data File Formats". Coordinates that do not fix a direction get
 the directions that ALTA gives them. INV_STERADIAN_COSINE_FACTOR is the BRDF times the cosine of the view.
 """
 
@@ -71,9 +71,9 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     used = np.minimum(wi[:, 2], wo[:, 2]) > TANGENT_COSINE
     notes = [f"directions from {coordinates}"]
     if spare:
-        notes.append("vertical segments (VS) are left out: the file does not say how sure they are")
+        notes.append("vertical segments (VS) are skipped: the file does not say how sure they are")
     if not real.all():
-        notes.append(f"left out: {plural(int((~real).sum()), 'sample')} of no directions")
+        notes.append(f"skipped: {plural(int((~real).sum()), 'sample')} of no directions")
     if not used.all():
         notes.append(f"masked: {plural(int((~used).sum()), 'sample')} with light or view at or below the horizon")
     source = Source(str(path), "alta", holds, tuple(notes))
@@ -111,9 +111,9 @@ def _dimensions(said: dict[str, tuple[Line, list[str]]]) -> tuple[int, int, int]
 
 
 def _quantity(
-    path: Path, said: dict[str, tuple[Line, list[str]]], dim_y: int, given: Quantity | None
+    path: Path, said: dict[str, tuple[Line, list[str]]], dim_y: int, requested: Quantity | None
 ) -> tuple[Quantity, tuple[str, ...] | None]:
-    """What the values are, by the file or else by who asks, and names of their columns."""
+    """Quantity of the values, by the file or else by the caller, and names of their columns."""
     line, words = said.get("PARAM_OUT", (said["DIM"][0], []))
     word = words[0] if words else "UNKNOWN"
     if word not in _HOLDS:
@@ -121,9 +121,9 @@ def _quantity(
     stated, count, names = _HOLDS[word]
     if count not in (0, dim_y):
         raise line.error(f"{word} has {count} columns, DIM says {dim_y}")
-    if given is not None and stated not in (None, given):
-        raise ValueError(f"{path}: quantity is {given!r}, this alta file says {stated!r}")
-    holds = stated or given
+    if requested is not None and stated not in (None, requested):
+        raise ValueError(f"{path}: quantity is {requested!r}, this alta file says {stated!r}")
+    holds = stated or requested
     if holds is None:
         raise ValueError(
             f"{path}: {f'PARAM_OUT {word}' if words else 'no PARAM_OUT: the header'} does not say what the values are: "
@@ -146,7 +146,7 @@ def _unit(theta: Floats, phi: Floats) -> Floats:
 
 
 def _half(theta_h: Floats, phi_h: Floats, theta_d: Floats, phi_d: Floats) -> Pair:
-    """Of Rusinkiewicz' half and difference angles; the first direction is at the difference angles, as in ALTA."""
+    """Directions from Rusinkiewicz' half and difference angles; the first is at the difference angles, as in ALTA."""
     x, y, z = _unit(theta_d, phi_d).T
     tilted = np.cos(theta_h) * x + np.sin(theta_h) * z, y, np.cos(theta_h) * z - np.sin(theta_h) * x
     turned = np.cos(phi_h) * tilted[0] - np.sin(phi_h) * y, np.sin(phi_h) * tilted[0] + np.cos(phi_h) * y, tilted[2]

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fits.data.formats._text import Line, plural, read_lines, rows, within
+from fits.data.formats._text import Line, plural, read_lines, require_range, rows
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, direction
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
@@ -50,7 +50,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     degrees = any((abs(angle) > 1.0001 * _TURN).any() for angle in angles.values())
     half, turn = (180.0, 360.0) if degrees else (np.pi * 1.0001, _TURN * 1.0001)
     for name, angle in angles.items():
-        within(body, angle, name, (-half, half) if name.startswith("theta") else (-turn, turn))
+        require_range(body, angle, name, (-half, half) if name.startswith("theta") else (-turn, turn))
     if not degrees:
         angles = {name: np.degrees(angle) for name, angle in angles.items()}
     light = angles.get("phi_i", np.full(len(body), LIGHT_AZIMUTH))

@@ -12,8 +12,8 @@ bsdf | bsdf_cos | brf, reflectance
 <that column>_std | _sigma   its standard deviation (optional); an empty cell or nan means unknown
 used                         1 or 0 (optional): whether the sample takes part in fits
 
-A row without a value (an empty cell, nan or NA in a value column) is left out, and a note says how many were. Other
-columns are left out and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
+A row without a value (an empty cell, nan or NA in a value column) is skipped, and a note says how many were. Other
+columns are skipped and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
 them. The delimiter is a comma, semicolon or tab.
 """
 
@@ -70,12 +70,12 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     table = Table(header, body)
     kind, channels = _value_columns(header, table.names, quantity)
     chosen = _QUANTITY_OF[kind]
-    empty = table.leave_out_missing(list(channels.values()))
+    empty = table.skip_missing(list(channels.values()))
 
     written_here = lines[0].text == _FIRST_LINE
     wi, wo, notes = _directions(table, written_here)
     if empty:
-        notes.append(f"left out: {plural(empty, 'data point')} without a value (an empty cell, or nan)")
+        notes.append(f"skipped: {plural(empty, 'data point')} without a value (an empty cell, or nan)")
     if kind != chosen:
         notes.append(f"{named(list(channels.values()))} taken for {_MEANING[chosen]}")
 
@@ -135,7 +135,7 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
 
 
 def csv_text(measurements: Measurements) -> str:
-    """What `write_csv` writes."""
+    """The text of `write_csv`."""
     value_names = _names_to_write(measurements.channels)
     names = ["theta_i", "phi_i", "theta_o", "phi_o", *value_names]
     columns = [
@@ -178,25 +178,25 @@ def _directions(table: Table, written_here: bool) -> tuple[Floats, Floats, list[
 
 
 def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> tuple[str, dict[str, str]]:
-    """What the names of the value columns begin with, one of `_QUANTITY_OF`, and they, as channel name -> column."""
-    found: dict[str, dict[str, str]] = {}
+    """Prefix of the value columns, one of `_QUANTITY_OF`, and their names, as channel name -> column."""
+    columns_of: dict[str, dict[str, str]] = {}
     for name in names:
         kind, channel = _kind_and_channel(name)
         if kind is not None and not name.endswith(SUFFIXES):
-            found.setdefault(kind, {})[channel] = name
-    if not found:
+            columns_of.setdefault(kind, {})[channel] = name
+    if not columns_of:
         allowed = ", ".join(_QUANTITY_OF)
         raise header.error(f"no value column: must be one of {allowed}; the file has {', '.join(names)}")
-    quantities = dict.fromkeys(_QUANTITY_OF[kind] for kind in found)
+    quantities = dict.fromkeys(_QUANTITY_OF[kind] for kind in columns_of)
     if wanted is not None and wanted not in quantities:
         raise header.error(f"no column {wanted!r}, the file has {', '.join(names)}")
     if wanted is None and len(quantities) > 1:
         raise header.error(f"{len(quantities)} quantities ({', '.join(quantities)}): choose one with quantity")
     chosen = next(iter(quantities)) if wanted is None else wanted
-    kinds = [kind for kind in found if _QUANTITY_OF[kind] == chosen]
+    kinds = [kind for kind in columns_of if _QUANTITY_OF[kind] == chosen]
     if len(kinds) > 1:
         raise header.error(f"columns {', '.join(kinds)}: names of one quantity, must be only one of them")
-    columns = found[kinds[0]]
+    columns = columns_of[kinds[0]]
     if kinds[0] in columns.values() and len(columns) > 1:
         raise header.error(
             f"columns {', '.join(columns.values())}: one without a channel name cannot stand beside others"
@@ -208,7 +208,7 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
 
 
 def _kind_and_channel(column: str) -> tuple[str | None, str]:
-    """Which of `_QUANTITY_OF` the name of a column begins with, None for another column, and the channel it names."""
+    """Prefix of a column's name, one of `_QUANTITY_OF` or None for another column, and the channel that it names."""
     longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
     kind = next((known for known in longest_first if column == known or column.startswith(f"{known}_")), None)
     return kind, column.removeprefix(kind or "").removeprefix("_") or channel_names(1)[0]

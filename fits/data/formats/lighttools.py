@@ -118,7 +118,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
 
 
 def _header(rest: Rows) -> tuple[dict[str, str], dict[str, Floats]]:
-    """What is said before DataBegin."""
+    """The header before DataBegin."""
     choices: dict[str, str] = {}
     angles: dict[str, Floats] = {}
     while True:

@@ -7,9 +7,9 @@ reciprocity phi_d has a period of 180 degrees. A negative value marks what could
 Bin centres: the database's own lookup code truncates the index, so that bin i covers [i, i + 1). We take its value to
 stand at i + 1/2 in each index. Readers that put it at i differ by half a bin, which near a sharp peak is a lot.
 
-Readings are taken at the centres of bins unless asked otherwise. Between them a table has to be interpolated, which is
-off near peaks: from an exact table of flakes (roughness 0.02) over paint a fit of such readings, each taken for good
-to 1 %, finds an optical depth of 0.828 +- 0.002 for 0.8, and at the centres 0.8.
+Measurements are taken at the centres of bins by default. Between them a table has to be interpolated, which is
+off near peaks: from an exact table of flakes (roughness 0.02) over paint a fit of interpolated values, each taken to be
+accurate to 1 %, finds an optical depth of 0.828 +- 0.002 for 0.8, and at the centres 0.8.
 """
 
 import itertools
@@ -55,12 +55,12 @@ def read(
     geometry: the directions, both above the surface. Default: incidence 10, 30, 50, 70 degrees, detector from -85 to 85
         degrees in steps of 5 in the planes at azimuth 0, 30 and 60 degrees; for "centre" all polar angles are half a
         degree more, because the bins at mirror directions have theta_i = theta_o = j + 1/2 degrees.
-    lookup: "centre" gives each bin's value as it is and, in place of the directions asked for, those at the centre of
+    lookup: "centre" gives each bin's value as it is and, in place of the requested directions, those at the centre of
         a bin near them: the incidence within 0.2 degrees where there is such a bin, the viewer a few degrees away, and
-        more only in azimuth around light near the normal. No bin is read twice, so that there may be fewer readings
-        than were asked for.
+        more only in azimuth around light near the normal. No bin is read twice, so that there may be fewer measurements
+        than directions.
         "linear" interpolates between the 8 nearest bin centres, "nearest" takes the bin that the angles fall into, as
-        the database's own code does: both keep the directions asked for.
+        the database's own code does: both keep the requested directions.
     bins: instead of slices, so many bins that hold a measurement, at most 100,000, or "all" of them (1.4 million).
     strata: what each of so many bins stands for an equal share of: "bins" of the table, which are dense around the
         mirror direction, or "flux", the projected solid angle of light and viewer, as in an integral over both.
@@ -94,7 +94,7 @@ def read(
         else:
             corners, weights = corners_around(index)
     values, valid, more_notes = _looked_up(path, table, corners, weights)
-    return _readings(path, geometry, values, valid, notes + more_notes)
+    return _samples(path, geometry, values, valid, notes + more_notes)
 
 
 def _looked_up(
@@ -105,11 +105,11 @@ def _looked_up(
     lost = _damaged(path, corner_values).any(axis=(0, 1))
     valid = np.asarray((corner_values >= 0).all(axis=(0, 1)))
     if lost.all():
-        raise ValueError(f"{path}: all bins that are asked for hold nan")
+        raise ValueError(f"{path}: all bins that are requested hold nan")
     values = np.where(valid, (weights * corner_values).sum(axis=1), 0.0).T * SCALE
     notes = []
     if lost.any():
-        notes.append(f"left out: {plural(int(lost.sum()), 'data point')} that need a bin that holds nan")
+        notes.append(f"skipped: {plural(int(lost.sum()), 'data point')} that need a bin that holds nan")
     if not (valid | lost).all():
         count = int((~valid & ~lost).sum())
         notes.append(f"masked: {plural(count, 'sample')} that need a bin without a measurement")
@@ -117,7 +117,7 @@ def _looked_up(
 
 
 def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, seed: int) -> Measurements:
-    """Readings at the centres of bins that hold a measurement."""
+    """Measurements at the centres of bins that hold one."""
     table = _table(path)
     lost = _damaged(path, table).any(axis=0)
     wi, wo = centre(np.stack(np.unravel_index(np.arange(np.prod(SHAPE)), SHAPE), axis=-1))
@@ -126,7 +126,7 @@ def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, s
     if not readable.any():
         raise ValueError(f"{path}: no bin holds a measurement")
     if bins == "all":
-        chosen, note = merl_bins.every(readable)
+        chosen, note = merl_bins.all_bins(readable)
     else:
         measure = np.ones(SHAPE)
         if strata == "flux":
@@ -140,11 +140,11 @@ def _of_bins(path: Path, bins: int | Literal["all"], strata: merl_bins.Strata, s
     geometry = Geometry(_turned(wi, turn), _turned(wo, turn))
     notes = [CONVENTION, note]
     if lost.any():
-        notes.append(f"left out: {plural(int(lost.sum()), 'bin')} of the table that hold nan")
-    return _readings(path, geometry, values, np.ones(len(values), bool), notes)
+        notes.append(f"skipped: {plural(int(lost.sum()), 'bin')} of the table that hold nan")
+    return _samples(path, geometry, values, np.ones(len(values), bool), notes)
 
 
-def _readings(
+def _samples(
     path: Path, geometry: Geometry, values: Floats, valid: NDArray[np.bool_], notes: list[str]
 ) -> Measurements:
     source = Source(str(path), "merl", "brdf", tuple(notes))
@@ -152,7 +152,7 @@ def _readings(
 
 
 def _damaged(path: Path, values: Floats) -> NDArray[np.bool_]:
-    """Where values are nan, which programs write for what was not measured; ValueError for infinite ones."""
+    """Mask of values that are nan, which programs write for bins not measured; ValueError for infinite ones."""
     if np.isinf(values).any():
         raise ValueError(f"{path}: the table holds {values[np.isinf(values)][0]}, must be finite")
     return np.isnan(values)
@@ -193,47 +193,47 @@ def index_of(theta_h: Floats, theta_d: Floats, phi_d: Floats) -> Floats:
     return np.stack([np.sqrt(share_h), share_d, phi_d / np.pi], axis=-1) * SHAPE
 
 
-def _at_centres(asked: Geometry) -> tuple[Geometry, Indices, list[str]]:
-    """Pairs of directions at centres of bins near those asked for, their bins (M, 3), none twice, and notes on both.
+def _at_centres(requested: Geometry) -> tuple[Geometry, Indices, list[str]]:
+    """Pairs of directions at centres of bins near the requested ones, their bins (M, 3), none twice, and notes on both.
 
     The azimuth of the light is kept: of an isotropic material it is free.
     """
-    bins, found = _near(asked)
+    bins, found = _near(requested)
     if not found.any():
         raise ValueError("geometry holds only pairs too near the horizon: no bin there has its centre above it")
     _, first = np.unique((bins % SHAPE)[found], axis=0, return_index=True)
     kept = np.flatnonzero(found)[np.sort(first)]
-    total, bins, asked = len(asked), bins[kept], Geometry(asked.wi[kept], asked.wo[kept])
+    total, bins, requested = len(requested), bins[kept], Geometry(requested.wi[kept], requested.wo[kept])
     wi, wo = centre(bins)
-    incidence, along, across = _distances(asked, wi, wo)
+    incidence, along, across = _distances(requested, wi, wo)
     notes = [
-        f"readings at the centres of {plural(len(bins), 'bin')}; from the directions asked for the incidence differs "
-        f"by up to {incidence.max():.2g} degrees, the viewer by up to {np.hypot(along, across).max():.2g}"
+        f"measurements at the centres of {plural(len(bins), 'bin')}; from the requested directions the incidence "
+        f"differs by up to {incidence.max():.2g} degrees, the viewer by up to {np.hypot(along, across).max():.2g}"
     ]
     if len(bins) < total:
         reason = "their bins were already read, or no bin near them has its centre above the horizon"
-        notes.append(f"left out: {total - len(bins)} of the {plural(total, 'pair')} asked for: {reason}")
-    turn = np.radians(_light_azimuth(asked.wi) - azimuth(wi))
+        notes.append(f"skipped: {total - len(bins)} of the {plural(total, 'pair')} requested: {reason}")
+    turn = np.radians(_light_azimuth(requested.wi) - azimuth(wi))
     return Geometry(_turned(wi, turn), _turned(wo, turn)), bins % SHAPE, notes
 
 
-def _near(asked: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
+def _near(requested: Geometry) -> tuple[Indices, NDArray[np.bool_]]:
     """A bin for each pair (N, 3), with phi_d counted on to 360 for exchanged directions, and whether there is one (N,).
 
     It is the one whose viewer is nearest, among those within `SAME_INCIDENCE` of the incidence where there are any.
     """
-    theta_h, theta_d, phi_d = _half_difference(asked.wi, asked.wo)
+    theta_h, theta_d, phi_d = _half_difference(requested.wi, requested.wo)
     start = np.floor(index_of(theta_h, theta_d, phi_d)).astype(int)
     stride = np.ones_like(start)
     # where theta_d is small a step of phi_d hardly moves anything: several at once
     stride[:, 2] = np.rint(1 / np.maximum(np.sin(theta_d), 0.01))
-    bins, least = start, np.full(len(asked), np.inf)
+    bins, least = start, np.full(len(requested), np.inf)
     for step in itertools.product(range(-REACH, REACH + 1), repeat=3):
         tried = start + stride * np.array(step)
         wi, wo = centre(tried)
         exists = ((tried >= 0) & (tried < SHAPE))[:, :2].all(axis=-1) & (wi[:, 2] > 0) & (wo[:, 2] > 0)
-        incidence, along, across = _distances(asked, wi, wo)
-        # across counts double, so that what was asked for in the plane of incidence stays near it
+        incidence, along, across = _distances(requested, wi, wo)
+        # across counts double, so that requests in the plane of incidence stays near it
         far = np.hypot(along, 2 * across) + 100 * np.maximum(incidence - SAME_INCIDENCE, 0)
         better = exists & (far < least - 1e-6)  # of equally near ones the first, whatever the rounding
         bins, least = np.where(better[:, None], tried, bins), np.where(better, far, least)
@@ -254,11 +254,11 @@ def _angles(i: Indices, j: Indices, k: Indices) -> tuple[Floats, Floats, Floats]
     return share_h**2 * (np.pi / 2), share_d * (np.pi / 2), share_phi * np.pi
 
 
-def _distances(asked: Geometry, wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:
-    """How far pairs are from those asked for, (N,) degrees: incidence, viewer in polar angle, and viewer sideways."""
-    turn = azimuth(wo) - azimuth(wi) - azimuth(asked.wo) + _light_azimuth(asked.wi)
-    sideways = ((turn + 180.0) % 360.0 - 180.0) * np.sin(np.radians(polar(asked.wo)))
-    return abs(polar(wi) - polar(asked.wi)), polar(wo) - polar(asked.wo), sideways
+def _distances(requested: Geometry, wi: Floats, wo: Floats) -> tuple[Floats, Floats, Floats]:
+    """Distance from the requested pairs, (N,) degrees: incidence, viewer in polar angle, and viewer sideways."""
+    turn = azimuth(wo) - azimuth(wi) - azimuth(requested.wo) + _light_azimuth(requested.wi)
+    sideways = ((turn + 180.0) % 360.0 - 180.0) * np.sin(np.radians(polar(requested.wo)))
+    return abs(polar(wi) - polar(requested.wi)), polar(wo) - polar(requested.wo), sideways
 
 
 def _light_azimuth(wi: Floats) -> Floats:

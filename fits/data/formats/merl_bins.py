@@ -1,7 +1,7 @@
-"""Which bins of a MERL table are read where no directions are asked for: every one, or a stratified choice.
+"""Bins of a MERL table that are read without given directions: all of them, or a stratified choice.
 
 A choice follows a low-discrepancy sequence through the table, with the probability of a bin in proportion to what it
-counts for. All readings then stand for equally much, and none needs a weight in a likelihood.
+counts for. All measurements then have equal weight in a likelihood.
 """
 
 from typing import cast
@@ -27,14 +27,14 @@ Indices = NDArray[np.int_]
 Table = NDArray[np.float64]
 
 
-def every(readable: NDArray[np.bool_]) -> tuple[Indices, str]:
+def all_bins(readable: NDArray[np.bool_]) -> tuple[Indices, str]:
     """The bins (N, 3) that can be read, and a note."""
     bins = np.argwhere(readable)
-    return bins, f"readings at the centres of {_of(len(bins), readable)}"
+    return bins, f"measurements at the centres of {_count_of(len(bins), readable)}"
 
 
 def choice(readable: NDArray[np.bool_], measure: Table, count: int, strata: Strata, seed: int) -> tuple[Indices, str]:
-    """So many of the bins that can be read, (count, 3), none twice, each for an equal share of `measure`; and a note.
+    """Choose `count` of the readable bins, (count, 3), none twice, each for an equal share of `measure`; and a note.
 
     Raises:
         ValueError: there are not so many.
@@ -53,10 +53,10 @@ def choice(readable: NDArray[np.bool_], measure: Table, count: int, strata: Stra
             break
         points = np.concatenate([points, sequence.random(len(points))])
     else:
-        raise ValueError(f"bins is {count}, but only {len(first)} of them count for more than nothing; ask for fewer")
+        raise ValueError(f"bins is {count}, but only {len(first)} of them count for more than nothing; choose fewer")
     stands = {"bins": "bins of the table", "flux": "projected solid angle of light and viewer"}[strata]
-    note = f"readings at the centres of {_of(count, readable)}, each for an equal share of the {stands} (seed {seed})"
-    return bins[np.sort(first)[:count]], note
+    centres = f"measurements at the centres of {_count_of(count, readable)}"
+    return bins[np.sort(first)[:count]], f"{centres}, each for an equal share of the {stands} (seed {seed})"
 
 
 def check(bins: object, strata: object, seed: object) -> None:
@@ -89,5 +89,5 @@ def _of_points(weight: Table, points: Floats) -> Indices:
     return bins
 
 
-def _of(count: int, readable: NDArray[np.bool_]) -> str:
+def _count_of(count: int, readable: NDArray[np.bool_]) -> str:
     return f"{plural(count, 'bin')} of {readable.sum():,} that can be read"

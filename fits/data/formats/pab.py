@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fits.data.formats._text import Line, plural, read_lines, rows, within
+from fits.data.formats._text import Line, plural, read_lines, require_range, rows
 from fits.data.geometry import TANGENT_COSINE, direction
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
@@ -49,8 +49,8 @@ def read(path: Path) -> Measurements:
     if not body:
         raise ValueError(f"{path}: no samples below the header, must be at least one")
     table = rows(body, 2 + len(channels))
-    within(body, table[:, 0], "theta", _POLAR)
-    within(body, table[:, 1], "phi", _AZIMUTH)
+    require_range(body, table[:, 0], "theta", _POLAR)
+    require_range(body, table[:, 1], "phi", _AZIMUTH)
     wi = np.broadcast_to(direction(theta, phi), (len(body), 3))
     wo = direction(table[:, 0], table[:, 1])
     values = to_bsdf(table[:, 2:], wo, quantity)

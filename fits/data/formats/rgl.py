@@ -1,7 +1,7 @@
-"""Readings from RGL's measured materials (see `rgl_table`): at the nodes of their grids, or between these along slices.
+"""Measurements from RGL's measured materials (see `rgl_table`): at the nodes of their grids, or along slices.
 
-The database measured at the nodes, so that these are its readings. A file holds f cos(theta_o); near the horizon the
-quotient is of two small numbers, and it is left out there.
+The database was measured at the nodes. A file holds f cos(theta_o); near the horizon the
+quotient is of two small numbers, and it is skipped there.
 """
 
 from pathlib import Path
@@ -17,10 +17,10 @@ from fits.data.geometry import LIGHT_AZIMUTH, Floats, Geometry
 from fits.data.measurements import Measurements, Source
 
 MOST = 20_000
-"""Readings of twice as many nodes or more, unless all or some number of them are asked for."""
+"""Measurements that are read of twice as many nodes or more, by default."""
 
 LOWEST = 0.01
-"""Cosine of the viewer, of readings that are taken."""
+"""Least cosine of the viewer of measurements that are read."""
 
 
 def recognises(head: bytes) -> bool:
@@ -76,11 +76,11 @@ def _at_nodes(
     count = int(readable.sum())
     if bins == "all" or (bins is None and count < 2 * MOST):
         place = np.argwhere(readable)
-        note = f"readings at all {plural(count, 'node')} above the horizon"
+        note = f"measurements at all {plural(count, 'node')} above the horizon"
     else:
         wanted = MOST if bins is None else bins
         place, _ = merl_bins.choice(readable, np.ones(readable.shape), wanted, "bins", seed)
-        note = f"readings at {wanted:,} of {count:,} nodes above the horizon, from all over the file (seed {seed})"
+        note = f"measurements at {wanted:,} of {count:,} nodes above the horizon, from all over the file (seed {seed})"
     light, row, column = place.T
     values = table.values.reshape(len(wi), *table.values.shape[2:])[light, :, row, column]
     at = (light, row, column)

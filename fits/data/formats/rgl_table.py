@@ -1,7 +1,7 @@
 """The table in a file of RGL's measured materials (Dupuy & Jakob 2018), which Mitsuba and pbrt read.
 
 For each direction of the light, at the nodes ``theta_i`` and ``phi_i``, the file holds a grid of values over the unit
-square. Where a point of the square looks is told by ``vndf``, a density on the square (u, v) of half vectors, u =
+square. A point of the square has its direction by ``vndf``, a density on the square (u, v) of half vectors, u =
 sqrt(2 theta / pi) and v = (phi + pi) / 2 pi, with phi from that of the light where the material is isotropic: the point
 is the pair of numbers that draws the half vector from it. Values are f cos(theta_o) = value D / (4 sigma), with D the
 table ``ndf`` over half vectors and sigma the table ``sigma`` over directions of the light (``jacobian`` 1), or as they
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.data.formats._square import Between, Density, bilinear
+from fits.data.formats._square import Density, Interpolation, bilinear
 from fits.data.formats._tensor_file import Fields, fields_as_bytes, read_fields
 from fits.data.geometry import Floats
 
@@ -37,7 +37,7 @@ _DIMENSIONS = {
 
 @dataclass(frozen=True)
 class Table:
-    """What such a file holds.
+    """Content of such a file.
 
     theta_i (T,), phi_i (P,): of the light, radians, ascending. ndf, sigma: (h, w), rows over azimuth. vndf: (P, T, h,
     w). luminance: (P, T, n, n), what is drawn from. values: (P, T, C, n, n). wavelengths: (C,) nm; None for red, green
@@ -65,25 +65,25 @@ class Table:
 
     @property
     def turns(self) -> int:
-        """How often the azimuths that the file holds make the full circle; 1 for an isotropic material."""
+        """Number of times that the azimuths of the file fill the circle; 1 for an isotropic material."""
         if self.isotropic:
             return 1
         return int(np.rint(2 * np.pi / (self.phi_i[-1] - self.phi_i[0])))
 
     @cached_property
     def density(self) -> Density:
-        """Of half vectors, for each direction of the light, azimuths first."""
+        """Density of half vectors, for each direction of the light, azimuths first."""
         return Density(self.vndf.reshape(-1, *self.vndf.shape[2:]))
 
     def factor(self, theta_m: Floats, phi_m: Floats, theta_i: Floats, phi_i: Floats) -> Floats:
-        """What values are multiplied by, (N,)."""
+        """Factor of the values, (N,)."""
         if not self.jacobian:
             return np.ones_like(theta_m)
         sigma = bilinear(self.sigma[None], to_u(theta_i), to_v(phi_i))
         return bilinear(self.ndf[None], to_u(theta_m), to_v(phi_m)) / (4.0 * sigma)
 
     def nodes(self, place: slice = slice(None)) -> tuple[Floats, Floats, Floats, Floats]:
-        """Where values stand: azimuth of the light (L,), its polar angle (L,), of half vectors theta, phi (L, n, n).
+        """Nodes of the values: azimuth of the light (L,), its polar angle (L,), of half vectors theta, phi (L, n, n).
 
         The azimuth of half vectors is from that of the light where the material is isotropic. place: some of the L
         directions.
@@ -100,7 +100,7 @@ def to_u(theta: Floats) -> Floats:
 
 
 def to_v(phi: Floats) -> Floats:
-    """Of azimuths in any turn; those that stand for the end of the square stand for its start."""
+    """v of azimuths in any turn; the end of the square is its start."""
     v = (phi + np.pi) / (2.0 * np.pi)
     return v - np.floor(v)
 
@@ -126,10 +126,10 @@ def look_up(table: Table, wi: Floats, wo: Floats) -> Floats:
     theta_i, phi_i = _angles(wi)
     theta_m, phi_m = _angles(half)
     turn = phi_m - phi_i if table.isotropic else phi_m
-    between = _between(table, theta_i, phi_i)
-    x, y, _ = table.density.undrawn(to_u(theta_m), to_v(turn), between)
+    interpolation = _interpolation(table, theta_i, phi_i)
+    x, y, _ = table.density.undrawn(to_u(theta_m), to_v(turn), interpolation)
     values = table.values.reshape(len(table.phi_i) * len(table.theta_i), *table.values.shape[2:])
-    found = [bilinear(values[:, channel], x, y, between) for channel in range(values.shape[1])]
+    found = [bilinear(values[:, channel], x, y, interpolation) for channel in range(values.shape[1])]
     return np.stack(found, axis=-1) * table.factor(theta_m, turn, theta_i, phi_i)[:, None]
 
 
@@ -147,13 +147,13 @@ def _angles(w: Floats) -> tuple[Floats, Floats]:
     return np.arctan2(np.hypot(w[:, 0], w[:, 1]), w[:, 2]), np.arctan2(w[:, 1], w[:, 0])
 
 
-def _between(table: Table, theta_i: Floats, phi_i: Floats) -> Between:
-    """The directions of the light around each asked for, clamped to those of the file."""
+def _interpolation(table: Table, theta_i: Floats, phi_i: Floats) -> Interpolation:
+    """Interpolation between the file's directions of the light, clamped to their range."""
     phi, share_phi = _around(table.phi_i, phi_i)
     theta, share_theta = _around(table.theta_i, theta_i)
     index = phi[:, :, None] * len(table.theta_i) + theta[:, None, :]
     share = share_phi[:, :, None] * share_theta[:, None, :]
-    return Between(index.reshape(len(index), -1), share.reshape(len(index), -1))
+    return Interpolation(index.reshape(len(index), -1), share.reshape(len(index), -1))
 
 
 def _around(nodes: Floats, at: Floats) -> tuple[NDArray[np.int_], Floats]:
@@ -214,7 +214,7 @@ def read_table(path: Path) -> Table:
 
 
 def _numbers(path: Path, fields: Fields, name: str) -> Floats:
-    with np.errstate(invalid="ignore"):  # of what is no number, which is told next
+    with np.errstate(invalid="ignore"):  # of values that are no numbers, which are refused next
         values = np.asarray(fields[name], float)
     if not np.isfinite(values).all():
         raise ValueError(f"{path}: field {name!r} holds {values[~np.isfinite(values)][0]}, must be finite")

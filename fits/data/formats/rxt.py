@@ -35,7 +35,7 @@ Indices = NDArray[np.int_]
 
 FIRST = "IAD1"
 HEADER = 17
-"""Numbers before the readings: seven of the sample and how it was read, and five of each sphere."""
+"""Numbers before the measurements: seven of the sample and how it was read, and five of each sphere."""
 
 LETTERS: dict[str, Kind] = {"r": "reflectance", "t": "transmittance", "u": "unscattered"}
 COUNTED = "rtuwWRT"
@@ -69,19 +69,19 @@ UNUSED = {
     "e": "tolerance",
     "q": "quadrature",
 }
-"""Columns that iad's inversion takes and that say nothing of the measurements."""
+"""Columns of settings of iad's inversion, which do not concern the measurements."""
 
 MUST_BE = {"c": 1.0, "C": 1.0, "E": 0.0}
-"""What the model cannot follow otherwise."""
+"""Columns whose other values the model does not support."""
 
 SMOOTH = 1e-4
 """Roughness of a polished face."""
 
-ALIKE = 0.01
-"""Numbers of the slab and of the standard that vary by less from row to row, of their value, are taken for one."""
+SAME_VALUE = 0.01
+"""Relative variation from row to row below which numbers of the slab and of the standard count as one."""
 
-WALLS_ALIKE = 0.002
-"""Reflectances of walls that do: what is lost at a wall decides, not what is sent back."""
+SAME_WALLS = 0.002
+"""The same, absolute, for reflectances of walls, as their absorptance matters."""
 
 _TWO_BEAMS = re.compile(r"(?i:dual[ -]?beam)|\biad\s(.*\s)?-X\b")
 
@@ -130,9 +130,9 @@ def read_slab(
         path: the file.
         incidence: polar angle of the light, in [0, 90) degrees; None: that of column ``i``, or 0 without one.
         sigma: standard deviation of every measurement, above 0; the format does not say it.
-        corrected: the readings are of the slab itself, whatever the spheres: two beams were compared, say. Else what
-            spheres add is part of the model (`Spheres`): of one at a time, each for its reading, or of two together.
-            None: corrected if a comment of the file says that two beams were compared, and a note tells of it.
+        corrected: values are those of the slab itself, whatever the spheres: two beams were compared, say. Else what
+            spheres add is part of the model (`Spheres`): of one at a time, each for its value, or of two together.
+            None: corrected if a comment of the file says that two beams were compared, and a note says so.
         wavelengths: the lowest and the highest that are read, in nm; None for all rows.
 
     Raises:
@@ -147,11 +147,11 @@ def read_slab(
         raise ValueError(f"{path}: not an .rxt file, which begins with {FIRST}")
     words = words[1:]
     if len(words) < HEADER:
-        raise ValueError(f"{path}: {len(words)} numbers, must be {HEADER} before the readings")
+        raise ValueError(f"{path}: {len(words)} numbers, must be {HEADER} before the measurements")
     header = [line.parse(text, place) for place, (line, text) in enumerate(words[:HEADER], start=1)]
     columns = _columns(path, words[HEADER:])
     if wavelengths is not None:
-        columns = _within(path, columns, *_interval(wavelengths))
+        columns = _select(path, columns, *_interval(wavelengths))
     if not any(letter in columns for letter in LETTERS):
         raise ValueError(f"{path}: no column of r, t or u")
     for letter, needed in MUST_BE.items():
@@ -176,18 +176,18 @@ def read_slab(
     )
 
 
-def _totals(path: Path, columns: dict[str, Floats], given: float | None, sigma: float) -> tuple[Totals, Indices]:
-    """Readings by incidence and channel, and the rows (C,) of the first incidence, which name the channels."""
+def _totals(path: Path, columns: dict[str, Floats], incidence: float | None, sigma: float) -> tuple[Totals, Indices]:
+    """Measurements by incidence and channel, and the rows (C,) of the first incidence, which name the channels."""
     count = len(next(iter(columns.values())))
-    if given is not None and "i" in columns:
-        raise ValueError(f"{path}: incidence is {given:g}, and the file has a column i of its own: leave it out")
-    at = columns.get("i", np.full(count, given or 0.0))
+    if incidence is not None and "i" in columns:
+        raise ValueError(f"{path}: incidence is {incidence:g}, and the file has a column i of its own: use that")
+    at = columns.get("i", np.full(count, incidence or 0.0))
     angles = at[np.sort(np.unique(at, return_index=True)[1])]
     rows = [np.flatnonzero(at == angle) for angle in angles]
     waves = columns.get("L")
     for angle, own in zip(angles, rows, strict=True):
-        alike = len(own) == len(rows[0]) and (waves is None or np.array_equal(waves[own], waves[rows[0]]))
-        if not alike:
+        equal = len(own) == len(rows[0]) and (waves is None or np.array_equal(waves[own], waves[rows[0]]))
+        if not equal:
             raise ValueError(
                 f"{path}: rows at {angle:g} degrees have other wavelengths than those at {angles[0]:g}, must have "
                 "the same: restrict the wavelengths"
@@ -219,12 +219,12 @@ def _compared(
             "say which holds with corrected (--corrected, --no-corrected)"
         )
     return None, [
-        "a comment says that two beams were compared: spheres are left out, as by iad -X (--no-corrected counts them)"
+        "a comment says that two beams were compared: spheres are ignored, as by iad -X (--no-corrected counts them)"
     ]
 
 
 def _described(path: Path, header: list[float], columns: dict[str, Floats]) -> Spheres | None:
-    """What header and columns say of spheres; a sphere of no diameter is none."""
+    """Spheres of header and columns; a diameter of 0 means no sphere."""
     counts = [columns[letter] for letter in "SM" if letter in columns] or [np.array(header[6:7])]
     if len(set(np.concatenate(counts))) > 1:
         raise ValueError(f"{path}: the number of spheres varies; restrict the wavelengths")
@@ -233,8 +233,8 @@ def _described(path: Path, header: list[float], columns: dict[str, Floats]) -> S
         raise ValueError(f"{path}: number of spheres is {count:g}, must be 0, 1 or 2")
     if count == 0:
         return None
-    walls = [_one(path, "w", columns, header[11], WALLS_ALIKE)]
-    walls.append(_one(path, "W" if "W" in columns else "w", columns, header[16], WALLS_ALIKE))
+    walls = [_one(path, "w", columns, header[11], SAME_WALLS)]
+    walls.append(_one(path, "W" if "W" in columns else "w", columns, header[16], SAME_WALLS))
     standard = _one(path, "R", columns, header[5])
     ports = header[7:11], header[12:16]
     try:
@@ -259,13 +259,13 @@ def _interval(wavelengths: Any) -> tuple[float, float]:
 
 
 def _words(line: Line) -> list[tuple[Line, str]]:
-    """What stands on a line, without its comment; ``IAD1`` is a word of its own."""
+    """Words of a line, without its comment; ``IAD1`` is a word of its own."""
     text = line.text.partition("#")[0].replace(",", " ")
     return [(line, word) for word in re.sub(rf"^\s*{FIRST}", f"{FIRST} ", text).split()]
 
 
 def _columns(path: Path, words: list[tuple[Line, str]]) -> dict[str, Floats]:
-    """The readings by the letters of their columns, (rows,) each."""
+    """The measurements by the letters of their columns, (rows,) each."""
     letters: list[str] = []
     place = 0
     while place < len(words) and not _is_number(words[place][1]):
@@ -274,7 +274,7 @@ def _columns(path: Path, words: list[tuple[Line, str]]) -> dict[str, Floats]:
     if letters:
         return _lettered(path, letters, words[place:])
     if not words:
-        raise ValueError(f"{path}: no readings behind the description of the spheres")
+        raise ValueError(f"{path}: no measurements after the description of the spheres")
     line, text = words[0]
     count = line.parse(text, "number of measurements", (1.0, len(COUNTED)))
     if count != int(count):
@@ -298,12 +298,12 @@ def _lettered(path: Path, letters: list[str], words: list[tuple[Line, str]]) -> 
         for found in on_lines.values():
             if len(found) % len(letters):
                 raise found[0].error(f"{plural(len(found), 'number')}, must be {len(letters)}: {' '.join(letters)}")
-        raise ValueError(f"{path}: no readings behind the names of the columns")
+        raise ValueError(f"{path}: no measurements after the names of the columns")
     rows = np.array(numbers).reshape(-1, len(letters))
     return {letter: rows[:, place] for place, letter in enumerate(letters)}
 
 
-def _within(path: Path, columns: dict[str, Floats], low: float, high: float) -> dict[str, Floats]:
+def _select(path: Path, columns: dict[str, Floats], low: float, high: float) -> dict[str, Floats]:
     """The rows of these wavelengths."""
     if "L" not in columns:
         raise ValueError(f"{path}: the rows have no wavelengths to choose by")
@@ -316,12 +316,12 @@ def _within(path: Path, columns: dict[str, Floats], low: float, high: float) -> 
     return {letter: column[keep] for letter, column in columns.items()}
 
 
-def _one(path: Path, letter: str, columns: dict[str, Floats], default: float, within: float | None = None) -> float:
-    """One number for all rows: their mean, where they are alike: within so much, or `ALIKE` of it."""
+def _one(path: Path, letter: str, columns: dict[str, Floats], default: float, tolerance: float | None = None) -> float:
+    """One number for all rows: their mean, if they are equal within `tolerance`, or `SAME_VALUE` of it."""
     if letter not in columns:
         return default
     values = columns[letter]
-    if np.ptp(values) > (ALIKE * np.mean(values) if within is None else within):
+    if np.ptp(values) > (SAME_VALUE * np.mean(values) if tolerance is None else tolerance):
         raise ValueError(
             f"{path}: {letter}, the {COLUMNS[letter]}, goes from {values.min():g} to {values.max():g}, "
             "and one slab has one: restrict the wavelengths, by wavelengths=(low, high) or --wavelengths LOW,HIGH"

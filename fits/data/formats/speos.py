@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from fits.data.formats._rows import Rows
-from fits.data.formats._text import plural, read_lines, require_room, within, without_mark
+from fits.data.formats._text import plural, read_lines, require_range, require_room, without_mark
 from fits.data.geometry import LIGHT_AZIMUTH, TANGENT_COSINE, Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names, to_bsdf
 from fits.names import Quantity
@@ -43,7 +43,7 @@ class Table:
 
     @property
     def side(self) -> Side:
-        """Of the viewer, from that of the light."""
+        """Azimuth of the viewer, from that of the light."""
         return "transmission" if self.theta.max() > 90.0 else "reflection"
 
     def share(self, quantity: Quantity) -> float:
@@ -123,7 +123,7 @@ def _table(lines: Rows, rotation: float, incidence: float) -> Table:
     place = lines.last
     body, numbers = lines.table(rows, 1 + columns, "a row of a table")
     theta = numbers[:, 0]
-    within(body, theta, "theta", (0.0, 180.0))
+    require_range(body, theta, "theta", (0.0, 180.0))
     if (np.diff(theta) <= 0).any() or (np.diff(phi) <= 0).any():
         raise place.error("angles of this table do not rise")
     if theta[0] < 90.0 < theta[-1]:
@@ -137,7 +137,7 @@ def _read_isotropic(path: Path, lines: Rows) -> Measurements:
     incidences = lines.numbers(int(counts[0]), "incidences", (0.0, 90.0))
     wavelengths = lines.numbers(int(counts[1]), "wavelengths", (0.0, 1e6))
     names = tuple(f"{one:.12g} nm" for one in wavelengths) if len(wavelengths) > 1 else channel_names(1)
-    found: dict[Side, list[list[Floats]]] = {side: [] for side in header.sides}
+    scaled: dict[Side, list[list[Floats]]] = {side: [] for side in header.sides}
     nodes: dict[Side, list[Table]] = {side: [] for side in header.sides}
     factors = []
     for _ in range(len(header.sides) * counts[0] * counts[1]):
@@ -145,22 +145,22 @@ def _read_isotropic(path: Path, lines: Rows) -> Measurements:
         place = lines.last
         table = _table(lines, 0.0, 0.0)
         side = table.side
-        if side not in found or (len(nodes[side]) == counts[0] and len(found[side][-1]) == counts[1]):
+        if side not in scaled or (len(nodes[side]) == counts[0] and len(scaled[side][-1]) == counts[1]):
             raise place.error(f"a table of {side} too many")
-        if not found[side] or len(found[side][-1]) == counts[1]:
+        if not scaled[side] or len(scaled[side][-1]) == counts[1]:
             incidence = float(incidences[len(nodes[side])])
             nodes[side].append(Table(0.0, incidence, table.theta, table.phi, table.values))
-            found[side].append([])
+            scaled[side].append([])
         first = nodes[side][-1]
         if not (np.array_equal(first.theta, table.theta) and np.array_equal(first.phi, table.phi)):
             raise place.error("tables of one incidence have different angles at different wavelengths")
         factors.append(_factor(0.01 * percent, table.share(header.quantity)))
-        found[side][-1].append(factors[-1] * table.values.ravel())
+        scaled[side][-1].append(factors[-1] * table.values.ravel())
     lines.end(allowed=_END)
     parts = [
-        _readings(table, np.stack(values, axis=-1), header.quantity)
+        _samples(table, np.stack(values, axis=-1), header.quantity)
         for side in header.sides
-        for table, values in zip(nodes[side], found[side], strict=True)
+        for table, values in zip(nodes[side], scaled[side], strict=True)
     ]
     return _measurements(
         path, parts, names, header, factors, ["angles as in anisotropic files: light from azimuth 180"]
@@ -204,7 +204,7 @@ def _read_anisotropic(path: Path, lines: Rows) -> Measurements:
         reference = _reference(tables[side], spectrum, header.quantity)
         factor = np.array([_factor(one, reference) for one in share])
         factors += list(factor)
-        parts += [_readings(table, table.values.ravel()[:, None] * factor, header.quantity) for table in tables[side]]
+        parts += [_samples(table, table.values.ravel()[:, None] * factor, header.quantity) for table in tables[side]]
     note = "the vector that marks the sample is azimuth 0; rotations taken as counter-clockwise from the light's travel"
     return _measurements(path, parts, names, header, factors, [note])
 
@@ -219,11 +219,11 @@ def _reference(tables: list[Table], spectrum: _Spectrum, quantity: Quantity) -> 
 
 
 def _factor(wanted: float, share: float) -> float:
-    """Of values; 1 where a table holds nothing that could be scaled."""
+    """Scale of values; 1 where a table holds nothing that could be scaled."""
     return wanted / share if share > 0.0 else 1.0
 
 
-def _readings(table: Table, values: Floats, quantity: Quantity) -> tuple[Floats, Floats, Floats]:
+def _samples(table: Table, values: Floats, quantity: Quantity) -> tuple[Floats, Floats, Floats]:
     """wi and wo (T P, 3) and BSDFs (T P, C); what the file repeats, at the pole and after a turn, is taken once."""
     once = np.ones((len(table.theta), len(table.phi)), bool)
     once[(table.theta % 180.0) == 0.0, 1:] = False

@@ -75,14 +75,14 @@ def read(path: Path) -> Measurements:
     notes = [" and ".join(f"{block.kind} in a {block.said['PARAM_TYPE'][1][0]}" for block in tables)]
     again = sum(len(block.values) for block in tables) - len(values)
     if again:
-        notes.append(f"left out: {plural(again, 'value')} at directions that the file holds already")
+        notes.append(f"skipped: {plural(again, 'value')} at directions that the file holds already")
     if not seen.all():
-        notes.append(f"left out: {plural(int((~seen).sum()), 'value')} at or beyond the horizon")
+        notes.append(f"skipped: {plural(int((~seen).sum()), 'value')} at or beyond the horizon")
     if any("REDUCTION_TYPE" in block.said for block in tables):
         notes.append("what the file leaves to symmetry is not filled in")
     other = [block.kind for block in blocks if block not in tables]
     if other:
-        notes.append(f"left out: {', '.join(other)}")
+        notes.append(f"skipped: {', '.join(other)}")
     source = Source(str(path), "ssdd", "brdf", tuple(notes))
     return Measurements(wi[seen], wo[seen], values[seen], None, np.ones(int(seen.sum()), bool), channels, source)
 

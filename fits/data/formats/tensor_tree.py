@@ -8,7 +8,7 @@ the last axis running fastest. Numbers are BSDFs in 1/sr without the cosine. Lay
 `bsdf2ttree.c` of Radiance; colours are trees of CIE 1976 u' and v' beside that of Y.
 
 A box is read at its middle. As in `window_xml`, WINDOW's front is the top, Radiance's z is turned, and light that
-passes straight stays in boxes that cannot be told from the rest: these are masked.
+is transmitted collimated lies in boxes that cannot be separated from the rest: these are masked.
 """
 
 import re
@@ -61,14 +61,14 @@ def read(path: Path, layer: ElementTree.Element, rank: int) -> Measurements:
     if not trees.get("Y"):
         raise ValueError(f"{path}: no WavelengthData of 'Visible'")
     coloured = all(trees.get(which, {}).keys() == trees["Y"].keys() for which in ("u", "v"))
-    parts = [_readings(path, name, trees, rank, coloured) for name in trees["Y"]]
+    parts = [_samples(path, name, trees, rank, coloured) for name in trees["Y"]]
     wi, wo, values, used = (np.concatenate(one) for one in zip(*parts, strict=True))
     notes = [
         ", ".join(trees["Y"]) + "; WINDOW's front is the top (Radiance calls it the back)",
         "means over boxes of a tensor tree, read at their middles",
     ]
     if not used.all():
-        notes.append(f"masked: {int((~used).sum())} boxes in which light passes straight or at grazing")
+        notes.append(f"masked: {int((~used).sum())} boxes with collimated or grazing light")
     source = Source(str(path), "tensortree", "brdf", tuple(notes))
     return Measurements(wi, wo, values, None, used, ("X", "Y", "Z") if coloured else channel_names(1), source)
 
@@ -170,7 +170,7 @@ def disk(square: Floats) -> Floats:
     return radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _readings(
+def _samples(
     path: Path, name: str, trees: dict[str, dict[str, Node]], rank: int, coloured: bool
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
     """wi and wo (M, 3), values (M, C), and whether they are used (M,), of one block."""
@@ -191,7 +191,7 @@ def _readings(
     wo = _raised(disk(middle[:, -2:]) * turn, -COME[side] if through else COME[side])
     used = np.minimum(abs(wi[:, 2]), abs(wo[:, 2])) > 1e-6
     if through:
-        used &= ~_straight(found.low, high, rank)
+        used &= ~_collimated(found.low, high, rank)
     values = found.values[:, None]
     if coloured:
         u, v = (look_up(trees[which][name], middle)[:, None] for which in ("u", "v"))
@@ -208,7 +208,7 @@ def _raised(flat: Floats, sign: float) -> Floats:
     return np.concatenate([flat, sign * up], axis=-1)
 
 
-def _straight(low: Floats, high: Floats, rank: int) -> NDArray[np.bool_]:
+def _collimated(low: Floats, high: Floats, rank: int) -> NDArray[np.bool_]:
     """Whether boxes hold light that leaves towards where it travelled, (M,)."""
     if rank == 4:
         overlap = (low[:, :2] < high[:, 2:]) & (low[:, 2:] < high[:, :2])

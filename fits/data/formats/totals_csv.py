@@ -3,7 +3,7 @@
 Columns                      meaning
 theta_i                      polar angle of the light in degrees, [0, 90)
 total_reflectance            all that leaves on the side of the light, as a share of it
-total_transmittance          all that leaves on the other side, what passes straight included
+total_transmittance          hemispherical transmittance, with its collimated part
 unscattered_transmittance    of this, what no medium has scattered
 <that column>_std | _sigma   its standard deviation (all of a kind, or none)
 
@@ -67,20 +67,20 @@ def read(path: Path) -> Totals:
             raise header.error(f"channels {', '.join(columns)}: every kind must have the same, {', '.join(channels)}")
         spreads = [name + suffix for name in columns.values() for suffix in SUFFIXES if name + suffix in table.names]
         part = _numbers(table, columns.values(), _SHARE)
-        given = _given(table, list(columns.values()), part)
+        measured = _is_measured(table, list(columns.values()), part)
         if spreads:
             if len(spreads) != len(columns):
                 raise header.error(f"{', '.join(spreads)}: every channel must have one standard deviation, or none")
-            sigma.append(_numbers(table, spreads, _POSITIVE)[given])
-        wi.append(light[given])
-        wo.append(light[given] * (-1, -1, 1 if kind == "reflectance" else -1))
-        values.append(part[given])
-        kinds += [kind] * int(given.sum())
+            sigma.append(_numbers(table, spreads, _POSITIVE)[measured])
+        wi.append(light[measured])
+        wo.append(light[measured] * (-1, -1, 1 if kind == "reflectance" else -1))
+        values.append(part[measured])
+        kinds += [kind] * int(measured.sum())
         known |= {*columns.values(), *spreads}
     if sigma and len(sigma) != len(named):
         raise header.error("only some kinds have standard deviations: all must, or none")
     if not kinds:
-        raise header.error("all cells of shares are empty, must be one reading at least")
+        raise header.error("all cells of values are empty, must be one measurement at least")
     ignored = [name for name in table.names if name not in known]
     totals = Totals(
         wi=np.concatenate(wi),
@@ -149,7 +149,7 @@ def _numbers(table: Table, names: Iterable[str], allowed: tuple[float, float]) -
     return np.stack([table.column(name, allowed, empty=np.nan) for name in names], axis=-1)
 
 
-def _given(table: Table, names: list[str], values: Floats) -> NDArray[np.bool_]:
+def _is_measured(table: Table, names: list[str], values: Floats) -> NDArray[np.bool_]:
     """Rows (N,) of values (N, C) that were read; ValueError for one that only some channels were read in."""
     empty = np.isnan(values)
     for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1)):

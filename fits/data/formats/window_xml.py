@@ -4,7 +4,7 @@ Patches are rings of polar angle, cut by azimuth, the first around azimuth 0; th
 which light travels, seen from the front. A number is the mean of the BSDF over a patch of light that comes and one of
 light that leaves, and is read at the middles of both. WINDOW's front, which faces outside, is read as the top, the
 other way round than in Radiance, whose z points to the room: its x is turned as well. Light that passes unscattered is
-in the patch that it stays in and cannot be told from the rest: such readings are masked.
+in the patch that it stays in and cannot be separated from the rest: such patches are masked.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -54,7 +54,7 @@ def read(path: Path) -> Measurements:
         if channel is None:
             continue
         for name, block in blocks(path, data):
-            pair = _of(path, bases, block, "ColumnAngleBasis"), _of(path, bases, block, "RowAngleBasis")
+            pair = _basis_of(path, bases, block, "ColumnAngleBasis"), _basis_of(path, bases, block, "RowAngleBasis")
             come, leave = pair if incident == "columns" else pair[::-1]
             matrix = _matrix(path, block, name, len(pair[1].directions), len(pair[0].directions))
             if used.setdefault(name, (come, leave)) != (come, leave):
@@ -64,13 +64,13 @@ def read(path: Path) -> Measurements:
         raise ValueError(f"{path}: no WavelengthData of 'Visible'")
     colours = tuple(one for one in ("X", "Y", "Z") if matrices.get(one, {}).keys() == matrices["Y"].keys())
     chosen = colours if len(colours) == len(CHANNELS) else ("Y",)
-    left_out = sorted(matrices.keys() - set(chosen))
-    notes = [f"left out: {' and '.join(left_out)}, the blocks are not those of the visible"] if left_out else []
+    skipped = sorted(matrices.keys() - set(chosen))
+    notes = [f"skipped: {' and '.join(skipped)}, the blocks are not those of the visible"] if skipped else []
     channels = chosen if len(chosen) > 1 else channel_names(1)
-    return _readings(path, [matrices[one] for one in chosen], used, channels, notes)
+    return _samples(path, [matrices[one] for one in chosen], used, channels, notes)
 
 
-def _readings(
+def _samples(
     path: Path,
     matrices: list[dict[str, Floats]],
     used: dict[str, tuple[Basis, Basis]],
@@ -90,12 +90,12 @@ def _readings(
         wi.append(pairs[0].reshape(-1, 3))
         wo.append(pairs[1].reshape(-1, 3))
         values.append(np.stack([block[name].ravel() for block in matrices], axis=-1))
-        straight = through & (np.abs(pairs[0] + pairs[1]).max(axis=-1) < 1e-9)
-        mask.append(~straight.ravel())
+        collimated = through & (np.abs(pairs[0] + pairs[1]).max(axis=-1) < 1e-9)
+        mask.append(~collimated.ravel())
     notes = (
         ", ".join(matrices[0]) + "; WINDOW's front is the top (Radiance calls it the back)",
         "means over patches, read at their middles",
-        *(["masked: patches in which light passes straight"] if not all(part.all() for part in mask) else []),
+        *(["masked: patches with collimated light"] if not all(part.all() for part in mask) else []),
         *more_notes,
     )
     source = Source(str(path), "klems", "brdf", notes)
@@ -127,7 +127,7 @@ def _bases(path: Path, layer: ElementTree.Element) -> list[Basis]:
     return found
 
 
-def _of(path: Path, bases: dict[str, Basis], block: ElementTree.Element, tag: str) -> Basis:
+def _basis_of(path: Path, bases: dict[str, Basis], block: ElementTree.Element, tag: str) -> Basis:
     name = (text_of(block, tag) or "").lower()
     if name not in bases:
         raise ValueError(

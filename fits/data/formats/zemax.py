@@ -1,12 +1,12 @@
 """Zemax (OpticStudio) tabular BSDF text, also called Radiant Imaging's BSDF data interchange format.
 
 For every sample rotation and angle of incidence the file holds a rectangle of values over ScatterAzimuth and
-ScatterRadial. These are polar coordinates around the *specular* direction (BRDF) or the direction of straight
+ScatterRadial. These are polar coordinates around the *specular* direction (BRDF) or the direction of collimated
 transmission (BTDF), not around the normal: ScatterRadial is the angle from that direction, and ScatterAzimuth 0 points
 from it towards the normal, counter-clockwise seen against the specular ray. Documented in "Zemax Tabular BSDF data file
 format", Zemax knowledge base.
 
-A rectangle reaches below the horizon; such points are left out. A zero above it means "not measured": it is masked.
+A rectangle reaches below the horizon; such points are skipped. A zero above it means "not measured": it is masked.
 """
 
 from collections.abc import Iterator
@@ -74,7 +74,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
 
     notes = [
         "ScatterRadial and ScatterAzimuth converted from around the specular direction to theta_o, phi_o",
-        f"left out: {plural(int((once & ~above).sum()), 'grid point')} at or beyond the horizon",
+        f"skipped: {plural(int((once & ~above).sum()), 'grid point')} at or beyond the horizon",
     ]
     if not measured.all():
         notes.append(f"masked: {plural(int((~measured).sum()), 'zero')} above the horizon, not measured")
@@ -83,7 +83,7 @@ def read(path: Path, quantity: Quantity = "brdf") -> Measurements:
     if len(rotation) > 1:
         notes.append("the sample's x of Zemax is at right angles to the plane of incidence at SampleRotation 0")
     if btdf:
-        notes.append("BTDF: AngleOfIncidence taken as the angle of straight transmission, equal to theta_i")
+        notes.append("BTDF: AngleOfIncidence taken as the angle of collimated transmission, equal to theta_i")
     channels = _CHANNELS[file.choices["spectralcontent"]]
     source = Source(str(path), "zemax", quantity, tuple(notes))
     return Measurements(wi[keep], wo[keep], values, None, measured, channels, source)

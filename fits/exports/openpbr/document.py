@@ -16,11 +16,11 @@ from layerjax.mixture import stacks_by_name
 
 NODE = "open_pbr_surface"
 LINEAR = "lin_rec709"
-"""How MaterialX calls red, green and blue of IEC 61966-2-1 that are proportional to light."""
+"""MaterialX's name of linear red, green and blue of IEC 61966-2-1."""
 
 CHANNELS = (1, 3)
 LEAST_THROUGH = 0.01
-"""Share of the light that passes a stack which can no longer be written as opaque."""
+"""Transmittance above which a stack cannot be written as opaque."""
 
 
 def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
@@ -28,17 +28,17 @@ def contents(material: Material, wavelengths: Floats | None = None) -> Contents:
     require_materialx()
     _require_counterpart(material)
     found = translated(material)
-    given = inputs(found.surface)
+    values = inputs(found.surface)
     notes = [
-        f"{NODE} 1.1, {' and '.join(found.surface.lobes)}, fitted: {_told(found.surface)}",
+        f"{NODE} 1.1, {' and '.join(found.surface.lobes)}, fitted: {_fitted(found.surface)}",
         *(_error(one) for one in found.errors),
         *(
-            f"what has no place in it is in what was fitted: {', '.join(names)}"
-            for names in [_left_over(material)]
+            f"absorbed by the fitted values, as the surface has no such parameter: {', '.join(names)}"
+            for names in [_without_counterpart(material)]
             if names
         ),
     ]
-    return Contents(_document(material.name, given, notes).encode(), tuple(notes))
+    return Contents(_document(material.name, values, notes).encode(), tuple(notes))
 
 
 def require_materialx() -> None:
@@ -50,13 +50,12 @@ def require_materialx() -> None:
 
 
 def inputs(surface: Surface) -> dict[str, float | tuple[float, float, float]]:
-    """What the node is given: all inputs of the lobes that the surface has, and that the others have no weight.
+    """Inputs of the node: those of the lobes that the surface has, and weights of 0 for the others.
 
-    The coat does not darken what lies below by light that goes back and forth: renderers differ in how much, and the
-    fitted color of the base has it.
+    Inter-reflection below the coat is switched off: renderers differ in it, and the fitted base color includes it.
     """
     lobes = surface.lobes
-    given: dict[str, Any] = {
+    values: dict[str, Any] = {
         "base_weight": 1.0,
         "base_metalness": _number(surface.base_metalness),
         "specular_weight": float("metal" in lobes or "gloss" in lobes),
@@ -65,12 +64,12 @@ def inputs(surface: Surface) -> dict[str, float | tuple[float, float, float]]:
     }
     for name in RANGES:
         if name in used_by(surface):
-            given[name] = _color(getattr(surface, name)) if name in COLORS else _number(getattr(surface, name))
+            values[name] = _color(getattr(surface, name)) if name in COLORS else _number(getattr(surface, name))
     if "gloss" not in lobes and "diffuse" in lobes:
         # MaterialX's shaders dim what lies below a gloss even where it has no weight, but little below the roughest
-        given.setdefault("specular_roughness", 1.0)
-        given["specular_ior"] = given.get("coat_ior", 1.0)  # as what lies above
-    return given
+        values.setdefault("specular_roughness", 1.0)
+        values["specular_ior"] = values.get("coat_ior", 1.0)  # as what lies above
+    return values
 
 
 def _require_counterpart(material: Material) -> None:
@@ -83,15 +82,15 @@ def _require_counterpart(material: Material) -> None:
     if material.opaque:
         return
     wi = direction(np.array(INCIDENCE), 0.0)
-    through = float((material.shares(wi)[1] + material.unscattered(wi)).max())
+    through = float((material.albedos(wi)[1] + material.unscattered(wi)).max())
     if through > LEAST_THROUGH:
         raise ValueError(
-            f"{100 * through:.2g} % of the light passes this stack, and OpenPBR has nothing that scatters as it does: "
+            f"{100 * through:.2g} % of the light is transmitted, and OpenPBR has no lobe that scatters it: "
             "give it a base"
         )
 
 
-def _document(name: str, given: dict[str, Any], notes: list[str]) -> str:
+def _document(name: str, values: dict[str, Any], notes: list[str]) -> str:
     import MaterialX
 
     library = MaterialX.createDocument()
@@ -99,24 +98,24 @@ def _document(name: str, given: dict[str, Any], notes: list[str]) -> str:
     document = MaterialX.createDocument()
     document.setDataLibrary(library)
     document.setColorSpace(LINEAR)
-    called = MaterialX.createValidName(name)
-    shader = document.addNode(NODE, f"{called}_surface", "surfaceshader")
+    valid_name = MaterialX.createValidName(name)
+    shader = document.addNode(NODE, f"{valid_name}_surface", "surfaceshader")
     shader.setDocString("; ".join(notes))
-    for key, value in given.items():
+    for key, value in values.items():
         if isinstance(value, tuple):
             shader.setInputValue(key, MaterialX.Color3(*value))
         else:
             shader.setInputValue(key, value)
-    document.addMaterialNode(called, shader)
+    document.addMaterialNode(valid_name, shader)
     valid, why = document.validate()
     if not valid:
         raise ValueError(f"openpbr: MaterialX {MaterialX.__version__} refuses the document: {why.strip()}")
     return str(MaterialX.writeToXmlString(document))
 
 
-def _told(surface: Surface) -> str:
-    given = inputs(surface)
-    return ", ".join(f"{name} {_numbers(given[name], '.4g')}" for name in RANGES if name in used_by(surface))
+def _fitted(surface: Surface) -> str:
+    values = inputs(surface)
+    return ", ".join(f"{name} {_numbers(values[name], '.4g')}" for name in RANGES if name in used_by(surface))
 
 
 def _error(one: Error) -> str:
@@ -131,17 +130,19 @@ def _numbers(values: Any, form: str) -> str:
     return " ".join(format(value, form) for value in np.atleast_1d(np.asarray(values)))
 
 
-def _left_over(material: Material) -> list[str]:
-    """Names of numbers of the stack that no parameter stands for."""
+def _without_counterpart(material: Material) -> list[str]:
+    """Names of numbers of the stack without a counterpart among the parameters."""
     names: list[str] = []
     for prefix, stack in stacks_by_name(material.stack).items():
         names += (
-            name for name, _ in leaves_with_names(stack, prefix) if not _has_place(stack, name.removeprefix(prefix))
+            name
+            for name, _ in leaves_with_names(stack, prefix)
+            if not _has_counterpart(stack, name.removeprefix(prefix))
         )
     return names
 
 
-def _has_place(stack: lj.Stack, name: str) -> bool:
+def _has_counterpart(stack: lj.Stack, name: str) -> bool:
     if name.startswith("base."):
         return True
     interfaces = [f"layers[{place}]." for place, layer in enumerate(stack.layers) if isinstance(layer, lj.Interface)]

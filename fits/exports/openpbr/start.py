@@ -1,4 +1,4 @@
-"""What the layers of a stack say of an OpenPBR surface: where the fit of its parameters starts."""
+"""Start values of an OpenPBR surface, from the layers of a stack, for the fit of its parameters."""
 
 from collections.abc import Iterator
 from dataclasses import fields
@@ -37,11 +37,11 @@ USED = {
 """The parameters of each lobe."""
 
 MOSTLY = 0.8
-"""Where a metal lies below a medium: its share at the start, the rest is light that the medium spreads."""
+"""Weight of a metal below a medium at the start; the rest is diffuse light of the medium."""
 
 
 def starts(stacks: tuple[lj.Stack, ...]) -> list[Surface]:
-    """Of each kind of surface that may resemble one of the stacks one, by numbers."""
+    """One starting surface of each kind that may resemble one of the stacks."""
     kinds: dict[tuple[Lobe, ...], Surface] = {}
     for stack in stacks:
         for surface in _kinds(stack):
@@ -52,17 +52,17 @@ def starts(stacks: tuple[lj.Stack, ...]) -> list[Surface]:
 def freed(surface: Surface, channels: int) -> Surface:
     """The surface with all that its lobes use to be fitted, from where it is."""
     used = used_by(surface)
-    given: dict[str, Any] = {field.name: getattr(surface, field.name) for field in fields(surface)}
+    values: dict[str, Any] = {field.name: getattr(surface, field.name) for field in fields(surface)}
     for name, (low, high) in RANGES.items():
         if name not in used:
             continue
-        start = np.clip(np.asarray(given[name], float), low, high)
+        start = np.clip(np.asarray(values[name], float), low, high)
         if name in COLORS and channels > 1:
             start = np.broadcast_to(start, (channels,))
-            given[name] = Free(tuple(start), (low,) * channels, (high,) * channels)
+            values[name] = Free(tuple(start), (low,) * channels, (high,) * channels)
         else:
-            given[name] = Free(float(np.mean(start)), low, high)
-    return Surface(**given)
+            values[name] = Free(float(np.mean(start)), low, high)
+    return Surface(**values)
 
 
 def used_by(surface: Surface) -> set[str]:
@@ -81,22 +81,22 @@ def _kinds(stack: lj.Stack) -> Iterator[Surface]:
     metallic = isinstance(stack.base, lj.Conductor)
     coated = bool(mirrors) if metallic else len(mirrors) > 1
     coat: tuple[Lobe, ...] = ("coat",) if coated else ()
-    given: dict[str, Any] = {"coat_ior": mirrors[0][0], "coat_roughness": mirrors[0][1]} if coated else {}
+    parameters: dict[str, Any] = {"coat_ior": mirrors[0][0], "coat_roughness": mirrors[0][1]} if coated else {}
     if isinstance(stack.base, lj.Conductor):
-        given |= _metal(stack.base, stack)
+        parameters |= _metal(stack.base, stack)
         if all(isinstance(layer, lj.Interface) for layer in stack.layers):
-            yield Surface((*coat, "metal"), base_metalness=1.0, **given)
+            yield Surface((*coat, "metal"), base_metalness=1.0, **parameters)
         else:
-            yield Surface((*coat, "metal", "diffuse"), base_metalness=MOSTLY, **given)
+            yield Surface((*coat, "metal", "diffuse"), base_metalness=MOSTLY, **parameters)
         return
-    given["base_color"] = np.asarray(getattr(stack.base, "albedo", 0.5))
+    parameters["base_color"] = np.asarray(getattr(stack.base, "albedo", 0.5))
     if mirrors:
-        given["specular_ior"], given["specular_roughness"] = mirrors[-1]
-    yield Surface((*coat, "gloss", "diffuse") if mirrors else ("diffuse",), **given)
+        parameters["specular_ior"], parameters["specular_roughness"] = mirrors[-1]
+    yield Surface((*coat, "gloss", "diffuse") if mirrors else ("diffuse",), **parameters)
     if any(_flat(layer) is not None for layer in stack.layers):  # flakes that lie flat look like a metal
         below: tuple[Lobe, ...] = ("metal",) if stack.base is None else ("metal", "diffuse")
         yield Surface(
-            (*coat, *below), **given | {"base_color": 0.5, "base_metalness": 1.0 if stack.base is None else MOSTLY}
+            (*coat, *below), **parameters | {"base_color": 0.5, "base_metalness": 1.0 if stack.base is None else MOSTLY}
         )
 
 

@@ -86,23 +86,23 @@ def albedo(surface: Surface, wo: Array, nodes: int = 16) -> Array:
 
 
 def lobes(surface: Surface, wi: Vector, wo: Vector) -> dict[Lobe, Array]:
-    """What each lobe gives to the BRDF, (N, C); directions by components (N,)."""
-    found: dict[Lobe, Array] = {}
+    """Contribution of each lobe to the BRDF, (N, C); directions by components (N,)."""
+    values: dict[Lobe, Array] = {}
     passed = jnp.ones_like(wo[2])[:, None]
     if "coat" in surface.lobes:
-        found["coat"], albedo = _facets(surface, "coat", wi, wo)
+        values["coat"], albedo = _facets(surface, "coat", wi, wo)
         passed = passed * (1.0 - albedo)
     metal = jnp.asarray(surface.base_metalness)
     if "metal" in surface.lobes:
-        found["metal"] = passed * metal * _facets(surface, "metal", wi, wo)[0]
+        values["metal"] = passed * metal * _facets(surface, "metal", wi, wo)[0]
         passed = passed * (1.0 - metal)
     if "gloss" in surface.lobes:
         gloss, albedo = _facets(surface, "gloss", wi, wo)
-        found["gloss"] = passed * gloss
+        values["gloss"] = passed * gloss
         passed = passed * (1.0 - albedo)
     if "diffuse" in surface.lobes:
-        found["diffuse"] = passed * _diffuse(surface, wi, wo)
-    return found
+        values["diffuse"] = passed * _diffuse(surface, wi, wo)
+    return values
 
 
 def _alpha(surface: Surface, lobe: Lobe) -> Array | None:
@@ -145,7 +145,7 @@ def _facets(surface: Surface, lobe: Lobe, wi: Vector, wo: Vector) -> tuple[Array
     assert alpha is not None
     half, cosine = half_vector(wi, wo, same_side=True)
     once, whole = _albedos(surface, lobe, alpha)
-    weights = _between(wo[2])
+    weights = _interpolation(wo[2])
     reflectance = _fresnel(surface, lobe, cosine)
     value = _mirrors(half, wi, wo, alpha)[:, None] * reflectance
     return value * (1.0 + reflectance * (1.0 / (weights @ once) - 1.0)[:, None]), weights @ whole
@@ -166,8 +166,8 @@ def _albedos(surface: Surface, lobe: Lobe, alpha: Array) -> tuple[Array, Array]:
     return once, (share[..., None] * reflectance * again).sum(axis=1)
 
 
-def _between(cosine: Array) -> Array:
-    """What to multiply values at the table's angles by for those at these cosines (N,), (N, ANGLES)."""
+def _interpolation(cosine: Array) -> Array:
+    """Weights (N, ANGLES) of the table's angles in an interpolation at these cosines (N,)."""
     x = 4.0 / jnp.pi * jnp.arccos(jnp.minimum(cosine, 1.0)) - 1.0
     return jnp.cos(jnp.arange(ANGLES) * jnp.arccos(jnp.clip(x, -1.0, 1.0))[:, None]) @ jnp.asarray(_COEFFICIENTS)
 

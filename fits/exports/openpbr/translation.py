@@ -10,7 +10,7 @@ from scipy.stats import qmc
 
 from fits.data.geometry import Floats, direction
 from fits.data.measurements import Measurements, Source, channel_names
-from fits.exports.contents import STEEPEST, pairs, views
+from fits.exports.contents import LEAST_COSINE, pairs, views
 from fits.exports.material import Material
 from fits.exports.openpbr.start import freed, starts
 from fits.exports.openpbr.surface import Surface, albedo, evaluate
@@ -22,7 +22,7 @@ PAIRS_TO_FIT, VIEWS_TO_JUDGE = 512, 2048
 """Pairs anywhere, and as many near the mirror direction; and directions of view at each incidence, half and half."""
 
 INCIDENCE = (10.0, 30.0, 50.0, 70.0)
-"""Degrees, at which errors are told."""
+"""Polar angles of the reported errors, in degrees."""
 
 DARK = 1e-3
 """Of the reflected share over pi: values below that count for less."""
@@ -60,7 +60,7 @@ def translated(material: Material) -> Translation:
     """
     wi, wo = pairs(PAIRS_TO_FIT, seed=11)
     values = material.values(wi, wo)
-    sigma = np.abs(values) + DARK * material.shares(direction(np.array(INCIDENCE), 0.0))[0].mean() / np.pi
+    sigma = np.abs(values) + DARK * material.albedos(direction(np.array(INCIDENCE), 0.0))[0].mean() / np.pi
     names = channel_names(material.channels)
     data = Measurements(wi, wo, values, sigma, np.ones(len(wi), bool), names, Source("", "simulated"))
     noise = Noise(relative=0.0, floor=0.0, discrepancy=False)
@@ -86,7 +86,7 @@ def _errors(material: Material, surface: Surface) -> Iterator[Error]:
         towards = direction(np.array([incidence]), 0.0)
         wi = np.repeat(towards, len(u), axis=0)
         wo = views(wi, u[:, 0], u[:, 1])
-        kept = wo[:, 2] >= STEEPEST
+        kept = wo[:, 2] >= LEAST_COSINE
         true = material.values(wi[kept], wo[kept])
         own = np.asarray(_EVALUATE(surface, jnp.asarray(wi[kept]), jnp.asarray(wo[kept])))
         # of what a pair sends in all its channels: one that is nearly black says nothing
@@ -94,7 +94,7 @@ def _errors(material: Material, surface: Surface) -> Iterator[Error]:
         off = (np.abs(own - true)[scale[:, 0] > 0] / scale[scale[:, 0] > 0]).max(axis=1)
         median, most = (float(part) for part in np.quantile(off, [0.5, 0.95]))
         shares = np.broadcast_to(np.asarray(_ALBEDO(surface, jnp.asarray(towards)))[0], (material.channels,))
-        yield Error(incidence, median, most, material.shares(towards)[0][0], shares)
+        yield Error(incidence, median, most, material.albedos(towards)[0][0], shares)
 
 
 _EVALUATE, _ALBEDO = eqx.filter_jit(evaluate), eqx.filter_jit(albedo)

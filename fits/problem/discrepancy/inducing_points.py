@@ -74,7 +74,7 @@ def inducing_points(wi: ArrayLike, wo: ArrayLike, channels: int = 1) -> Inducing
 
 
 def _pivots(where: Floats, reach: Floats, most: int) -> tuple[list[int], float]:
-    """Of places (N, 4) so many at most, in the order of their choice; and the most that they leave of the variance."""
+    """Indices of so many places (N, 4) at most, as they are chosen; and the most that they leave of the variance."""
     rows, left, chosen = np.zeros((most, len(where))), np.ones(len(where)), list[int]()
     for row in range(min(most, len(where))):
         pivot = int(np.argmax(left))

@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-STRAIGHT = 4.0
-"""Standard deviations of the noise, without its relative part, below which it is straight."""
+LINEAR_BELOW = 4.0
+"""Standard deviations of the noise, without its relative part, below which it is linear."""
 
 LEAST = 1e-6
 """Of the median measurement: s is not below that, where nothing is said of additive noise."""
@@ -23,7 +23,7 @@ def softness(values: ArrayLike, additive: ArrayLike) -> NDArray[np.float64]:
     them."""
     values = np.asarray(values, float)
     typical = LEAST * float(np.median(np.abs(values))) or 1.0
-    return np.maximum(np.broadcast_to(STRAIGHT * np.asarray(additive, float), values.shape), typical)
+    return np.maximum(np.broadcast_to(LINEAR_BELOW * np.asarray(additive, float), values.shape), typical)
 
 
 def logarithm(x: Any, s: Any) -> Array:

@@ -51,19 +51,19 @@ class Discrepancy:
                     )
 
 
-def numbers_of(given: Discrepancy, process: Process, channels: int) -> Correlation:
-    """The numbers of a process, those that are left out filled in."""
+def numbers_of(discrepancy: Discrepancy, process: Process, channels: int) -> Correlation:
+    """The numbers of a process, with the default of each that is None."""
     half, difference = (_length(float(shortest)) for shortest in process.shortest)
-    own = given.channel_correlation
+    own = discrepancy.channel_correlation
     if own is None:
         own = Free(0.8, 0.0, 0.99) if channels > 1 else 0.0
     return Correlation(
-        amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 1.0)) if given.amplitude is None else given.amplitude,
-        length_half=half if given.length_half is None else given.length_half,
-        length_difference=difference if given.length_difference is None else given.length_difference,
+        amplitude=Free(0.1, 1e-3, 0.5, LogNormal(0.1, 1.0)) if discrepancy.amplitude is None else discrepancy.amplitude,
+        length_half=half if discrepancy.length_half is None else discrepancy.length_half,
+        length_difference=difference if discrepancy.length_difference is None else discrepancy.length_difference,
         grazing_exponent=Free(0.5, *RANGES["grazing_exponent"], Normal(0.5, 0.5))
-        if given.grazing_exponent is None
-        else given.grazing_exponent,
+        if discrepancy.grazing_exponent is None
+        else discrepancy.grazing_exponent,
         channel_correlation=own,
     )
 

@@ -85,11 +85,11 @@ class Process(eqx.Module):
         roots = roots_of(vector_of(at, z.shape[-1]), self.where, z.shape[-1])
         spread, axes = jnp.linalg.eigh(at.amplitude**2 * whitening.unit_square(roots, gram))  # of A'A
         root = jnp.sqrt(1.0 + jnp.maximum(spread, 0.0))
-        told = at.amplitude * whitening.from_points(roots, (self.weights.T @ (relative * z)).T)
-        white = -(axes @ ((axes.T @ told) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
+        explained = at.amplitude * whitening.from_points(roots, (self.weights.T @ (relative * z)).T)
+        white = -(axes @ ((axes.T @ explained) / (root * (1.0 + root))))  # ((1 + s)^-1/2 - 1) / s
         return z + relative * (self.weights @ (at.amplitude * whitening.on_points(roots, white)).T)
 
-    def leave_one_out(self, found: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
+    def leave_one_out(self, whitened_data: Whitened, relative: Array, at: Correlation) -> tuple[Array, Array]:
         """Of each measurement its weighted residual and precision, (N, C): given all others it has mean residual /
         precision and variance 1 / precision, in units of the noise.
         """
@@ -98,9 +98,11 @@ class Process(eqx.Module):
             "nc,cx,nr->ncxr", relative, roots.channels, self.weights @ roots.inducing_points
         )
         solved = solve_triangular(root, rows.reshape(relative.size, -1).T, lower=True)
-        return found.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
+        return whitened_data.residuals, 1.0 - jnp.sum(solved**2, axis=0).reshape(relative.shape)
 
-    def predict(self, found: Whitened, relative: Array, at_places: Array, at: Correlation) -> tuple[Array, Array]:
+    def predict(
+        self, whitened_data: Whitened, relative: Array, at_places: Array, at: Correlation
+    ) -> tuple[Array, Array]:
         """Errors of the model at other `places`, given residuals that were whitened: mean and sd, (M, C)."""
         roots, root = self._factors(relative, at)
         sizes, own = (jnp.exp(at.grazing_exponent * log_scales(where)) for where in (self.where, at_places))
@@ -109,9 +111,9 @@ class Process(eqx.Module):
         rows = at.amplitude * jnp.einsum("cx,rm->mcxr", roots.channels, across)
         rows = rows.reshape(*rows.shape[:2], -1)
         solved = solve_triangular(root, rows.reshape(-1, rows.shape[-1]).T, lower=True)
-        told = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
+        explained = jnp.sum(rows**2, axis=-1) - jnp.sum(solved**2, axis=0).reshape(rows.shape[:2])
         size = at.amplitude * own
-        return -rows @ found.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - told, 0.0))
+        return -rows @ whitened_data.latent, jnp.sqrt(jnp.maximum(size[:, None] ** 2 - explained, 0.0))
 
     def information_rows(self, relative: Array, at: Correlation) -> Array:
         """Rows whose Jacobian A has in A'A the Fisher information of the measurements about the numbers of the process.

@@ -35,8 +35,8 @@ class Correlation(NamedTuple):
 
 
 class Roots(NamedTuple):
-    """Of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; that of all is
-    their product."""
+    """Roots of the covariance of channels, (C, C), and of inducing points, (R, R), but for the amplitude; that of all
+    is their product."""
 
     channels: Array
     inducing_points: Array
@@ -56,7 +56,7 @@ def vector_of(at: Correlation, channels: int) -> Array:
 
 
 def roots_of(numbers: Array, where: Array, channels: int) -> Roots:
-    """Of a process on inducing points `where`, (R, 4)."""
+    """The roots of a process on inducing points `where`, (R, 4)."""
     _, half, difference, growth = numbers[:4]
     own = correlation(where, where, half, difference) + JITTER * jnp.eye(len(where))
     between = numbers[4] + (1.0 - numbers[4]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
@@ -65,7 +65,7 @@ def roots_of(numbers: Array, where: Array, channels: int) -> Roots:
 
 
 def moves_of(numbers: Array, where: Array, roots: Roots) -> list[Move]:
-    """Of all numbers but the amplitude."""
+    """The moves of all numbers but the amplitude."""
     inverse = triangular_inverse(roots.inducing_points)
     sizes = jnp.exp(numbers[3] * log_scales(where))
     by_lengths = jax.jacfwd(lambda lengths: correlation(where, where, *lengths))(numbers[1:3])
@@ -90,9 +90,9 @@ def on_points(roots: Roots, white: Array) -> Array:
     return roots.channels @ white.reshape(len(roots.channels), -1) @ roots.inducing_points.T
 
 
-def from_points(roots: Roots, told: Array) -> Array:
+def from_points(roots: Roots, observed: Array) -> Array:
     """The transpose of `on_points`: (C R,) from (C, R)."""
-    return (roots.channels.T @ told @ roots.inducing_points).reshape(-1)
+    return (roots.channels.T @ observed @ roots.inducing_points).reshape(-1)
 
 
 def gram_of(weights: Array, relative: Array) -> Array:
@@ -116,7 +116,7 @@ def root_of(amplitude: Array, square: Array) -> Array:
 
 
 def triangular_inverse(root: Array) -> Array:
-    """Of a lower triangular matrix."""
+    """The inverse of a lower triangular matrix."""
     return solve_triangular(root, jnp.eye(len(root), dtype=root.dtype), lower=True)
 
 
@@ -154,8 +154,8 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
 
     wanted = back(relative * z)
     white = amplitude * solved(wanted)
-    lack = weights @ (amplitude * on_points(roots, white)).T
-    left = z - relative * lack
+    discrepancy = weights @ (amplitude * on_points(roots, white)).T
+    left = z - relative * discrepancy
 
     steps = moves_of(numbers, where, roots)
     pulled = [moved(white[None], step._replace(factor=step.factor.T), roots)[0] for step in steps]
@@ -169,16 +169,16 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Trio, Trio]:
     levels = [jnp.where(amplitude > 0.0, (1.0 - jnp.sum(inverse**2, axis=-1)) / safe, 0.0)]
     levels += [jnp.sum(moved(root.T - inverse, step, roots) * inverse, axis=-1) for step in steps]
 
-    by_levels, told, by_lack = by_numbers @ jnp.stack(levels), relative * by_z, 0.0
+    by_levels, observed, by_discrepancy = by_numbers @ jnp.stack(levels), relative * by_z, 0.0
     if gram is None:
-        by_lack = by_relative * lack
-        told = told + by_relative * left - relative * by_lack
+        by_discrepancy = by_relative * discrepancy
+        observed = observed + by_relative * left - relative * by_discrepancy
         parts = inverse.reshape(len(root), *map(len, roots)), roots.channels, weights @ roots.inducing_points
         seen = amplitude * jnp.einsum("mcr,dc,nr->mnd", *parts)
         by_levels = by_levels + jnp.tensordot(seen**2, relative * by_relative, 2)
-    own = amplitude * solved(back(told))
+    own = amplitude * solved(back(observed))
     moved_nodes = on_points(roots, by_numbers @ jnp.stack(errors) + amplitude * own)
-    by_left = by_z - by_lack - relative * (weights @ moved_nodes.T)
+    by_left = by_z - by_discrepancy - relative * (weights @ moved_nodes.T)
     found = left, white, jnp.log(jnp.diagonal(root))
     return found, (by_left, by_numbers @ jnp.stack(whites) + own, by_levels)
 

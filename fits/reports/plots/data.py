@@ -2,7 +2,7 @@
 
 In-plane data is drawn against the signed polar angle of the viewer, positive on the forward (mirror) side; out of
 plane, as a map of the viewer's hemisphere with forward to the right. Colours are those of Okabe and Ito, which most
-readers with a colour deficiency can tell apart.
+readers with a colour deficiency can distinguish.
 """
 
 import io
@@ -18,9 +18,11 @@ from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
 from fits.data.scans import Incidence, in_plane, incidences, relative_azimuth, signed_angle
+from fits.data.totals import KINDS, Totals
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
+    from fits.optimise.result import Fit
 
 INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -28,6 +30,7 @@ NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
 COARSE = 20.0  # degrees between neighbours on a map from which it shows points
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
+MOST_NAMES = 12  # of channels along an axis; of more, some
 MOST_CHANNELS = 6  # in one picture, evenly spaced among all
 MOST_INCIDENCES = 9  # in one picture; data with more is shown at evenly spaced ones
 STYLE: dict[Any, Any] = {
@@ -171,12 +174,12 @@ def hemisphere_map(
 ) -> ScalarMappable:
     """Draws `values` (N,) of one incidence over the viewer's hemisphere: forward to the right, rings every 30 degrees.
 
-    What is NaN, or not positive on a logarithmic scale, is left blank; readings that lie too far apart for a surface
-    between them are drawn as points.
+    What is NaN, or not positive on a logarithmic scale, is left blank; measurements too far apart for a surface between
+    them are drawn as points.
     """
     rows = incidence.rows[np.isfinite(values[incidence.rows])]
     rows = rows[values[rows] > 0.0] if isinstance(norm, LogNorm) else rows
-    radius = np.minimum(data.theta_o, 180.0 - data.theta_o)[rows]  # light that passes is seen from below
+    radius = np.minimum(data.theta_o, 180.0 - data.theta_o)[rows]  # transmission is drawn from below
     azimuth = np.radians(relative_azimuth(data)[rows])
     x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
     surface = _surface(x, y)
@@ -281,9 +284,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
         axes.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
         axes.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
         axes.set(
-            xlabel=label,
-            ylabel="density",
-            title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}",
+            xlabel=label, ylabel="density", title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}"
         )
         axes.legend(loc="upper right")
 
@@ -296,7 +297,55 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
             axes.axhspan(-noise, noise, color="#dddddd", zorder=0, label="white noise, 95 %")
             axes.legend(loc="upper right")
         axes.set(
-            xlabel="readings apart, in one plane", ylabel="correlation", ylim=(-1.0, 1.0), title="Neighbours in angle"
+            xlabel="lag, measurements in one plane", ylabel="correlation", ylim=(-1.0, 1.0), title="Neighbours in angle"
         )
         axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(5.0))
     return figure
+
+
+def totals_picture(totals: Totals, fit: "Fit | None" = None) -> Figure:
+    """A panel for each kind: measured shares of the incident flux against the channel, or the angle of incidence where
+    there is but one channel, and those of the fit."""
+    kinds = [kind for kind in KINDS if kind in totals.kinds]
+    predicted, angles = (
+        np.full(totals.values.shape, np.nan),
+        list(dict.fromkeys(f"{angle:g}°" for angle in totals.theta_i)),
+    )
+    if fit is not None:
+        predicted[totals.mask] = fit.predicted
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 3.2), layout="constrained")
+        panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            rows = np.flatnonzero([one == kind for one in totals.kinds])
+            _panel(axes, totals, rows, predicted, angles)
+            axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
+        panels[0].set_ylabel("share of the incident flux")
+        every = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
+        marks = {label: handle for handle, label in every}
+        figure.legend(marks.values(), marks.keys(), loc="outside lower center", ncols=min(len(marks), 6))
+    return figure
+
+
+def _panel(axes: Axes, totals: Totals, rows: np.ndarray, predicted: np.ndarray, angles: list[str]) -> None:
+    """The rows of one kind; angles: of incidence of all kinds, each of which has a colour."""
+    channels = len(totals.channels)
+    if channels == 1:
+        order = rows[np.argsort(totals.theta_i[rows], kind="stable")]
+        lines = [(totals.theta_i[order], order, np.zeros(len(order), int), "")]
+        axes.set_xlabel("angle of incidence, degrees")
+    else:
+        places = np.arange(channels)
+        lines = [(places, np.full(channels, row), places, f"{totals.theta_i[row]:g}°") for row in rows]
+        shown = places[:: -(-channels // MOST_NAMES)]
+        axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
+    for x, row, channel, angle in lines:
+        colour = CYCLE[angles.index(angle) % len(CYCLE) if angle else 0]
+        label = f" at {angle}" if angle and len(angles) > 1 else ""
+        errors = None if totals.sigma is None else totals.sigma[row, channel]
+        measured = totals.values[row, channel]
+        axes.errorbar(x, measured, errors, fmt="o", color=INK, markersize=3, capsize=2, label=f"measured{label}")
+        if np.isfinite(predicted).any():
+            axes.plot(x, predicted[row, channel], "-" if len(x) > 1 else "x", color=colour, label=f"fit{label}")
+    axes.margins(y=0.1)
+    axes.set_ylim(bottom=0.0)

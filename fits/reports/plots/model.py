@@ -1,4 +1,4 @@
-"""Pictures of a fit beside its data: curves per incidence, residuals below, and maps where data leaves the plane."""
+"""Pictures of a fit, and of predictions, beside data: curves per incidence, residuals, and maps out of plane."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -32,37 +32,39 @@ from fits.reports.plots.data import (
 )
 
 if TYPE_CHECKING:
+    from fits.data.measurements import Measurements
     from fits.optimise.result import Fit
+    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
-BAND_DRAWS = 200  # posterior draws behind a band
+BAND_DRAWS = 200  # posterior draws behind an interval
 STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
 STEP = 1.0  # degrees between the points of a model curve
-FEWEST_IN_PLANE = 3  # readings that make a panel
+FEWEST_IN_PLANE = 3  # measurements that make a panel
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """The model along one incidence: viewing angles (M,), values (M, C), and the band's two edges (2, M, C) or None.
+    """The model along one incidence: viewing angles (M,), values (M, C), and an interval's two ends (2, M, C) or None.
 
-    alone: (M, C), of the stack without the model discrepancy, whose the band is; None where there is no discrepancy.
+    latent: (M, C), of the stack without the model discrepancy, as is the interval; None where there is no discrepancy.
     """
 
     angle: Floats
     values: Floats
-    alone: Floats | None
-    band: Floats | None
+    latent: Floats | None
+    interval: Floats | None
 
 
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
     """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
 
-    With a model discrepancy there are two curves, with it and of the stack alone; residuals are of the first.
+    With a model discrepancy there are two curves, with and without it; residuals are of the first.
 
     fits: one or more fits of the same data by name; the points and their errors are those of the first one.
-    posterior: adds the band that holds 95 % of its draws of the stack alone (not of new readings) around the first.
+    posterior: adds the central interval of 95 % of its draws, of the stack without discrepancy and noise, to the first.
     Every incidence has an axis of its own: linear, or logarithmic where its values span a wide range.
-    None where no incidence has at least three readings in the plane of incidence.
+    None where no incidence has at least three measurements in the plane of incidence.
     """
     first = next(iter(fits.values()))
     data = first.problem.data
@@ -113,7 +115,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
     values = np.where(data.mask, data.values[:, channel], np.nan)
     predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
     norm = value_norm(values[data.mask])
-    reach = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
+    limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
     with mpl.rc_context(STYLE):
         height = map_height(data, shown, 2.4)
         figure = Figure(figsize=(9.5, height * len(shown) + 0.3), layout="constrained")
@@ -121,7 +123,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
         for row, incidence in zip(panels, shown, strict=True):
             image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
             hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
-            signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-reach, reach), "PuOr")
+            signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-limit, limit), "PuOr")
             model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
             for axes, what in zip(row, ("data", model, "residual"), strict=True):
                 axes.set_title(f"{incidence.label}: {what}")
@@ -148,16 +150,16 @@ def _lines(axes: Axes, curve: _Curve, channels: tuple[str, ...], name: str | Non
     for channel, channel_name in enumerate(channels):
         own = len(channels) > 1 and name is None
         colour = channel_colour(channel_name, channel) if own else CYCLE[place % len(CYCLE)]
-        what = name or "model" if curve.alone is None else f"{name or 'model'} with discrepancy"
+        what = name or "model" if curve.latent is None else f"{name or 'model'} with discrepancy"
         label = what if channel == 0 else None
         axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=label, zorder=3)
         which = ""
-        if curve.alone is not None:
-            label, which = ("stack alone" if channel == 0 and place == 0 else None), ", stack alone"
-            axes.plot(curve.angle, curve.alone[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
-        if curve.band is not None:
+        if curve.latent is not None:
+            label, which = ("without discrepancy" if channel == 0 and place == 0 else None), ", without discrepancy"
+            axes.plot(curve.angle, curve.latent[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
+        if curve.interval is not None:
             label = f"95 % of the posterior{which}" if channel == 0 else None
-            low, high = curve.band[:, :, channel]
+            low, high = curve.interval[:, :, channel]
             axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=label, zorder=2.5)
 
 
@@ -199,12 +201,51 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     towards = np.concatenate(wi), np.concatenate(wo)
     values = np.asarray(fit.problem.predict_at(vectors, *towards))
     values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
-    band = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
+    interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
     best = with_discrepancy(fit, *towards, values[0])
     ends = np.cumsum([len(angle) for angle in angles])
     curves = []
     for angle, end in zip(angles, ends, strict=True):
         own = slice(end - len(angle), end)
-        alone = values[0, own] if fit.problem.noise.discrepancy else None
-        curves.append(_Curve(angle, best[own], alone, None if band is None else band[:, own]))
+        latent = values[0, own] if fit.problem.noise.discrepancy else None
+        curves.append(_Curve(angle, best[own], latent, None if interval is None else interval[:, own]))
     return curves
+
+
+def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure | None:
+    """Held-out data and their prediction intervals, a column for each incidence and a row for each channel.
+
+    prediction: of the used data, with levels 0.025, 0.25, 0.5, 0.75 and 0.975.
+    None where no incidence has at least three measurements in the plane of incidence.
+    """
+    used = data.used()
+    flat, angle = in_plane(used), signed_angle(used)
+    shown = [one for one in chosen(incidences(used)) if np.count_nonzero(flat[one.rows]) >= FEWEST_IN_PLANE]
+    if not shown:
+        return None
+    channels = len(used.channels)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 3.0 * channels), layout="constrained")
+        grid = figure.subplots(channels, len(shown), squeeze=False, sharex="col")
+        for column, incidence in enumerate(shown):
+            rows = incidence.rows[flat[incidence.rows]]
+            rows = rows[np.argsort(angle[rows], kind="stable")]
+            for channel in range(channels):
+                axes = grid[channel, column]
+                _intervals(axes, angle[rows], prediction, rows, channel)
+                axes.plot(angle[rows], used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
+                value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
+                axes.set_title(incidence.label if channel == 0 else "")
+            grid[-1, column].set_xlabel(ANGLE_LABEL)
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure
+
+
+def _intervals(axes: Axes, angle: np.ndarray, prediction: "Prediction", rows: np.ndarray, channel: int) -> None:
+    low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
+    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % prediction interval")
+    axes.fill_between(angle, quarter, three, color=CYCLE[0], alpha=0.35, linewidth=0, label="50 %")
+    axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
+    latent = prediction.latent.quantiles[2, rows, channel]
+    axes.plot(angle, latent, color=CYCLE[1], linewidth=1.0, linestyle="dashed", label="without discrepancy")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def corner_picture(posterior: "Posterior") -> Figure:
-    """Every pair of parameters and every parameter alone, over the posterior's samples; lines at the fitted values."""
+    """Every pair of parameters and every single parameter, over the posterior's samples; lines at the fitted values."""
     import corner
 
     count = len(posterior.names)
@@ -57,7 +57,7 @@ def trace_picture(posterior: "Posterior") -> Figure:
             axes.plot(np.arange(len(chain))[::every], chain[::every, :, index], color=INK, linewidth=0.3, alpha=0.3)
             axes.axvline(posterior.burn_in, color=CYCLE[1], linewidth=1.2)
             axes.set_title(f"{name}, autocorrelation time {posterior.autocorrelation_time[index]:.0f} steps")
-        panels[-1].set_xlabel("step (kept from the line on)")
+        panels[-1].set_xlabel("step (used from the line on)")
     return figure
 
 

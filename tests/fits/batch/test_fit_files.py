@@ -13,7 +13,7 @@ import fits
 from fits._files import locked
 from fits.batch import fit_files as batch
 from fits.batch.fit_files import STORE
-from fits.data.reading import Reading
+from fits.data.reading import ReadOptions
 from fits.store import Store
 from fits.structure_search.search import SearchOptions
 from tests.helpers.coats import TRUE
@@ -131,7 +131,7 @@ def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: li
         assert contents(folder / "out") == before
 
     refused(r"out/paint.csv/coat: holds the work of another problem \(starts 2, not 3\); --force", starts=3)
-    refused(r"\(mask_grazing None, not 60.0\)", reading=Reading(mask_grazing=60.0))
+    refused(r"\(max_polar_angle None, not 60.0\)", reading=ReadOptions(max_polar_angle=60.0))
     (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
     refused(r"out/paint.csv/bare: holds the work of another problem \(stack\)")
     del counted[:]
@@ -157,11 +157,13 @@ def test_a_damaged_result_costs_itself_alone(folder: Path, counted: list[str]) -
 
 @pytest.mark.slow
 def test_held_out_data_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fits.reports.html import foretell
-    from fits.reports.stored import held_out_of
+    from fits.reports.html import predict_held_out
+    from fits.reports.results import load_held_out
 
-    monkeypatch.setattr("fits.batch.fit_file.write_report", lambda at, name, fit: foretell(fit, None, held_out_of(at)))
-    found = fits.fit_files(["scans/coated.csv"], STACKS, "out", reading=Reading(hold_out=("incidence=50",)), **FEW)
+    monkeypatch.setattr(
+        "fits.batch.fit_file.write_report", lambda at, name, fit: predict_held_out(fit, None, load_held_out(at))
+    )
+    found = fits.fit_files(["scans/coated.csv"], STACKS, "out", reading=ReadOptions(hold_out=("incidence=50",)), **FEW)
     assert found.best == {"coated.csv": "coat"}
     coat, bare = found.rows
     assert coat["criterion"] == bare["criterion"] == "-2 log score"

@@ -22,12 +22,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "scans" / "coated.csv").unlink()
-    assert main([*MANY, "--mask-grazing", "80"]) == 1  # one file is broken
+    assert main([*MANY, "--max-polar-angle", "80"]) == 1  # one file is broken
     output = capsys.readouterr()
     for words in ("broken.csv", "failed", "paint.csv", "1 of 2 fits are there", "out/table.csv", "out/report.html"):
         assert words in output.out
     assert "layerjax: fits 2/2" in output.err
-    fit = ["fit", "scans/paint.csv", "--stack", "bare.toml", "--out", "alone", "--starts", "2", "--mask-grazing", "80"]
+    fit = [
+        "fit",
+        "scans/paint.csv",
+        "--stack",
+        "bare.toml",
+        "--out",
+        "alone",
+        "--starts",
+        "2",
+        "--max-polar-angle",
+        "80",
+    ]
     assert main(fit) == 0
     own, alone = ({path.name for path in Path(at).iterdir()} for at in ("out/paint.csv/bare", "alone"))
     assert own == alone
@@ -39,12 +50,12 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
 
     (folder / "scans" / "broken.csv").unlink()
     capsys.readouterr()
-    assert main([*MANY, "--mask-grazing", "80"]) == 0  # nothing is left to do
+    assert main([*MANY, "--max-polar-angle", "80"]) == 0  # nothing is left to do
     assert "1 of 1 fits are there, 1 of them converged" in capsys.readouterr().out
     with open("out/table.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert float(row["base.albedo"]) == pytest.approx(load_fit("alone").values["base.albedo"])
-    assert "starts 2, not 3" in refused([*MANY, "--mask-grazing", "80", "--starts", "3"], capsys, folder)
+    assert "starts 2, not 3" in refused([*MANY, "--max-polar-angle", "80", "--starts", "3"], capsys, folder)
 
 
 @pytest.mark.parametrize(
@@ -53,19 +64,12 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
         (["nowhere", "--stacks", "bare.toml"], "nowhere: no such file or folder"),
         (["scans", "--stacks", "nowhere.toml"], "nowhere.toml: no such file"),
         (["scans"], "no stack is given, nor a search asked for"),
-        (
-            ["scans", "--search", "--objective", "cube_root"],
-            "objective cube_root and solver least_squares are of no stack",
-        ),
-        (["scans", "--search", "--solver", "bounded"], "objective None and solver bounded are of no stack"),
         (["scans/broken.csv", "--stacks", "bare.toml"], "'twenty'"),
         (["scans", "scans", "--stacks", "bare.toml"], "results go by this name"),
-        (["scans", "--stacks", "bare.toml", "--only", "everything"], "'everything' is no selection"),
-        (["scans", "--stacks", "bare.toml", "--strata", "flux"], "--strata is given without --bins"),
+        (["scans", "--stacks", "bare.toml", "--select", "everything"], "'everything' is no selection"),
+        (["scans", "--stacks", "bare.toml", "--read", "strata=flux"], "strata is given without a number of bins"),
         (["scans", "--stacks", "bare.toml", "--noise", "0.1"], "--noise is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--calibration", "0"], "--calibration is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--layers", "2"], "--layers is given without --search"),
-        (["scans", "--stacks", "bare.toml", "--objective", "cube_root", "--hold-out", "incidence=50"], "--hold-out"),
+        (["scans", "--stacks", "bare.toml", "--scale-sd", "0"], "--scale-sd is given without --search"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -99,7 +103,7 @@ def test_a_cluster_that_is_not_there_is_named(folder: Path, capsys: pytest.Captu
     assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_an_interrupt_says_how_to_go_on(
+def test_an_interrupt_says_how_to_resume(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -107,5 +111,5 @@ def test_an_interrupt_says_how_to_go_on(
 
     monkeypatch.setattr("fits.batch.fit_files.fit_one", interrupted)
     assert main(MANY) == 130
-    assert "out keeps what was fitted; the same command again resumes it" in capsys.readouterr().err
+    assert "out keeps what was fitted; the same command resumes it" in capsys.readouterr().err
     assert (folder / "out" / "table.csv").is_file()

@@ -9,7 +9,7 @@ import pytest
 import fits
 from fits.data.checks import energies, peaks, reciprocity, repeats, sides, symmetry
 from fits.data.measurements import Measurements
-from fits.reports.data_statements import data_statements
+from fits.reports.data_summary import data_statements
 
 SHIPPED = Path(__file__).parents[3] / "examples" / "arizona_black_coatings"
 ANGLES = [10.0, 30.0, 50.0, 70.0]
@@ -58,7 +58,7 @@ def test_energy_is_the_integral() -> None:
     too_much = data(lambda i, o, between: np.full_like(i, 1.2 / np.pi), half)
     (mirrored,) = energies(too_much)
     assert mirrored.covered > 0.95
-    assert "More than all of it at 30°" in " ".join(data_statements(too_much))
+    assert "It exceeds 1 at 30°" in " ".join(data_statements(too_much))
 
 
 def test_sides_are_compared() -> None:
@@ -143,7 +143,7 @@ def test_a_peak_on_the_side_of_the_light_is_told_of(width: float) -> None:
     assert "all measurements in the plane of incidence lie on the light's side" in statement(one_side, "Sides")
     assert statement(lobe(1.0).where(SIGNED > -1.0).used(), "Sides") == ""
     assert statement(lobe(1.0), "Sides") == ""
-    assert "the peak about the mirror direction holds" in statement(lobe(1.0), "Sampling")
+    assert "above half the height of the peak about the mirror direction" in statement(lobe(1.0), "Sampling")
 
 
 def test_angles_in_radians_are_asked_about(tmp_path: Path) -> None:

@@ -120,11 +120,11 @@ def test_what_was_not_measured_is_left_out_and_counted(tmp_path, missing):
     np.testing.assert_allclose(data.values[:, 0], [1, 3])
     np.testing.assert_allclose(data.theta_o, [20, 30])
     np.testing.assert_allclose(data.sigma[:, 0], [0.1, 0.3])  # unknown: as much of the value as where it is known
-    assert data.source.notes[0] == "left out: 1 data point without a value (an empty cell, or nan)"
+    assert data.source.notes[0] == "skipped: 1 data point without a value (an empty cell, or nan)"
     colours = f"theta_i,theta_o,brdf_red,brdf_blue\n10,20,1,{missing}\n10,25,{missing},1\n10,30,1,2\n"
     data = read(_file(tmp_path, colours))
     np.testing.assert_array_equal(data.values, [[1, 2]])
-    assert "left out: 2 data points without a value (an empty cell, or nan)" in data.source.notes
+    assert "skipped: 2 data points without a value (an empty cell, or nan)" in data.source.notes
 
 
 def test_signed_theta_without_azimuths(tmp_path):

@@ -83,7 +83,7 @@ def test_no_number_passes_for_another(made: Callable[[str], bytes], tmp_path: Pa
         assert np.isfinite(data.values).all()
         assert np.abs(data.values).max() <= LARGEST
         if number in ("nan", "") and len(data) != len(whole):
-            assert any(note.startswith("left out: 1 data point") for note in data.source.notes)
+            assert any(note.startswith("skipped: 1 data point") for note in data.source.notes)
 
 
 @pytest.mark.parametrize("kind", FILES)

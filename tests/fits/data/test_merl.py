@@ -68,7 +68,7 @@ def test_centre_lookup_reads_bins_as_they_are_at_theircentre_angles(path, geomet
         np.testing.assert_allclose(data.values, table[:, *index.T].T, rtol=1e-14)
         assert len(np.unique(index, axis=0)) == len(data)
         assert data.mask.all()
-        assert f"readings at the centres of {len(data)} bins" in data.source.notes[1]
+        assert f"measurements at the centres of {len(data)} bins" in data.source.notes[1]
 
 
 def test_centres_are_near_what_was_asked_for(path, geometry):
@@ -93,7 +93,7 @@ def test_a_pair_at_a_centre_stays_and_its_reciprocal_is_the_same_reading(path, t
         np.testing.assert_allclose(data.values, table[:, *index.T].T, rtol=1e-14)
     both = read(path, geometry=Geometry(np.concatenate([wi, wo]), np.concatenate([wo, wi])))
     np.testing.assert_allclose([both.wi, both.wo], [wi, wo], atol=1e-12)
-    assert any("left out: 4 of the 8 pairs asked for" in note for note in both.source.notes)
+    assert any("skipped: 4 of the 8 pairs requested" in note for note in both.source.notes)
 
 
 def test_centres_along_the_default_slices_remain_slices(path):
@@ -226,7 +226,7 @@ def test_bad_files(tmp_path, path):
     broken = bytearray(whole)
     broken[12:] = np.full((MERL_BYTES - 12) // 8, np.nan).tobytes()
     other.write_bytes(broken)
-    with pytest.raises(ValueError, match="all bins that are asked for hold nan"):
+    with pytest.raises(ValueError, match="all bins that are requested hold nan"):
         read(other)
     broken[12:] = np.full((MERL_BYTES - 12) // 8, np.inf).tobytes()
     other.write_bytes(broken)
@@ -243,10 +243,10 @@ def test_bins_that_hold_nan_are_left_out_and_counted(tmp_path, path):
     data = read(other)
     np.testing.assert_array_equal(np.flatnonzero(whole.mask & ~data.mask), [0, 1])
     np.testing.assert_array_equal(data.values[2:], whole.values[2:])
-    assert "left out: 2 data points that need a bin that holds nan" in data.source.notes
+    assert "skipped: 2 data points that need a bin that holds nan" in data.source.notes
     every = read(other, bins="all")
     assert len(every) == len(read(path, bins="all")) - 2
-    assert "left out: 2 bins of the table that hold nan" in every.source.notes
+    assert "skipped: 2 bins of the table that hold nan" in every.source.notes
 
 
 def test_bad_arguments(path):

@@ -100,8 +100,8 @@ def test_bad_choices(path, readable, tmp_path):
 
 def test_on_the_command_line(path, tmp_path, capsys):
     out = tmp_path / "some.csv"
-    assert main(["convert", str(path), str(out), "--bins", "50", "--strata", "flux"]) == 0
+    assert main(["convert", str(path), str(out), "--read", "bins=50", "strata=flux"]) == 0
     assert len(read(out)) == 50
     capsys.readouterr()
-    message = refused(["convert", str(path), str(tmp_path / "none.csv"), "--strata", "flux"], capsys, tmp_path)
-    assert "--strata is given without --bins" in message
+    message = refused(["convert", str(path), str(tmp_path / "none.csv"), "--read", "strata=flux"], capsys, tmp_path)
+    assert "strata is given without a number of bins" in message

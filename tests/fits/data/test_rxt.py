@@ -78,8 +78,8 @@ def test_the_stack_is_the_slab(tmp_path, slides, ior, expected):
     ("text", "words"),
     [
         ("IAD2 1.4", "not an .rxt file, which begins with IAD1"),
-        ("IAD1 1.4 1.0", "2 numbers, must be 17 before the readings"),
-        (BARE, "no readings behind the description"),
+        ("IAD1 1.4 1.0", "2 numbers, must be 17 before the measurements"),
+        (BARE, "no measurements after the description"),
         (BARE + "8\n0.3", r"line 12, column 'number of measurements': 8 is not allowed, must be a number in \[1, 7\]"),
         (BARE + "2\n800 0.3 0.4\n810 0.2", "line 14: 2 numbers, must be 3: L r t"),
         (BARE + "L r z\n800 0.3 0.4", "column 'z' is not one of r, t, u, L"),
@@ -159,7 +159,7 @@ def test_two_beams_need_no_sphere(tmp_path, comment):
     path = written(tmp_path, SAMPLE.format(spheres=1).replace("a slab", comment) + rows)
     slab = read_slab(path)
     assert slab.totals.spheres is None
-    assert "two beams were compared: spheres are left out" in slab.totals.source.notes[0]
+    assert "two beams were compared: spheres are ignored" in slab.totals.source.notes[0]
     assert read_slab(path, corrected=False).totals.spheres is not None
     assert read_slab(path, corrected=True).totals.spheres is None
     path = written(tmp_path, SAMPLE.format(spheres=2).replace("a slab", comment) + rows)
@@ -174,17 +174,16 @@ def test_the_command_line_chooses_rows_and_spheres(tmp_path, capsys):
     words = ["info", str(path), "--out", str(tmp_path / "a.png"), "--force"]
     assert main(words) == 2
     assert "restrict the wavelengths" in capsys.readouterr().err
-    assert main([*words, "--wavelengths", "600,620"]) == 0
+    assert main([*words, "--read", "wavelengths=600,620"]) == 0
     told = capsys.readouterr().out
     assert "600 nm, 620 nm" in told
-    assert "as an integrating sphere read them" in told
-    assert main([*words, "--wavelengths", "600,620", "--corrected"]) == 0
+    assert "as measured with an integrating sphere" in told
+    assert main([*words, "--read", "wavelengths=600,620", "corrected=yes"]) == 0
     assert "integrating sphere" not in capsys.readouterr().out
-    assert main(["convert", str(path), str(tmp_path / "a.csv"), "--wavelengths", "600,620", "--corrected"]) == 0
+    assert main(["convert", str(path), str(tmp_path / "a.csv"), "--read", "wavelengths=600,620", "corrected=yes"]) == 0
     np.testing.assert_allclose(read(tmp_path / "a.csv").values, [[0.3, 0.25]])
     capsys.readouterr()
-    assert main(["info", str(tmp_path / "a.csv"), "--corrected"]) == 2
+    assert main(["info", str(tmp_path / "a.csv"), "--read", "corrected=yes"]) == 2
     assert "wavelengths and corrected apply to rxt files only" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main([*words, "--wavelengths", "600,610,620"])
-    assert "must be the lowest and the highest, as in 600,620" in capsys.readouterr().err
+    assert main([*words, "--read", "wavelengths=600,610,620"]) == 2
+    assert "it must be the lowest and the highest in nm, as in 600,620" in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_directions_that_a_file_repeats_are_read_once(tmp_path: Path, system: st
     pairs = np.round(np.hstack([data.wi, data.wo]), 9) + 0.0
     assert len(np.unique(pairs, axis=0)) == len(data) == count
     assert data.values.max() < 24  # the first of them: none of the azimuth 360
-    assert f"left out: {36 - count} values at directions that the file holds already" in data.source.notes
+    assert f"skipped: {36 - count} values at directions that the file holds already" in data.source.notes
 
 
 @pytest.mark.parametrize("kind", ["brdf", "btdf"])
@@ -107,7 +107,7 @@ def test_half_vectors(tmp_path: Path) -> None:
         local = Rotation.from_euler("y", -theta_h, degrees=True).apply(wi.copy())  # towards x is positive
         theta_d, phi_d = [0, 20, 60][int(value) // 2 % 3], [0, 90, 200][int(value) // 6]
         np.testing.assert_allclose(local, direction(theta_d, phi_d), atol=1e-12)
-    assert "left out" in " ".join(data.source.notes)  # some lie below the horizon
+    assert "skipped" in " ".join(data.source.notes)  # some lie below the horizon
 
 
 def test_blocks_colours_and_binary(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_blocks_colours_and_binary(tmp_path: Path) -> None:
     once = np.r_[0:6, 8:12, 14:18]  # at PARAM2 = 0 all azimuths are one direction
     np.testing.assert_array_equal(data.values, numbers[:, once].reshape(-1, 3).astype(float))
     np.testing.assert_array_equal(np.sign(data.wo[:, 2]), np.repeat([1, -1], 14))
-    assert "left out: specular_reflectance" in data.source.notes
+    assert "skipped: specular_reflectance" in data.source.notes
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_more_than_all_the_light_is_noted(tmp_path):
             ("theta_i,total_reflectance_a,total_reflectance_b", "0,0.3,"),
             "line 2, column 'total_reflectance_b': the cell",
         ),
-        (("theta_i,total_reflectance", "0,", "10,"), "line 1: all cells of shares are empty"),
+        (("theta_i,total_reflectance", "0,", "10,"), "line 1: all cells of values are empty"),
         (("# a comment",), "the file holds only comments, must have a header line"),
     ],
 )

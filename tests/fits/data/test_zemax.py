@@ -111,7 +111,7 @@ def test_layout_by_hand(tmp_path):
     np.testing.assert_array_equal(data.mask, [True] * 6 + [False, True])
     np.testing.assert_allclose(data.wo[7], direction(85, 0), atol=1e-15)
     assert data.source.notes[1:] == (
-        "left out: 0 grid points at or beyond the horizon",
+        "skipped: 0 grid points at or beyond the horizon",
         "masked: 1 zero above the horizon, not measured",
     )
 
@@ -120,7 +120,7 @@ def test_below_the_horizon_is_left_out(tmp_path):
     data = _read(tmp_path, _header().replace("0 25", "0 35") + "Monochrome\n" + BLOCK)
     assert len(data) == 7  # 60 + 35 degrees away from the normal is below
     assert (data.wo[:, 2] > 0).all()
-    assert "left out: 1 grid point at or beyond the horizon" in data.source.notes
+    assert "skipped: 1 grid point at or beyond the horizon" in data.source.notes
 
 
 def test_transmission_goes_on_below(tmp_path):

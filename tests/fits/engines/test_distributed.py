@@ -158,7 +158,7 @@ def test_a_scheduler_that_goes_away_is_named(tmp_path: Path) -> None:
             found = run(tasks.slow, str(tmp_path / "seen"), range(1000), client=own)
             next(found)
             started[0].kill()
-            with pytest.raises(OSError, match=r"tcp://\S+: the scheduler has gone away"):
+            with pytest.raises(OSError, match=r"tcp://\S+: the scheduler has stopped"):
                 list(found)
     finally:
         for process in started:

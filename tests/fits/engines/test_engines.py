@@ -87,7 +87,7 @@ def test_a_mistake_ends_the_run_and_says_where(engine: dict[str, Any]) -> None:
 
 def test_a_task_that_kills_its_worker_costs_itself_alone(tmp_path: Path) -> None:
     found = dict(run(tasks.deadly, str(tmp_path / "tried"), range(6), processes=2))
-    assert found.pop(2) == Failure("its worker died 3 times (SIGKILL, which systems send where memory is short)")
+    assert found.pop(2) == Failure("its worker died 3 times (SIGKILL, which systems send when memory is short)")
     assert found == {index: index for index in (0, 1, 3, 4, 5)}
     tried = Counter((tmp_path / "tried").read_text().split())
     assert tried == {"2": 3, "0": 1, "1": 1, "3": 1, "4": 1, "5": 1}
@@ -241,7 +241,7 @@ def test_a_script_that_has_no_main_guard_is_told_so(tmp_path: Path) -> None:
     assert output == ""
     assert error.count("Traceback") == 1
     last = error.strip().splitlines()[-1]
-    assert last.startswith("ValueError: each worker process runs the script that asks for it")
+    assert last.startswith("ValueError: each worker process runs the script that starts it")
     assert '`if __name__ == "__main__":`' in last
 
 

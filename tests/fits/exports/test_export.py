@@ -9,7 +9,7 @@ import pytest
 import fits
 import layerjax as lj
 from fits.cli.parser import main
-from fits.data.formats._square import Between
+from fits.data.formats._square import Interpolation
 from fits.data.formats.rgl_table import read_table
 from fits.data.measurements import Measurements
 from fits.exports import merl
@@ -131,8 +131,8 @@ def test_what_is_drawn_from_an_rgl_file_is_drawn_as_light_goes(tmp_path: Path) -
     np.testing.assert_allclose(ratio, np.median(ratio), rtol=0.02)
 
 
-def _only(table: int, count: int) -> Between:
-    return Between(np.full((count, 1), table), np.ones((count, 1)))
+def _only(table: int, count: int) -> Interpolation:
+    return Interpolation(np.full((count, 1), table), np.ones((count, 1)))
 
 
 def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_a_merl_table_holds_the_stack_at_its_bins(tmp_path: Path) -> None:
 def test_a_merl_table_says_that_light_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Material, "values", lambda self, wi, wo, stage="": np.ones((len(wi), 3)))
     notes = merl.contents(material_of(HAZE, lj.SingleScattering())).notes
-    assert any("passes through is left out" in note for note in notes)
+    assert any("transmission is omitted" in note for note in notes)
 
 
 @pytest.mark.parametrize(("stack", "total"), [(HAZE, 1), (FIBERS, 24)], ids=["haze", "fibers"])
@@ -164,7 +164,7 @@ def test_a_zemax_file_holds_the_stack(tmp_path: Path, stack: lj.Stack, total: in
         # white of D65 by the matrix that the standard gives (IEC 61966-2-1)
         white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
         true = true @ white.T
-        assert any("passes through is left out" in note for note in notes)
+        assert any("transmission is omitted" in note for note in notes)
     used = data.mask
     np.testing.assert_allclose(data.values[used], true[used], rtol=1e-5)
     totals = [float(line.split()[1]) for line in path.read_text().splitlines() if line.startswith("TIS")]
@@ -227,7 +227,7 @@ def test_what_is_there_stays(tmp_path: Path) -> None:
 
 def test_on_the_command_line(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"]) == 0
-    assert "readings" in capsys.readouterr().out
+    assert "data points" in capsys.readouterr().out
     assert len(fits.read(work / "coat.csv")) > 1000
     assert "exists already" in refused(["export", "coat.toml", "--to", "csv", "--out", "coat.csv"], capsys, work)
     assert "must end in .bsdf" in refused(["export", "coat.toml", "--to", "rgl", "--out", "coat.txt"], capsys, work)

@@ -90,7 +90,7 @@ def test_colours_are_xyz_and_an_opaque_stack_has_no_back(tmp_path: Path) -> None
     done = fits.export(stack, tmp_path / "paint.xml", "klems")
     found = matrices(tmp_path / "paint.xml")
     assert {direction for _, direction in found} == {"Reflection Front"}
-    assert any("opaque: nothing of the back" in note for note in done.notes)
+    assert any("opaque: no data of the back" in note for note in done.notes)
     white = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     for wavelength, value in zip(("CIE-X", "Visible", "CIE-Z"), white @ [0.8, 0.4, 0.2], strict=True):
         np.testing.assert_allclose(found[wavelength, "Reflection Front"], value / np.pi, rtol=1e-5)
@@ -173,4 +173,4 @@ def test_blocks_that_the_visible_lacks_are_left_out(tmp_path: Path, grey: bytes)
     path.write_bytes(grey[:end] + more + grey[end:])
     data = fits.read(path)
     assert len(data) == 145**2
-    assert data.source.notes[-1] == "left out: X, the blocks are not those of the visible"
+    assert data.source.notes[-1] == "skipped: X, the blocks are not those of the visible"

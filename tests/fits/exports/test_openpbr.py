@@ -192,7 +192,7 @@ def test_a_stack_is_found_again(
 
 FAULTS = {
     "axis": (lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.5, (1.0, 0.0, 0.0)))], lj.Lambertian(0.3)), "no lobe"),
-    "light that passes": (lj.Stack([lj.Medium(0.7, 0.9)]), "% of the light passes this stack"),
+    "light that passes": (lj.Stack([lj.Medium(0.7, 0.9)]), "% of the light is transmitted"),
     "channels": (lj.Stack([], lj.Lambertian([0.1, 0.2])), "this stack has 2 channels"),
 }
 

@@ -19,7 +19,6 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.reports import tables, verdicts
-from fits.reports.agreement import discrepancy
 from fits.reports.results import load_fit, save_fit
 from fits.sampling.posterior import Posterior
 from tests.helpers.models import line
@@ -98,11 +97,11 @@ def test_where_they_cannot_be_counted_they_are_not(noise: Noise) -> None:
 
 
 def test_both_are_told(wrong: Fit) -> None:
-    words = " ".join(discrepancy(wrong))
+    words = " ".join(verdicts.verdict(wrong).remarks)
     assert "neighbouring residuals correlate by +0." in words
     assert "Set `discrepancy = false` to disable it" in words
-    assert f"deviation of {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BRDF" in words
-    table = tables.alone_table(wrong)
+    assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
+    table = tables.discrepancy_table(wrong)
     assert [row[0] for row in table.rows] == ["['a']", "['b']"]
     assert len(table.rows[0]) == len(table.columns)
 
@@ -117,13 +116,13 @@ def test_starts_are_those_that_were_asked_for(wrong: Fit) -> None:
     """Two with independent noise, then one from each of their minima and two more with the discrepancy."""
     again = sum(wrong.start_outcomes.values())
     assert again > 2
-    words = verdicts.starts_in_words(wrong)
+    words = tables.starts_in_words(wrong)
     assert words.startswith("2 with independent noise (seed 0, solver least_squares), then ")
     assert f"then {again} with the discrepancy term: " in words
     plain = replace(
         wrong, without_discrepancy=None, start_outcomes={**wrong.start_outcomes, "best minimum": 2, "local minima": 0}
     )
-    assert verdicts.starts_in_words(plain).startswith("2 (seed 0, solver least_squares): ")
+    assert tables.starts_in_words(plain).startswith("2 (seed 0, solver least_squares): ")
     assert f"{wrong.minima[0].count} of {again} starts with the discrepancy term" in verdicts.minima(wrong)[0]
 
 

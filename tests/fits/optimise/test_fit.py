@@ -168,8 +168,8 @@ def test_a_parameter_without_effect_is_not_determined() -> None:
     assert result.unidentified == (Direction(np.inf, {"['c']": 1.0}, {"['c']": np.inf}),)
     assert result.insensitive == ("['c']",)
     assert result.at_bound == ()
-    assert "the data leave 1 direction(s) unidentified" in result.status
-    assert verdicts.identifiability(result)["['c']"] == "NO INFLUENCE on the data"
+    assert "1 direction(s) in the space of parameters are not identified" in result.status
+    assert verdicts.identifiability(result)["['c']"] == "insensitive: no effect on the data"
 
 
 @pytest.mark.parametrize("strength", [0.0, 1e-300, 1e-170, 1e-30])

@@ -8,6 +8,8 @@ from scipy import stats
 
 from fits.optimise.fit import fit
 from fits.prediction.compare import compare
+from fits.prediction.cross_validation import groups_of
+from fits.prediction.options import ComparisonOptions
 from fits.problem.parameters import Free
 from fits.sampling.sample import sample
 from tests.helpers.models import design, line, measured
@@ -110,3 +112,13 @@ def test_different_data_or_objectives_are_refused(fits: dict) -> None:
     both = compare({"a": named, "b": named})
     assert both.sorted_by == "chi_square"
     assert math.isnan(both.rows[0].aic)
+
+
+def test_thresholds_are_options(fits: dict) -> None:
+    comparison = compare(fits, options=ComparisonOptions(slight_difference=1e6))
+    assert "line and flat are statistically indistinguishable" in comparison.verdict[0]
+    assert comparison.options.slight_difference == 1e6
+    assert len(groups_of(DATA, ComparisonOptions(min_incidences=10**6, scan_parts=2))) <= 2
+    for bad, message in (({"clear_difference": 0.0}, "must be above 0"), ({"scan_parts": 1}, "must be at least 2")):
+        with pytest.raises(ValueError, match=rf"{next(iter(bad))} is .*; it {message}"):
+            ComparisonOptions(**bad)

@@ -16,7 +16,7 @@ from fits.problem.discrepancy.parameters import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
-from fits.reports.predictions import UNRELIABLE, scores_table
+from fits.reports.tables import UNRELIABLE, scores_table
 from fits.sampling.sample import sample
 from tests.helpers.models import COUNT, design, directions, line, line_fit, measured
 

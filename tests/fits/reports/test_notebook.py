@@ -1,4 +1,4 @@
-"""What a notebook shows of results: their numbers, what is to be minded, and no word as HTML."""
+"""What a notebook shows of results: their numbers, reservations, and no word as HTML."""
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -35,25 +35,25 @@ def chain(fit: Fit, converged: bool) -> Posterior:
 def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
     shown = coat_fit._repr_html_()
     head, *found = rows(shown)
-    assert head == ["parameter", "value", "error", "unit", "bounds", "identified"]
+    assert head == ["parameter", "value", "error", "unit", "bounds", "identifiability"]
     assert [row[0] for row in found] == ["layers[0].thickness", "base.albedo"]
     for row in found:
         assert float(row[1]) == pytest.approx(coat_fit.values[row[0]], rel=0.01)
         assert float(row[2]) == pytest.approx(coat_fit.standard_errors[row[0]], rel=0.05)
     assert found[1][4] == "0 to 1"
-    assert f"Chi-square per degree of freedom: {coat_fit.reduced_chi_square:.3g}" in text(shown)
+    assert f"reduced chi-square {coat_fit.reduced_chi_square:.3g}" in text(shown)
 
 
-def test_what_is_open_is_told(result: Fit) -> None:
+def test_what_is_not_identified_is_named(result: Fit) -> None:
     bound = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]))
     found = {row[0]: row for row in rows(bound._repr_html_())}
-    assert found[A][-1] == "AT BOUND"
+    assert found[A][-1] == "at a bound"
     assert found[A][2] == "unknown"
-    assert f"At a bound: {A}." in text(bound._repr_html_())
+    assert f"{A} is at a bound." in text(bound._repr_html_())
     combination = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
     loose = replace(result, unidentified=(combination,))._repr_html_()
-    assert f"The data do not separate {A} and {B}" in text(loose)
-    assert any(row[2:4] == ["unconstrained", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
+    assert f"{A} and {B} are not identified separately" in text(loose)
+    assert any(row[2:4] == ["unidentified", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
 
 
 def test_a_joint_fit_is_shown_by_measurement_and_names_are_no_html() -> None:
@@ -90,7 +90,7 @@ def test_words_are_short_and_on_one_line(result: Fit, coat_data: Measurements) -
         == f"<Measurements: {len(coat_data)} data points, 10 of them masked, of value, from simulated data>"
     )
     assert repr(fits.slices(incidence=[10, 30], outgoing=[0, 20])) == "<Geometry: 4 pairs of directions>"
-    assert repr(result).startswith(f"<Fit to 100 readings: ['a'] {result.vector[0]:.4g} ± ")
+    assert repr(result).startswith(f"<Fit to 100 measurements: ['a'] {result.vector[0]:.4g} ± ")
     assert repr(chain(result, True)) == "<Posterior of ['a'], ['b']: 500 steps of 8 walkers, converged>"
     for shown in (result, chain(result, False), coat_data):
         assert "\n" not in repr(shown)

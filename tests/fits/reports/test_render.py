@@ -60,7 +60,10 @@ def test_the_command(tmp_path, capsys) -> None:
     for words, complaint in (
         ([str(stack), "--out", str(picture)], "exists already"),
         (["fabric", "--out", str(tmp_path / "a.png"), "--size", "100000"], "size is 100000, must be in [16, 1024]"),
-        (["fabrik", "--out", str(tmp_path / "a.png")], "neither a .toml file nor one of the gallery: window_shade"),
+        (
+            ["fabrik", "--out", str(tmp_path / "a.png")],
+            "neither a .toml file nor a material of the gallery: window_shade",
+        ),
         (["fabric", "--out", str(tmp_path / "a.jpg")], "pictures can be written as .png only"),
     ):
         assert main(["render", *words]) == 2

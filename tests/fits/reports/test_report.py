@@ -14,14 +14,12 @@ from fits.data.measurements import Measurements, Source
 from fits.data.neighbours import autocorrelation
 from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
-from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.reports import tables, verdicts
-from fits.reports.agreement import explains
+from fits.reports import tables
 from fits.reports.diagnostics import residual_structure, standardised
-from fits.reports.html import report
+from fits.reports.html import page, report
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.plots import parameters as parameter_pictures
@@ -50,13 +48,13 @@ def test_light_along_the_normal_has_the_planes_of_the_slices() -> None:
     assert in_plane(data).all()
 
 
-def test_incidences_are_told_apart_by_both_angles() -> None:
+def test_incidences_differ_by_either_angle() -> None:
     data = measurements([10, 30, 10, 30, 10], [180, 180, 0, 180, 180.0], [5] * 5, [0] * 5)
     found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
     assert found == [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]
 
 
-def test_incidences_are_not_told_apart_by_what_an_instrument_jitters() -> None:
+def test_incidences_are_the_same_within_the_jitter_of_an_instrument() -> None:
     theta = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0]
     phi = [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
     data = measurements(theta, phi, [5] * 8, [0] * 8)
@@ -98,7 +96,7 @@ def test_the_correlation_of_neighbours_is_recovered(correlation: float) -> None:
 def test_independent_share_is_what_the_mean_of_a_correlated_series_says() -> None:
     means = [series(0.6, 400, seed).mean() for seed in range(1500)]
     share = residual_structure(long_track(4000), series(0.6, 4000, seed=1)[:, None]).independent_share
-    # Var(mean) = 1 / (n share); 1500 means give the variance to sqrt(2 / 1500) = 4 %, 4000 readings the share to 5 %
+    # Var(mean) = 1 / (n share); 1500 means give the variance to sqrt(2 / 1500) = 4 %, 4000 residuals the share to 5 %
     assert share == pytest.approx(1 / (400 * np.var(means)), rel=0.2)
 
 
@@ -129,83 +127,6 @@ def test_numbers_stand_to_two_digits_of_their_error(value: float, error: float, 
     assert tables.with_error(value, error) == words
 
 
-class Altered:
-    """A fit with some of its answers replaced."""
-
-    def __init__(self, fit: Fit, **answers: object):
-        self.__dict__.update(answers)
-        self._fit = fit
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._fit, name)
-
-
-def test_a_misfit_is_called_one(coat_fit: Fit) -> None:
-    data, residuals = coat_fit.problem.data, standardised(coat_fit)
-    good = " ".join(explains(coat_fit, residual_structure(data, residuals)))
-    assert "what the stated noise predicts" in good
-    assert "too small" not in good
-    bad = Altered(coat_fit, reduced_chi_square=9.0, chi_square=9.0 * coat_fit.degrees_of_freedom)
-    words = " ".join(explains(bad, residual_structure(data, 3 * residuals)))
-    assert "too small by a factor of about 3 (3 for the size of the residuals)" in words
-    sentences, fine = verdicts.in_short(coat_fit, residual_structure(data, residuals))
-    assert fine
-    values = data.used().values
-    errors = np.sort(np.abs(coat_fit.predicted / values - 1.0).ravel())
-    half, most = map(float, re.findall(r"([\d.e-]+) %", sentences[0])[::2])
-    assert np.mean(errors < 0.01 * half) == pytest.approx(0.5, abs=0.05)
-    assert np.mean(errors < 0.01 * most) == pytest.approx(0.95, abs=0.05)
-    assert not verdicts.in_short(bad, residual_structure(data, 3 * residuals))[1]
-
-
-def test_combinations_and_bounds_are_named(coat_fit: Fit) -> None:
-    first, second = coat_fit.problem.names
-    together = Direction(0.3, {first: 0.8, second: -0.6}, {first: 0.01, second: 0.02})
-    undecided = Altered(coat_fit, unidentified=(together,), at_bound=(second,))
-    words = " ".join(verdicts.determines(undecided))
-    assert "1 of 2 principal directions of parameter space are constrained by the data to no better than 10 %" in words
-    assert f"At a bound: {second}" in words
-    (row,) = tables.unresolved_table(undecided).rows
-    assert row == ("1", "0.3", "weak", f"+0.8 {first}, -0.6 {second}", f"{first} 0.01, {second} 0.02")
-    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
-    (line,) = (line for line in verdicts.outcome(undecided, structure) if line.startswith("The data"))
-    assert line == f"The data do not separate {first} and {second}."
-    several = Altered(coat_fit, unidentified=(together, together, together))
-    (line,) = (line for line in verdicts.outcome(several, structure) if line.startswith("The data"))
-    assert line.endswith("(and more).")  # still one line
-    short, fine = verdicts.in_short(undecided, structure)
-    assert f"The data do not separate {first} and {second}." in short
-    assert not fine
-    assert verdicts.identifiability(undecided)[first] == "weakly constrained: see direction 1"
-    assert verdicts.identifiability(coat_fit)[first] == f"trades with {second} {coat_fit.correlation[0, 1]:+.2f}"
-    apart = Altered(coat_fit, correlation=np.eye(2))
-    assert verdicts.identifiability(apart)[first] == "yes"
-    unseen = Altered(coat_fit, unidentified=(Direction(np.inf, {first: 1.0}, {first: np.inf}),))
-    assert f"The data do not determine {first}." in verdicts.outcome(unseen, structure)
-    assert tables.unresolved_table(unseen).rows[0][:3] == ("1", "infinite", "unconstrained")
-    assert verdicts.identifiability(unseen)[first] == "unconstrained by the data: see direction 1"
-
-
-def test_a_small_share_in_a_loose_direction_does_not_make_a_parameter_loose(coat_fit: Fit) -> None:
-    """alpha 0.284 +- 0.017 was called loose for a weight of 0.028: it is known to 2 % of its range."""
-    first, second = coat_fit.problem.names
-    mostly = Direction(0.6, {first: 0.9996, second: 0.028}, {first: 0.01, second: 0.02})
-    apart = Altered(coat_fit, unidentified=(mostly,), correlation=np.eye(2))
-    assert verdicts.identifiability(apart) == {first: "weakly constrained: see direction 1", second: "yes"}
-    structure = residual_structure(coat_fit.problem.data, standardised(coat_fit))
-    assert f"The data weakly constrain {first}." in verdicts.in_short(apart, structure)[0]
-    # of two directions, the one that a parameter owes more of its variance
-    other = Direction(0.2, {second: 0.9996, first: 0.028}, {first: 0.01, second: 0.02})
-    both = Altered(coat_fit, unidentified=(mostly, other), correlation=np.eye(2))
-    words = verdicts.identifiability(both)
-    assert words == {first: "weakly constrained: see direction 1", second: "weakly constrained: see direction 2"}
-    # a box and a half across, of which a parameter has a third
-    wide = Direction(1.5, {first: 0.94, second: 0.34}, {first: 0.01, second: 0.02})
-    words = verdicts.identifiability(Altered(coat_fit, unidentified=(wide,), correlation=np.eye(2)))
-    assert words[first].startswith("unconstrained by the data")
-    assert words[second].startswith("weakly constrained")
-
-
 def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
     strange = Source("<coat> & paint.csv", "csv", "brdf_cos", ("a note",), "Somebody's laboratory")
     named = replace(coat_fit, problem=replace(coat_fit.problem, data=replace(coat_fit.problem.data, source=strange)))
@@ -217,7 +138,7 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         "layers[0].thickness",
         "base.albedo",
         "optical depth",
-        "Chi-square per degree of freedom",
+        "reduced chi-square",
         "condition number",
     ):
         assert word in text, word
@@ -228,6 +149,16 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
     assert len(pictured) == 6  # stack, curves, maps, residuals, correlation, comparison
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_the_report_lists_the_incidences_that_were_fitted(coat_fit: Fit) -> None:
+    data = coat_fit.problem.data
+    kept = data.where(np.isclose(data.theta_i, 10.0), "held out: incidence=50")
+    text = page(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)), None, {})
+    assert "<td>incidence</td><td>10°</td>" in text
+    heads = re.findall("<h2>(.*?)</h2>", text)
+    assert heads == ["Values", "Data and model", "Diagnostics", "Identifiability", "Posterior"]
+    assert text.index('class="verdict') < text.index("<h2>")
 
 
 def test_the_report_replaces_an_earlier_one_only_by_force(coat_fit: Fit, tmp_path: Path) -> None:

@@ -15,8 +15,7 @@ from fits.optimise.result import Fit, Minimum
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.reports.directories import replacing
-from fits.reports.results import load_fit, load_posterior, save_fit
+from fits.reports.results import load_fit, load_posterior, replacing, save_fit
 from fits.sampling.sample import sample
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
@@ -156,7 +155,7 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
         ("fit.json", "{", "not valid JSON"),
         ("fit.json", "[]", "must be an object"),
         ("fit.json", '{"layerjax_result": 99}', "version 99"),
-        ("fit.json", '{"layerjax_result": 2}', "damaged"),
+        ("fit.json", '{"layerjax_result": 4}', "damaged"),
         ("data.csv", None, "data.csv"),
         ("data.csv", "", "data.csv: damaged or changed"),
         ("problem.toml", "layers = 3", "problem.toml: damaged or changed"),

@@ -10,7 +10,7 @@ import pytest
 from fits.cli.parser import main
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements
-from fits.reports.data_tables import data_table
+from fits.reports.data_summary import data_table
 from fits.reports.tables import Table, degrees, print_table
 
 INCIDENCES, OUTGOING = (8.123456, 30.0, 55.5, 75.0), (0.0012345, 12.3456, 45.0, 89.851123)

@@ -11,8 +11,8 @@ import fits
 import layerjax as lj
 from fits.cli.parser import main
 from fits.data.formats import totals_csv
-from fits.reports.data_tables import data_table, source_table
-from fits.reports.plots.totals import totals_picture
+from fits.reports.data_summary import data_table, source_table
+from fits.reports.plots.data import totals_picture
 from tests.helpers.commands import refused
 
 SPHERES = fits.Spheres(fits.Sphere(100.0, 20.0, 5.0, 8.0, 0.95), fits.Sphere(90.0, 20.0, wall=0.97), 0.98, True)
@@ -67,15 +67,15 @@ def test_a_fit_by_spheres_is_kept_and_reported(tmp_path: Path) -> None:
     np.testing.assert_allclose(loaded.predicted, fit.predicted, rtol=1e-12)
     fits.report(loaded, path=tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert "as two integrating spheres read them" in page
-    assert "Shares of the light, with one sigma" in page
+    assert "as measured with two integrating spheres" in page
+    assert "Shares of the incident flux with one sigma" in page
     assert "In the plane of incidence" not in page
 
 
 def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     monkeypatch.chdir(folder)
     assert main(["info", "totals.csv"]) == 0
-    assert "totals, shares of the light" in capsys.readouterr().out
+    assert "shares of the incident flux" in capsys.readouterr().out
     assert (folder / "totals.png").is_file()
     assert main(["fit", "totals.csv", "--stack", "slab.toml", "--out", "result", "--starts", "1"]) == 0
     assert "layers[0].thickness" in capsys.readouterr().out
@@ -83,21 +83,17 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
     assert main(["convert", "totals.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
     capsys.readouterr()
+    fit = ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r"]
     for words, message in (
-        (
-            ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r", "--only", "incidence=0"],
-            "--only chooses nothing",
-        ),
-        (["fit", "totals.csv", "--stack", "slab.toml", "--out", "r", "--mask-grazing", "50"], "--mask-grazing chooses"),
-        (["info", "totals.csv", "--quantity", "brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
-        (["search", "totals.csv", "--out", "r"], "a search takes values along directions"),
+        ([*fit, "--select", "incidence=0"], "--select does not apply"),
+        ([*fit, "--max-polar-angle", "50"], "--max-polar-angle does not apply"),
+        (["info", "totals.csv", "--read", "quantity=brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
+        (["search", "totals.csv", "--out", "r"], "a search needs measurements along directions"),
     ):
         assert message in refused(words, capsys, folder)
 
 
-def test_readings_of_spheres_are_not_converted_to_what_tells_of_none(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch
-) -> None:
+def test_totals_of_spheres_are_not_converted(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     monkeypatch.chdir(folder)
     sphere = "200 25 12 1 0.96"
     (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
@@ -108,7 +104,7 @@ def test_many_channels_have_a_range(tmp_path: Path) -> None:
     names = tuple(f"{nm} nm" for nm in range(400, 700, 10))
     totals = fits.Totals.of(reflectance=np.linspace(0.1, 0.5, 30)[None], channels=names)
     assert data_table(totals).rows == (("reflectance", "0°", "0.1", "0.5"),)
-    assert dict(source_table(totals).rows)["values came as"] == "totals, shares of the light"
+    assert dict(source_table(totals).rows)["quantity"] == "shares of the incident flux"
     panel = totals_picture(totals).axes[0]
     assert len(panel.get_xticks()) == 10
     assert panel.get_xticklabels()[0].get_text() == "400 nm"
@@ -122,7 +118,7 @@ def test_an_angle_has_one_colour_in_all_panels_and_is_in_the_legend() -> None:
     some = replace(every, **arrays, kinds=tuple(every.kinds[row] for row in kept))
     picture = totals_picture(some, SimpleNamespace(predicted=some.values))
     words = {text.get_text() for text in picture.legends[0].get_texts()}
-    assert words == {f"{what} at {angle}°" for what in ("read", "fit") for angle in (0, 8, 60)}
+    assert words == {f"{what} at {angle}°" for what in ("measured", "fit") for angle in (0, 8, 60)}
     colours: dict[str, set[str]] = {}
     for axes in picture.axes:
         for line, label in zip(*axes.get_legend_handles_labels(), strict=True):

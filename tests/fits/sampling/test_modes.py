@@ -15,7 +15,6 @@ from fits.optimise.result import Fit
 from fits.prediction.importance import importance_draws
 from fits.problem.parameters import Free, Normal
 from fits.reports import verdicts
-from fits.reports.diagnostics import residual_structure, standardised
 from fits.reports.tables import parameter_table, posterior_table
 from fits.sampling.chain import MemoryChain
 from fits.sampling.convergence import autocorrelation_times, long_enough, r_hat
@@ -117,13 +116,11 @@ def test_chains_visit_all_modes_as_often_as_they_are_likely(
 
 def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
     assert len(fitted.alternatives) == 1
-    lines, sure = verdicts.in_short(fitted, residual_structure(fitted.problem.data, standardised(fitted)))
-    words = "standard errors are those of the best one alone"
-    assert not sure
-    assert any(words in line for line in lines)
-    assert any(words in line for line in verdicts.minima(fitted))
-    assert parameter_table(fitted).note == "Errors are those of the best minimum alone."
-    assert "the errors are of this minimum alone" in fitted.status
+    lines, _, sound = verdicts.verdict(fitted)
+    assert not sound
+    assert "standard errors are those of the best one only" in lines[1]
+    assert parameter_table(fitted).note == "Errors are those of the best minimum only."
+    assert "errors are conditional on this local minimum" in fitted.status
 
 
 def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
@@ -158,8 +155,8 @@ def test_it_is_said_where_shares_of_modes_are_not_known(fitted: Fit) -> None:
     modes = tuple(fits.Mode(0.5, 0.18, dict(zip(fitted.problem.names, one, strict=True))) for one in at[:2])
     posterior = Posterior(fitted, values, np.zeros((200, 8)), np.ones(2), 0.5, False, modes=modes)
     lines = verdicts.sampled(posterior)
-    assert any("R-hat is above 1.01: walkers differ in how long they stay at each mode" in line for line in lines)
-    assert any("R-hat above 1.05" in line for line in lines)
+    assert any("R-hat is above 1.01: the shares of the modes are uncertain" in line for line in lines)
+    assert any("The chain has not converged" in line for line in lines)
     with pytest.raises(ValueError, match=r"with R-hat below 1.05 \(it is [1-9]"):
         posterior.summary()
 

@@ -105,16 +105,6 @@ def test_without_its_extra_it_says_how_to_get_it(result: Fit, monkeypatch: pytes
         sample(result, sampler="nuts")
 
 
-def test_the_command_says_so_before_it_fits(
-    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "blackjax", None)
-    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--sample", "--sampler", "nuts"]
-    assert main(words) == 2
-    assert 'pip install "layerjax[nuts]"' in capsys.readouterr().err
-    assert not (work / "result").exists()
-
-
 def test_the_command_samples_with_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:

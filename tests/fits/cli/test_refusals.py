@@ -1,0 +1,167 @@
+"""Bad input and bad usage of `layerjax`: one line on stderr, exit code 2, and nothing written."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from fits.cli import commands
+from fits.cli.parser import main
+from fits.optimise.result import Fit
+from fits.reports.results import save_fit
+from tests.helpers.commands import refused
+from tests.helpers.files import contents
+
+HEADER = "theta_i,phi_i,theta_o,phi_o,brdf\n"
+FIT = "fit data.csv --stack coat.toml --out result"
+PREDICT = "predict saved --incidence 30 --out new.csv"
+
+BAD_DATA = {
+    "missing column": ("theta_i,phi_i,theta_o,phi_o\n10,180,20,0\n", "brdf"),
+    "missing angle": ("theta_i,phi_i,theta_o,brdf\n10,180,20,0.1\n", "phi_o"),
+    "text in a number": (HEADER + "10,180,twenty,0,0.1\n", "twenty"),
+    "nothing but NaN": (HEADER + "10,180,20,0,nan\n", "no data point below holds a number"),
+    "angle of NaN": (HEADER + "10,180,nan,0,0.1\n", "nan"),
+    "too large": (HEADER + "10,180,20,0,1e300\n", "1e300"),
+    "angle outside its range": (HEADER + "10,180,200,0,0.1\n", "200"),
+    "empty file": ("", "empty"),
+    "header only": (HEADER, "no samples"),
+    "short row": (HEADER + "10,180,20,0\n", "4 cells"),
+}
+
+
+@pytest.mark.parametrize(("text", "fragment"), BAD_DATA.values(), ids=BAD_DATA)
+@pytest.mark.parametrize("command", ["fit {} --stack coat.toml --out result", "info {}", "convert {} good.csv"])
+def test_bad_data(work: Path, capsys: pytest.CaptureFixture[str], text: str, fragment: str, command: str) -> None:
+    (work / "bad.csv").write_text(text)
+    message = refused(command.format("bad.csv").split(), capsys, work)
+    assert "bad.csv" in message
+    assert fragment in message
+
+
+BAD_STACKS = {
+    "unknown key": ("thicknes = 1.0", "thicknes"),
+    "bounds the wrong way round": ("thickness = { start = 1.0, low = 5.0, high = 0.05 }", "low"),
+    "start outside its bounds": ("thickness = { start = 9.0, low = 0.05, high = 5.0 }", "start"),
+    "outside the range of the field": ("thickness = -1.0", "thickness"),
+    "not TOML": ("thickness = = 1", "TOML"),
+}
+
+
+@pytest.mark.parametrize(("line", "fragment"), BAD_STACKS.values(), ids=BAD_STACKS)
+@pytest.mark.parametrize("command", ["fit data.csv --stack {} --out result", "simulate --stack {} --out new.csv"])
+def test_bad_stacks(work: Path, capsys: pytest.CaptureFixture[str], line: str, fragment: str, command: str) -> None:
+    lines = (work / "coat.toml").read_text().splitlines()
+    (work / "bad.toml").write_text("\n".join(line if old.startswith("thickness") else old for old in lines))
+    message = refused(command.format("bad.toml").split(), capsys, work)
+    assert "bad.toml" in message
+    assert fragment in message
+
+
+REFUSALS = (
+    ("info nowhere.csv", "nowhere.csv"),
+    ("info .", "."),
+    ("info short.binary", "short.binary"),
+    ("info data.csv --out coat.toml", "--force"),
+    ("info data.csv --read format=mrel", "format is 'mrel'; it must be one of csv, "),
+    ("info data.csv --read csv", "'csv' is no option of reading; it must be format=..., quantity=..., bins=..."),
+    ("info data.csv --read format=csv format=csv", "format is given twice"),
+    ("info data.csv --read bins=0", "bins is '0'; it must be a number of at least 1, or all"),
+    ("info data.csv --read corrected=maybe", "corrected is 'maybe'; it must be yes or no"),
+    ("fit data.csv --stack nowhere.toml --out result", "nowhere.toml"),
+    ("fit data.csv --stack rough.toml --out result", "Interface"),
+    ("fit data.csv --stack coat.toml --out no/such/result", "no/such"),
+    ("fit data.csv --stack coat.toml --out .", "not a result directory"),
+    ("fit data.csv --stack coat.toml --out . --force", "not a result directory"),
+    (f"{FIT} --max-polar-angle 1", "no sample"),
+    (f"{FIT} --hold-out incidence=30", "incidence 30 is not in the data; there are 10, 50 degrees"),
+    (f"{FIT} --hold-out incidence=10,50", "--select and --hold-out leave nothing to fit"),
+    (f"{FIT} --select incidence=10 --hold-out incidence=50", "--hold-out leaves nothing to score"),
+    (f"{FIT} --hold-out everything", "'everything' is no selection"),
+    (f"{FIT} --hold-out channel=value", "the parameters of a channel cannot be predicted from others"),
+    (f"{FIT} --select channel=blue", "channel blue is not in the data; there are"),
+    (
+        "fit data.csv --stack root.toml --out result --hold-out share=0.2",
+        "--hold-out needs the objective 'likelihood'",
+    ),
+    ("convert data.csv data.csv", "--force"),
+    ("convert data.csv data.bsdf", ".csv"),
+    ("simulate --stack coat.toml --out data.csv", "--force"),
+    ("simulate --stack coat.toml --incidence 95.5 200 --out new.csv", "200"),
+    ("sample .", "fit.json"),
+    ("report nowhere", "nowhere"),
+    ("compare .", "two or more"),
+    ("compare . nowhere", "fit.json"),
+    ("predict saved", "predict needs one of --incidence and --score"),
+    ("predict saved --incidence 30 --score data.csv", "predict needs one of --incidence and --score"),
+    ("predict saved --incidence 30", "predict --incidence needs --out FILE"),
+    ("predict saved --incidence 30 --out new.txt", ".csv"),
+    (f"{PREDICT} --select plane=0", "--select is given without --score"),
+    (f"{PREDICT} --read bins=all", "--read is given without --score"),
+    ("predict saved --score data.csv --azimuth 90", "--azimuth is given without --incidence"),
+    ("predict saved --incidence 95 --out new.csv", "a light at 95 degrees sees nothing"),
+    ("predict nowhere --incidence 30 --out new.csv", "nowhere"),
+    ("predict saved --score nowhere.csv", "nowhere.csv"),
+    ("predict saved --score data.csv --select incidence=40", "incidence 40 is not in the data"),
+    ("predict saved --incidence 130 --out new.csv --azimuth 400", "400"),
+)
+
+
+@pytest.mark.parametrize(("command", "fragment"), REFUSALS)
+def test_refusals(work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, command: str, fragment: str) -> None:
+    (work / "short.binary").write_bytes(np.array([90, 90, 180], "<i4").tobytes() + b"\0" * 1000)
+    interface = '[[layers]]\nkind = "Interface"\nior = { start = 1.5, low = 1.2, high = 2.0 }\nalpha = 0.1\n'
+    (work / "rough.toml").write_text('transport = "SingleScattering"\n' + interface)
+    (work / "root.toml").write_text('objective = "cube_root"\n' + (work / "coat.toml").read_text())
+    if "saved" in command:
+        save_fit(coat_fit, "saved")
+    assert fragment in refused(command.split(), capsys, work)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "",
+        "fot",
+        "fit data.csv",
+        f"{FIT} --starts 0",
+        f"{FIT} --min-retro-angle nan",
+        "simulate --stack coat.toml --out x.csv --noise -1",
+    ],
+)
+def test_bad_usage(work: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+    before = contents(work)
+    with pytest.raises(SystemExit) as stop:
+        main(command.split())
+    assert stop.value.code == 2
+    assert contents(work) == before
+    assert "error: " in capsys.readouterr().err
+
+
+MACHINE = {
+    "memory": (MemoryError("Unable to allocate 74.5 GiB"), "memory is not enough: Unable to allocate 74.5 GiB"),
+    "memory without a message": (MemoryError(), "memory is not enough: MemoryError"),
+    "JAX's memory": (
+        jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 bytes."),
+        "memory is not enough: RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.",
+    ),
+    "size": (OverflowError("cannot convert float infinity to integer"), "a number is too large: cannot convert"),
+}
+
+
+@pytest.mark.parametrize(("error", "fragment"), MACHINE.values(), ids=MACHINE)
+def test_errors_of_the_machine(
+    work: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception, fragment: str
+) -> None:
+    def fails(_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(commands, "info", fails)
+    assert fragment in refused(["info", "data.csv"], capsys, work)
+
+
+def test_an_error_of_the_program_has_its_traceback(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "info", lambda _: {}["nothing"])
+    with pytest.raises(KeyError):
+        main(["info", "data.csv"])
