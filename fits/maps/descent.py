@@ -183,7 +183,7 @@ class _Lane(NamedTuple):
     """A texel on its way.
 
     texel: its number. rough: whether it goes by `sigma`, (N, C), which is held, as far from the data; NaN where not.
-    unit: (P,), and the solver's state, beside which stands what is known at `unit`.
+    unit: (P,), and the solver's state, whose auxiliary output is the linearisation at `unit`.
     """
 
     texel: Array
@@ -282,7 +282,7 @@ def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array) -> Any:
 
 def _ends(lanes: _Lane, converged: Array) -> Ending:
     state = lanes.state
-    return Ending(lanes.unit, state.cost, state.gradient, converged.astype(lanes.unit.dtype), state.beside)
+    return Ending(lanes.unit, state.cost, state.gradient, converged.astype(lanes.unit.dtype), state.auxiliary)
 
 
 def _choose(where: Array, new: Array, old: Array) -> Array:
@@ -335,9 +335,9 @@ class _Lanes:
         known = nothing if self.known is None else jax.tree.map(lambda part: part[self.which[at]], self.known)
         return _Lane(number, rough, sigma, unit, self._state(unit, nothing)), known
 
-    def _state(self, unit: Array, beside: Linearisation) -> Any:
-        state = _SOLVER.init(None, unit, None, self.options, None, beside, frozenset())
-        return with_beside(state, beside)
+    def _state(self, unit: Array, auxiliary: Linearisation) -> Any:
+        state = _SOLVER.init(None, unit, None, self.options, None, auxiliary, frozenset())
+        return with_auxiliary(state, auxiliary)
 
     def _step(self, lane: _Lane, trial: Linearisation) -> tuple[_Lane, Array, Array]:
         row, at = self._row(lane.texel), self.model.box.from_unit(lane.state.trial)
@@ -354,7 +354,7 @@ class _Lanes:
         unit, state = jax.tree.map(partial(jnp.where, last), self._stepped_last(unit, state), (unit, state))
         stop |= last
         again = stop & lane.rough
-        state = jax.tree.map(partial(jnp.where, again), self._state(unit, state.beside), state)
+        state = jax.tree.map(partial(jnp.where, again), self._state(unit, state.auxiliary), state)
         converged = (result == optx.RESULTS.successful) & jnp.isfinite(state.cost)
         return _Lane(lane.texel, lane.rough & ~stop, lane.sigma, unit, state), stop & ~lane.rough, converged
 
@@ -367,13 +367,13 @@ class _Lanes:
 
     def _stepped_last(self, unit: Array, state: Any) -> tuple[Array, Any]:
         """After a step so short that all is linear on the way."""
-        step, known = state.trial - unit, state.beside
+        step, known = state.trial - unit, state.auxiliary
         moved = self.model.box.from_unit(state.trial) - self.model.box.from_unit(unit)
         near = Linearisation(known.values + jnp.tensordot(moved, known.slopes, 1), known.slopes)
         state = replace(state, cost=state.cost - state.predicted, gradient=state.gradient + state.normal @ step)
-        return state.trial, with_beside(state, near)
+        return state.trial, with_auxiliary(state, near)
 
 
-def with_beside(state: Any, beside: Any) -> Any:
-    """A solver's state with something else beside it."""
-    return eqx.tree_at(lambda s: s.beside, state, beside, is_leaf=lambda part: part is None)
+def with_auxiliary(state: Any, auxiliary: Any) -> Any:
+    """A solver's state with another auxiliary output."""
+    return eqx.tree_at(lambda s: s.auxiliary, state, auxiliary, is_leaf=lambda part: part is None)
