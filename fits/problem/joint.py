@@ -57,11 +57,6 @@ class JointModel(Density):
         """See `Density`."""
         return (2,) if any(part.logarithmic for part in self.parts) else ()
 
-    @property
-    def rows(self) -> int:
-        """See `Density`."""
-        return sum(part.rows for part in self.parts)
-
     def vectors(self, vector: Array) -> list[Array]:
         """The parameters of each data set."""
         return [vector[np.array(own)] for own in self.own]

@@ -82,11 +82,6 @@ class Density(eqx.Module):
     def logarithmic(self) -> tuple[int, ...]:
         """Places, among `residuals`, of those whose half squares are logarithms of levels of noise."""
 
-    @property
-    @abc.abstractmethod
-    def rows(self) -> int:
-        """Number of `residuals` without those of the prior."""
-
     @abc.abstractmethod
     def predict(self, vector: Array) -> Array:
         """Scaled BSDF, (N, C), in 1/sr."""
@@ -286,12 +281,6 @@ class Model(Density):
     def logarithmic(self) -> tuple[int, ...]:
         """See `Density`."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
-
-    @property
-    def rows(self) -> int:
-        """See `Density`."""
-        own = self.values.size * (1 + self.varying)
-        return own if self.process is None else own + self.process.rows_beside(self.values.shape[-1])
 
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
         """See `Density`."""

@@ -29,8 +29,6 @@ from fits._files import locked, named, write_bytes, write_whole
 
 GROUP = "mcmc"
 MOVES = "layerjax_moves"
-SURROGATE = ".surrogate"
-"""Suffix of a file beside a chain: what is known of a surrogate that is not yet built."""
 IDENTITY = "layerjax_"
 TITLE, USER_BLOCK = b"chain of layerjax", 512
 BEFORE_CHECKSUMS = b"\x89HDF"
@@ -111,9 +109,8 @@ class FileChain(MemoryChain):
             raise
 
     def _take(self, resume: bool) -> None:
-        for name in (self.path.name, beside(self.path, SURROGATE).name):
-            for left in self.path.parent.glob(f".{glob.escape(name)}.????????"):
-                left.unlink()  # what a process wrote as it was killed
+        for left in self.path.parent.glob(f".{glob.escape(self.path.name)}.????????"):
+            left.unlink()  # what a process wrote as it was killed
         if resume and self.path.exists():
             stored = read_chain(self.path)
             _refuse_others(self.path, stored["identity"], self.identity)

@@ -1,10 +1,9 @@
 """An ensemble of walkers moved by emcee, in unconstrained coordinates, where the box has no walls.
 
-Where an evaluation is cheap, half the steps are stretch moves, and half independent proposals from an approximation,
-the fit's own or one learned from the chain (`laplace`). Where it is costly, most are delayed acceptance by a surrogate.
+Half the steps are stretch moves, and half independent proposals from an approximation, the fit's own or one learned
+from the chain (`laplace`).
 """
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -15,21 +14,14 @@ from jax import Array
 from numpy.typing import NDArray
 
 from fits.optimise.result import Fit
+from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
-from fits.problem.problem import Problem
-from fits.progress import Progress
 from fits.sampling.chain import MemoryChain
 from fits.sampling.convergence import last_checks
-from fits.sampling.delayed_acceptance import DelayedAcceptance
-from fits.sampling.design import Design, Kept, Walked
 from fits.sampling.laplace import Approximation, first_positions
 from fits.sampling.mixture import MODES, Mixture
-from fits.sampling.surrogate import evaluate_many
 
 INDEPENDENT = 0.5
-BY_SURROGATE, BESIDE = 0.8, 0.1  # share of its moves, and of each of the other two beside them
-COSTLY = 200e-6  # seconds an evaluation: below, walks of a surrogate and their compilation take longer than they save
-TRIES, ENOUGH = 3, 0.1  # that it is timed at least, and seconds after which it is timed no more
 
 Floats = NDArray[np.float64]
 Proposals = Approximation | Mixture
@@ -41,30 +33,10 @@ class Ensemble:
     def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
         self.problem, self.chain, self.seed = fit.problem, chain, seed
         self.initial: Proposals = Mixture.of(fit) or Approximation.of(fit)
-        self._delayed: DelayedAcceptance | None = None
-        self._read_moves()
 
-    def decide(self, surrogate: bool, kept: Kept, progress: Progress | None) -> None:
-        """Before the first step, and for all: whether proposals come from a surrogate, which is built if so."""
-        moves: dict[str, Any] = {"surrogate": surrogate, "words": ""}
-        moves |= modes_of(self.initial)
-        if surrogate:
-            built = Design(self.problem, self.chain.shape[0], self.seed, kept, progress).build(self.initial)
-            moves["words"] = built.words
-            if built.walked is not None:
-                moves |= built.walked.arrays()
-        self.chain.decide(moves)
-        self._read_moves()
-        kept.remove()
-
-    @property
-    def has_modes(self) -> bool:
-        """Whether the posterior has several, between which walkers leap by the mixture of all."""
-        return bool(modes_of(self.initial))
-
-    def _read_moves(self) -> None:
-        walked = Walked.from_arrays(self.problem.model, self.chain.moves)
-        self._delayed = walked and walked.moves()
+    def decide(self) -> None:
+        """Before the first step, and for all: between which modes walkers jump."""
+        self.chain.decide(modes_of(self.initial))
 
     def advance(self, step: int, tell: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""
@@ -78,18 +50,15 @@ class Ensemble:
         """emcee with the moves of the steps up to the next check."""
         independent = emcee.moves.MHMove(adapted(self.chain, self.initial).propose)
         moves = [(independent, INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
-        if self._delayed is not None:
-            by_surrogate = emcee.moves.MHMove(self._delayed.propose)
-            moves = [(by_surrogate, BY_SURROGATE), (independent, BESIDE), (emcee.moves.StretchMove(), BESIDE)]
         walkers, count = self.chain.shape
         return emcee.EnsembleSampler(
             walkers, count, self._log_posteriors, moves=moves, vectorize=True, backend=self.chain
         )
 
     def _log_posteriors(self, positions: Floats) -> Floats:
-        if self._delayed is not None:  # the program that the surrogate was built with: compiled already
-            return evaluate_many(self.problem, positions, self.chain.shape[0])[1]
-        return np.asarray(self.problem.call(log_posteriors, positions), float)
+        share = max(1, len(positions) // cores())
+        (heights,) = in_shares(lambda part: [self.problem.call(log_posteriors, part)], positions, share)
+        return heights
 
     def _first_state(self) -> emcee.State:
         def finite(positions: Floats) -> bool:
@@ -126,17 +95,3 @@ def adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
 def log_posteriors(model: Model, positions: Array) -> Array:
     """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
     return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
-
-
-def is_costly(problem: Problem, positions: Floats) -> bool:
-    """Whether a log-posterior takes more than COSTLY by the clock, at its best, in a program compiled before.
-
-    One look under that ends it, and the others may be slow: another process may have had the processor.
-    """
-    began, tries = time.perf_counter(), 0
-    while tries < TRIES or time.perf_counter() - began < ENOUGH:
-        before, tries = time.perf_counter(), tries + 1
-        np.asarray(problem.call(log_posteriors, positions))
-        if time.perf_counter() - before <= COSTLY * len(positions):
-            return False
-    return True

@@ -49,11 +49,12 @@ def require_blackjax() -> None:
 class Nuts:
     """Moves the chains about the optimum of a fit. A step depends on the seed, its number, and where the chains are."""
 
-    def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
+    def __init__(self, fit: Fit, chain: MemoryChain, seed: int, progress: Progress | None):
         self.fit, self.problem, self.chain, self.seed = fit, fit.problem, chain, seed
+        self.progress = progress
         self._compiled = False
 
-    def decide(self, progress: Progress | None) -> None:
+    def decide(self) -> None:
         """Before the first step, and for all: starts, metric and length of steps, by a warm-up that is not kept."""
         generator = np.random.RandomState(self.seed)
         mixture, near = Mixture.of(self.fit), Approximation.of(self.fit)
@@ -74,8 +75,8 @@ class Nuts:
                 state = update(state, float(np.mean(acceptance)))
                 visited.append(positions)
                 heights.append(height)
-                if progress is not None:
-                    progress("warm-up", done, sum(WARM_UP))
+                if self.progress is not None:
+                    self.progress("warm-up", done, sum(WARM_UP))
             length = float(end(state))
             if done < sum(WARM_UP):
                 settled, level = np.concatenate(visited[SETTLING:]), np.concatenate(heights[SETTLING:])

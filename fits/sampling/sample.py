@@ -14,10 +14,9 @@ from scipy.stats import qmc
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 from fits.progress import Progress
-from fits.sampling.chain import SURROGATE, FileChain, MemoryChain, another, beside, stored_chain
+from fits.sampling.chain import FileChain, MemoryChain, stored_chain
 from fits.sampling.convergence import FIRST_CHECK, Outlook, finished, next_check
-from fits.sampling.design import Kept
-from fits.sampling.ensemble import Ensemble, is_costly, log_posteriors
+from fits.sampling.ensemble import Ensemble, log_posteriors
 from fits.sampling.nuts import CHAINS, Nuts, require_blackjax
 from fits.sampling.posterior import Posterior, posterior_of
 from layerjax._checks import require_kind
@@ -33,7 +32,6 @@ def sample(
     walkers: int | None = None,
     seed: int = 0,
     path: str | Path | None = None,
-    surrogate: bool | None = None,
     ess: float | None = None,
     max_steps: int = 20_000,
     resume: bool = True,
@@ -48,22 +46,17 @@ def sample(
             for many parameters: it needs the extra `layerjax[nuts]`.
         walkers: of emcee, even, at least twice the number of parameters plus 2; None for 32, or for more if that is
             too few. Of NUTS, the number of chains, at least 2; None for 4.
-        seed: of starts and moves; the same seed gives the same chain, where `surrogate` is the same.
+        seed: of starts and moves; the same seed gives the same chain.
         path: HDF5 file that the chain is kept in as it grows, with a journal beside it: a killed run that is started
             again goes on from its last whole step and ends as it would have. One process at a time writes it, any
             number may read it. None keeps it in memory.
-        surrogate: whether most proposals come from a polynomial surrogate of the model, each of which takes one exact
-            evaluation and is nearly independent of the last (delayed acceptance); the posterior is the same. A
-            surrogate that does not hold is left out, which `status` of the result says. None: where one evaluation
-            takes more than about 200 microseconds, by the clock, and one mode is known. Of emcee alone.
         ess: effective samples of the worst parameter that are asked for, above 0: sampling goes on until the chain has
             them, and is 50 autocorrelation times long. None asks for the latter alone. A chain may be gone on with for
             more of them.
         max_steps: hard limit; a chain that reaches it may not be `converged`.
         resume: False replaces what `path` holds.
         allow_unconverged: let the result report estimates though the chain has not converged.
-        progress: called with ("sample", steps, None, note); before that with ("surrogate", evaluations, None, note) or
-            ("warm-up", steps, all).
+        progress: called with ("sample", steps, None, note); of NUTS, before that with ("warm-up", steps, all).
 
     Raises:
         ValueError: the fit's objective is no likelihood, or it is a part of one of several measurements, whose chain is
@@ -74,14 +67,13 @@ def sample(
     """
     _require_possible(fit, path)
     count = len(fit.problem.names)
-    walkers = require_settings(
-        count, sampler=sampler, walkers=walkers, surrogate=surrogate, ess=ess, max_steps=max_steps
-    )
+    walkers = require_settings(count, sampler=sampler, walkers=walkers, ess=ess, max_steps=max_steps)
     identity = identity_of(fit.problem, walkers, seed, sampler)
     chain = MemoryChain(walkers, count) if path is None else FileChain(path, walkers, count, identity, resume)
     try:
-        moved = Nuts(fit, chain, seed) if sampler == "nuts" else Ensemble(fit, chain, seed)
-        _decide(moved, surrogate, path, identity, progress)
+        moved = Nuts(fit, chain, seed, progress) if sampler == "nuts" else Ensemble(fit, chain, seed)
+        if not (chain.iteration or chain.moves):
+            moved.decide()
         _run(moved, chain, max_steps, ess, progress)
     finally:
         chain.close()
@@ -115,16 +107,12 @@ def _require_possible(fit: Fit, path: str | Path | None) -> None:
         raise ValueError(f"{path}: there is no directory {Path(path).parent}")
 
 
-def require_settings(
-    count: int, *, sampler: Sampler, walkers: int | None, surrogate: bool | None, ess: float | None, max_steps: int
-) -> int:
+def require_settings(count: int, *, sampler: Sampler, walkers: int | None, ess: float | None, max_steps: int) -> int:
     """The walkers, or chains, of `sample`. ValueError for settings by which it cannot sample so many parameters."""
     if sampler not in get_args(Sampler):
         raise ValueError(f"sampler is {sampler!r}; it must be one of {', '.join(get_args(Sampler))}")
     if sampler == "nuts":
         require_blackjax()
-        if surrogate:
-            raise ValueError('surrogate=True goes with sampler="emcee", whose proposals it makes')
     if max_steps < FIRST_CHECK:
         raise ValueError(f"max_steps is {max_steps}; it must be at least {FIRST_CHECK}")
     if ess is not None and not ess > 0:
@@ -142,29 +130,6 @@ def _walkers(sampler: Sampler, walkers: int | None, count: int) -> int:
     if walkers is not None and (walkers % 2 or walkers < least):
         raise ValueError(f"walkers is {walkers}; it must be even and at least {least} for {count} parameters")
     return walkers or max(WALKERS, least)
-
-
-def _decide(
-    sampler: Ensemble | Nuts,
-    surrogate: bool | None,
-    path: str | Path | None,
-    identity: dict[str, Any],
-    progress: Progress | None,
-) -> None:
-    """How the chain is moved: as it was decided before it began, or, before it begins, as is asked for."""
-    chain = sampler.chain
-    if isinstance(sampler, Nuts):
-        if not chain.moves:
-            sampler.decide(progress)
-        return
-    if chain.iteration or chain.moves:
-        if surrogate not in (None, bool(chain.moves.get("surrogate", False))):
-            raise ValueError(another(path or "memory", "surrogate"))
-        return
-    if surrogate is None:  # a polynomial about several modes holds at none
-        surrogate = not sampler.has_modes and is_costly(sampler.problem, _fixed_points(sampler.problem))
-    rounds = None if path is None else beside(Path(path), SURROGATE)
-    sampler.decide(surrogate, Kept(rounds, identity), progress)
 
 
 class NoSteps(ValueError):

@@ -83,7 +83,7 @@ def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
     assert tuple(cases.CASES) == POSTERIORS
     case = cases.CASES[name]
     cheap = {"transport": CHEAP} if case.errors else {}
-    text, paths = run.study(directory=tmp_path, repeats=1, surrogate=False, posterior=name, processes=1, **cheap)
+    text, paths = run.study(directory=tmp_path, repeats=1, posterior=name, processes=1, **cheap)
     (record,) = json.loads(paths[0].read_text())["repeats"]
     assert len(record["truth"]) == len(record["estimate"]) == len(case.free)
     for free, estimate in zip(case.free.values(), record["estimate"], strict=True):
@@ -93,7 +93,7 @@ def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
     """Transport: paths with one event alone, which are cheap."""
-    parts_of, cheap = tmp_path / "parts", {"transport": CHEAP, "surrogate": False, "processes": 1}
+    parts_of, cheap = tmp_path / "parts", {"transport": CHEAP, "processes": 1}
     run.study(directory=parts_of, repeats=1, resume=True, **cheap)
     said: list[str] = []
     text, paths = run.study(directory=parts_of, repeats=3, resume=True, report=said.append, **cheap)
@@ -109,4 +109,4 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
     assert all(0 <= rank <= ranks.DRAWS for record in parts["repeats"] for rank in record["ranks"])
     assert paths[1].read_text() == text
     with pytest.raises(ValueError, match="other settings"):
-        run.study(directory=parts_of, resume=True, transport=CHEAP, surrogate=True)
+        run.study(directory=parts_of, resume=True)

@@ -1,7 +1,5 @@
 """One small fit of simulated data that the tests of results, reports and the command line share."""
 
-import math
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,6 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem
-from fits.sampling import ensemble
 from tests.helpers.models import line_fit
 
 TRUE_ALBEDO, TRUE_THICKNESS = 0.4, 0.6
@@ -31,14 +28,6 @@ albedo = 0.8
 kind = "Lambertian"
 albedo = { start = 0.5, low = 0.0, high = 1.0 }
 """
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cheap() -> Iterator[None]:
-    """No model here is costly, however slow the machine: what a sampler proposes does not hang on the clock."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ensemble, "COSTLY", math.inf)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 import json
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -69,7 +68,7 @@ class Repeat:
     """One repeat, lists by parameter as in `free_of`.
 
     truth, estimate: physical values, the estimate is that of the fit. apart: autocorrelation times between two draws of
-    one walker. fit_converged, converged: of the fit and of the chain. moves: how the chain was moved.
+    one walker. fit_converged, converged: of the fit and of the chain.
     """
 
     repeat: int
@@ -81,7 +80,6 @@ class Repeat:
     apart: float
     fit_converged: bool
     converged: bool
-    moves: str
     seconds: float
 
 
@@ -92,7 +90,6 @@ def study(
     resume: bool = False,
     posterior: str = "haze",
     transport: lj.Transport | None = None,
-    surrogate: bool = True,
     repeats: int | None = None,
     processes: int | None = None,
 ) -> tuple[str, tuple[Path, ...]]:
@@ -105,8 +102,6 @@ def study(
         resume: keep the repeats that the directory holds, and run those that it lacks. Each is written as it ends.
         posterior: one of `CASES`.
         transport: carries the light in the data and in the fits; None: that of the case.
-        surrogate: of `fits.sample`, where light is carried in all orders; left to the clock, a rerun might not be the
-            same.
         repeats: how many there are to be in all; 200 if None.
         processes: repeats at a time, a process each; one for each core if None. 1: by threads, one a core.
 
@@ -115,8 +110,7 @@ def study(
     """
     case, processes = _case(posterior, transport), processes or cores()
     wanted = repeats or (QUICK if quick else REPEATS)
-    surrogate = surrogate and isinstance(case.transport, lj.AddingDoubling)
-    settings = settings_of(case, surrogate)
+    settings = settings_of(case)
     path = directory / f"{case.name}.json"
     done = _held(path, settings) if resume else []
     left = sorted(set(range(wanted)) - {one.repeat for one in done})
@@ -124,7 +118,7 @@ def study(
     surroundings = environment.describe()
     if left:
         report(f"{len(done)} of {wanted} repeats are there; the first to come compile all programs")
-    for _, found in run(_work, (posterior, transport, surrogate), left, processes=processes):
+    for _, found in run(_work, (posterior, transport), left, processes=processes):
         if isinstance(found, Failure):
             raise ValueError(found.error)
         done = sorted([*done, found], key=lambda one: one.repeat)
@@ -142,12 +136,12 @@ def _case(posterior: str, transport: lj.Transport | None) -> Case:
     return case if transport is None else replace(case, transport=transport)
 
 
-def _work(settings: tuple[str, lj.Transport | None, bool], index: int) -> Repeat:
-    posterior, transport, surrogate = settings
-    return run_repeat(index, _case(posterior, transport), surrogate, _simulator(posterior, transport))
+def _work(settings: tuple[str, lj.Transport | None], index: int) -> Repeat:
+    posterior, transport = settings
+    return run_repeat(index, _case(posterior, transport), _simulator(posterior, transport))
 
 
-def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any]) -> Repeat:
+def run_repeat(index: int, case: Case, model: Callable[..., Any]) -> Repeat:
     """A truth from the prior, its data, fit and posterior, and its ranks; all of them drawn with `index`."""
     began = time.perf_counter()
     generator = np.random.default_rng([2018, index])
@@ -164,9 +158,7 @@ def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any
     fit = fits.fit(
         case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
     )
-    posterior = fits.sample(
-        fit, walkers=_walkers(case), seed=index, surrogate=surrogate, max_steps=case.most_steps, allow_unconverged=True
-    )
+    posterior = fits.sample(fit, walkers=_walkers(case), seed=index, max_steps=case.most_steps, allow_unconverged=True)
     draws, apart = spread_draws(posterior)
     return Repeat(
         repeat=index,
@@ -178,7 +170,6 @@ def run_repeat(index: int, case: Case, surrogate: bool, model: Callable[..., Any
         apart=apart,
         fit_converged=fit.converged,
         converged=posterior.converged,
-        moves=posterior.status or "proposals without a surrogate",
         seconds=time.perf_counter() - began,
     )
 
@@ -204,7 +195,7 @@ def drawn(free: fits.Free, generator: np.random.Generator) -> float:
             return float(value)
 
 
-def settings_of(case: Case, surrogate: bool) -> dict[str, Any]:
+def settings_of(case: Case) -> dict[str, Any]:
     """What has to be the same for repeats to stand in one file, as it stands there."""
     in_degrees = np.degrees(np.arccos(np.unique(case.readings.wi[:, 2].round(9))))
     free = case.own if case.errors else case.free
@@ -212,7 +203,6 @@ def settings_of(case: Case, surrogate: bool) -> dict[str, Any]:
         dict(case.settings)
         | {
             "transport": repr(case.transport),
-            "surrogate": surrogate,
             "free": {name: repr(one) for name, one in free.items()},
             "incidence_degrees": sorted(in_degrees.round(6).tolist()),
             "noise": case.noise,
@@ -304,7 +294,6 @@ def _chains(done: list[Repeat]) -> str:
     short = [str(one.repeat) for one in done if not one.converged]
     lost = [str(one.repeat) for one in done if not one.fit_converged]
     close = [str(one.repeat) for one in done if one.apart < APART]
-    moves = Counter(one.moves for one in done)
     lines = [
         f"Chains that did not converge (ranked all the same): {_listed(short)}. Fits that did not: {_listed(lost)}.",
         f"Steps: {np.median([one.steps for one in done]):.0f} in the median, {max(one.steps for one in done)} at most. "
@@ -312,7 +301,6 @@ def _chains(done: list[Repeat]) -> str:
         f"{APART:g}: {_listed(close)}.",
         f"Seconds a repeat: {figure(float(np.median([one.seconds for one in done])))} in the median, the first, which "
         f"compiles, {figure(done[0].seconds)}.",
-        *(f"{number} of {len(done)}: {words}." for words, number in moves.most_common()),
     ]
     return "".join(f"- {line}\n" for line in lines)
 

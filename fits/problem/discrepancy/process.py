@@ -54,10 +54,6 @@ class Process(eqx.Module):
     shortest: Array
     gram: Array | None = None
 
-    def rows_beside(self, channels: int) -> int:
-        """Residuals beside those of the measurements: of white numbers, and of levels."""
-        return 2 * channels * len(self.where)
-
     def gram_of(self, relative: Array) -> Array:
         """What measurements say of inducing points, (C, R, R); relative: an error of 1 in units of the noise, (N,
         C)."""

@@ -188,7 +188,7 @@ def test_beside_a_running_sampler_others_only_read(
     assert posterior is not None
     loaded = load_fit(directory)
     whole = sample(loaded, walkers=32, seed=0, path=directory / "chain.h5")
-    again = sample(loaded, walkers=32, seed=0, surrogate=False)
+    again = sample(loaded, walkers=32, seed=0)
     assert 2 < len(posterior.chain) < len(again.chain)
     np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
     np.testing.assert_array_equal(whole.chain, again.chain)

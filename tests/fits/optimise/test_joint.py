@@ -155,14 +155,6 @@ def test_the_posterior_is_that_of_all(joint):
     assert part.inference_data.posterior_predictive["value"].shape[-2:] == (COUNTS["second"], 1)
 
 
-def test_a_surrogate_moves_a_chain_of_several_measurements(joint):
-    found = sample(joint, walkers=16, max_steps=100, surrogate=True, allow_unconverged=True)
-    assert found.status.startswith("proposals from a surrogate of degree 2")
-    expected, covariance = least_squares(prior=False)
-    errors = np.sqrt(np.diagonal(covariance))
-    np.testing.assert_allclose(np.median(found.samples, axis=0)[order(joint)], expected, atol=np.min(errors))
-
-
 def test_measurements_that_share_nothing_are_each_alone():
     """One with levels of noise that are fitted, one with errors that readings share."""
     values = design(60) @ [0.9, 0.4]

@@ -91,7 +91,6 @@ def test_a_chain_of_another_sampler_is_refused(result: Fit, tmp_path: Path) -> N
     [
         ({"sampler": "gibbs"}, "sampler is 'gibbs'; it must be one of emcee, nuts"),
         ({"sampler": "nuts", "walkers": 1}, "walkers is 1; it must be at least 2"),
-        ({"sampler": "nuts", "surrogate": True}, 'goes with sampler="emcee"'),
     ],
 )
 def test_refused(result: Fit, options: dict, message: str) -> None:

@@ -152,15 +152,6 @@ def test_parameters_tied_together_on_one_bound() -> None:
     assert deviation == pytest.approx(spread, rel=2 * error)
 
 
-def test_a_direction_that_is_open_fills_its_box() -> None:
-    fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
-    posterior = sample(fitted, walkers=16, seed=3)
-    kept = posterior.chain[posterior.burn_in :, :, posterior.names.index("['c']")]
-    error = 5 / np.sqrt(posterior.effective_samples.min())
-    assert kept.mean() == pytest.approx(0.5, abs=error * np.sqrt(1 / 12))
-    assert kept.std() == pytest.approx(np.sqrt(1 / 12), rel=error)
-
-
 def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Path) -> None:
     short = sample(result, walkers=16, seed=1, max_steps=100, path=tmp_path / "chain.h5")
     assert not short.converged
@@ -220,7 +211,7 @@ from fits.sampling.sample import sample
 from tests.helpers.models import line_fit
 result = line_fit()
 print("ready", flush=True)
-options = {"walkers": 16, "seed": 1, "surrogate": False}
+options = {"walkers": 16, "seed": 1}
 posterior = sample(result, path=sys.argv[1], progress=lambda *a: time.sleep(0.02), **options)
 np.save(sys.argv[2], posterior.chain)
 """
