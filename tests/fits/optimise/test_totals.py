@@ -118,5 +118,5 @@ def test_bad_totals_are_named():
     given = Totals.of(reflectance=0.5)
     with pytest.raises(ValueError, match="instrument is given, but the data are totals"):
         Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, instrument=Instrument(detector_aperture=1.0))
-    with pytest.raises(ValueError, match=r"noise\.correlated is given, but the data are totals"):
+    with pytest.raises(ValueError, match=r"noise\.discrepancy is given, but the data are totals"):
         Problem(lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0))), given, noise=Noise(discrepancy=True))

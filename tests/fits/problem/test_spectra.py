@@ -156,7 +156,7 @@ def test_a_smooth_prior_draws_a_channel_to_its_neighbours(exact: np.ndarray) -> 
     ("arguments", "message"),
     [
         ((1.0, 0.0, 2.0, None, 0.1), "Free.random_walk_sd is given for a single number"),
-        (((1.0, 1.0), 0.0, 2.0, None, (0.1, 0.2)), "Free.random_walk_sd has 2 entries; it must have one, or 1"),
+        (((1.0, 1.0), 0.0, 2.0, None, (0.1, 0.2)), "Free.random_walk_sd has 2 entries; it must have 1 or 1"),
         (((1.0, 1.0), 0.0, 2.0, None, 0.0), "Free.random_walk_sd is 0.0; it must be above 0"),
     ],
 )
