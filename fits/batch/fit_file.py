@@ -9,6 +9,7 @@ from fits.names import Objective
 from fits.optimise.fit import discrepancy_checkpoint
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.multi_start import Solver
+from fits.optimise.options import options_from
 from fits.optimise.result import Fit
 from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress, silent
@@ -56,6 +57,7 @@ def fit_into(
     """
     directory = Path(directory)
     objective = require_posterior(objective or given.objective, "--hold-out" if held_out is not None else None)
+    options = options_from(given.options)
     kept = directory.resolve().with_name(f".{directory.resolve().name}.starts")
     with reserved(directory, force):
         found = run_fit(
@@ -69,6 +71,7 @@ def fit_into(
             starts=starts,
             seed=seed,
             solver=solver,
+            options=options,
             progress=progress,
             checkpoint=kept,
         )

@@ -1,7 +1,9 @@
 """Tolerances and thresholds of a fit, with the values that they have by default."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 from layerjax._checks import in_short
 
@@ -39,3 +41,12 @@ class FitOptions:
 
 
 DEFAULT = FitOptions()
+
+
+def options_from(table: Mapping[str, Any]) -> FitOptions:
+    """The options that the ``[options]`` of a stack file changes. ValueError for a key that is none of them."""
+    known = [entry.name for entry in fields(FitOptions)]
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise ValueError(f"[options] has an unknown key {unknown[0]!r}; it must be one of {', '.join(known)}")
+    return FitOptions(**table)

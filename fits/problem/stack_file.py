@@ -22,7 +22,9 @@
                                                # discrepancy: true, or a table of its amplitude and lengths
     [scale]                                    # optional common calibration factor: start, low, high, prior
 
-    [instrument]                               # optional: source, detector, offset, gain_sd, floor, rings
+    [instrument]                               # optional: apertures, tilt, gain_sd, floor, rings: see `Instrument`
+
+    [options]                                  # optional: thresholds of the fit, see `fits.FitOptions`
 
 Keys are the parameters of the classes of the same name; the `kind` of an SGGX is called `shape` here. Bad input is a
 ValueError on one line that names the place (``layers[0].thickness``), what stands there and what may.
@@ -67,6 +69,7 @@ class ProblemFile:
     scale: Free | None
     objective: Objective
     instrument: Instrument | None
+    options: Mapping[str, Any]
     about: Mapping[str, str]
     text: str
 
@@ -81,7 +84,7 @@ def read_problem(path: str | Path) -> ProblemFile:
     path = Path(path)
     text, tables = read_tables(path)
     try:
-        known = ("about", "transport", "objective", *MATERIAL, "noise", "scale", "instrument")
+        known = ("about", "transport", "objective", *MATERIAL, "noise", "scale", "instrument", "options")
         check_keys("the file", tables, known)
         return ProblemFile(
             stack=material_from_dict({key: tables[key] for key in MATERIAL if key in tables}),
@@ -90,6 +93,7 @@ def read_problem(path: str | Path) -> ProblemFile:
             scale=scale_from_dict(tables["scale"]) if "scale" in tables else None,
             objective=cast(Objective, choice("objective", tables.get("objective", "likelihood"), get_args(Objective))),
             instrument=instrument_from_dict(tables["instrument"]) if "instrument" in tables else None,
+            options=require_table("options", tables.get("options", {})),
             about=_about(tables.get("about", {})),
             text=text,
         )
