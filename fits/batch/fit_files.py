@@ -80,7 +80,7 @@ class FittedFiles:
 
     @property
     def best(self) -> dict[str, str]:
-        """By file, the stack of the lowest loss, or the only one that was fitted."""
+        """The stack of the lowest loss of each file, or the only one that was fitted."""
         fitted = [row for row in self.rows if row["result"] != "failed"]
         files = [row["file"] for row in fitted]
         return {
@@ -112,7 +112,7 @@ def fit_files(
 
     Args:
         files: a folder, of which files that hold no measurements are skipped, or files and folders.
-        stacks: stack files; may be none where a search is asked for.
+        stacks: stack files; may be none with a search.
         out: directory to write, or to resume.
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
@@ -133,7 +133,7 @@ def fit_files(
     named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in named_stacks.items()}
     if not given and search is False:
-        raise ValueError("no stack is given, nor a search asked for; there must be one of them")
+        raise ValueError("neither a stack nor a search is given; there must be one of them")
     if not given and (objective, solver) != (None, "least_squares"):
         raise ValueError(
             f"objective {objective} and solver {solver} are of no stack; a search fits likelihoods, by least squares"
@@ -245,11 +245,11 @@ class Job:
 
     @property
     def names(self) -> list[str]:
-        """Of stacks, and of the search."""
+        """Names of stacks, and of the search."""
         return [*self.stacks, *([] if self.searching is None else [SEARCH])]
 
     def fingerprint(self, task: "Task") -> dict[str, str]:
-        """Of a result."""
+        """Key of a result."""
         how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
         return fingerprint(file=task.content, **vars(self.reading), **(how or {}))
 
@@ -263,7 +263,7 @@ class Task(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Of its row in the store, and the place of its result."""
+        """Key of its row in the store, and the place of its result."""
         return f"{self.path.name}/{self.stack}"
 
     def failed(self, why: str) -> Row:

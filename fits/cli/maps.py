@@ -21,7 +21,7 @@ def fit_map(arguments: Namespace) -> int:
     from fits.maps.options import MapOptions, SpatialPrior
     from fits.problem.compilation import cores
 
-    # before anything slow: what is wrong with the files is told
+    # before anything slow: what is wrong with the files is refused
     map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
     prior = None
     if arguments.spatial_prior is None and arguments.spatial_scale is not None:

@@ -28,7 +28,7 @@ count, seed = _number(int, 1), _number(int, 0, 2**32 - 1)
 level, length = _number(float, 0.0), _number(float, 1.0)
 """A share or a standard deviation; a wavelength in nanometres."""
 angle, _polar = _number(float, 0.0, 90.0), _number(float, 0.0, 180.0)
-"""From the normal line, and from the normal, in degrees."""
+"""Angles from the normal line, and from the normal, in degrees."""
 
 
 def degrees(words: str) -> list[float]:

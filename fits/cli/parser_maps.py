@@ -30,7 +30,7 @@ def add_fit_map(commands: "argparse._SubParsersAction[Any]") -> None:
         "(default: these stand beside DATA)",
     )
     group.add_argument("--sigma", metavar="FILE", help="their standard deviations, (..., N, C), (..., N) or (N)")
-    group.add_argument("--mask", metavar="FILE", help="which texels are fitted, (...): 1, or 0 for those left out")
+    group.add_argument("--mask", metavar="FILE", help="which texels are fitted, (...): 1, or 0 for those skipped")
     group.add_argument("--noise", type=level, metavar="REL", help="relative noise (default: what the stack file says)")
     _add_solving(parser)
     add_force(parser, "replace STORE if it holds the map of another fit, or is damaged")

@@ -3,7 +3,7 @@
 A few lanes take their steps together, and a texel that has ended makes room for the next. Values and derivatives of the
 model are found once for every trial, and carried from step to step: residuals, sigma and all that follows from them see
 the model as linear there. Otherwise the program would compute the model again for each of these, which takes several
-times as long. Of a start whose linearisation is known the model need not be asked at all.
+times as long. Of a start whose linearisation is known the model is not evaluated at all.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from fits.problem.problem import Problem
 Floats = NDArray[np.float64]
 
 LEFT_OUT = 1e9
-"""Standard deviation of a value that is left out, in units of the largest: it weighs less than rounding."""
+"""Standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding."""
 
 LANES = 4
 """Texels that take their steps side by side: more do not make the arithmetic of each cheaper."""
@@ -44,7 +44,7 @@ _SOLVER = BoxLevenbergMarquardt()
 class Texels(NamedTuple):
     """Measurements of M texels.
 
-    values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is left out,
+    values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is omitted,
     and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
     of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the coordinate of
     `Box.centre`; None where there are none.
@@ -81,7 +81,7 @@ def make_texels(
     wi: Floats | None = None,
     wo: Floats | None = None,
 ) -> Texels:
-    """Values (M, N, C), with their standard deviations of that shape; what is not finite is left out, in single
+    """Values (M, N, C), with their standard deviations of that shape; what is not finite is omitted, in single
     precision also what is finite only in double.
 
     least: of the noise's floor.
@@ -106,7 +106,7 @@ def make_texels(
 
 
 def blank_texel(shape: tuple[int, ...]) -> Texels:
-    """One texel, for a model that is asked what it says whatever the values: (N, C) zeros."""
+    """One texel, for a model that is evaluated whatever the values: (N, C) zeros."""
     return make_texels(np.zeros((1, *shape)))
 
 
@@ -144,7 +144,7 @@ def with_own_directions(problem: Problem) -> Problem:
 
 
 def chi_square(model: Model, row: Texels, vector: Array, predicted: Array) -> Array:
-    """Of the values that count; for a named objective the sum of its squared residuals."""
+    """Chi-square of the values that count; for a named objective the sum of its squared residuals."""
     return jnp.sum(jnp.where(row.used, model.standardised_at(vector, predicted), 0.0) ** 2)
 
 

@@ -1,6 +1,6 @@
 """An emulator in the place of a dear transport: Chebyshev series over the bounds of all parameters at once.
 
-What the exact transport says of the data is smooth in every parameter. An emulator is worth its making where thousands
+What the exact transport says of the data is smooth in every parameter. An emulator pays where thousands
 of texels are fitted with the same directions: a value with its derivatives then takes tens of microseconds. Values are
 kept as logarithms, of which a few directions in the space of the data hold all (a singular value decomposition), and
 each channel has the coordinates of the parameters that matter to it alone. Lines through the box say how many terms
@@ -172,7 +172,7 @@ class _Space:
     logarithmic: NDArray[np.bool_]
 
     def ends(self) -> tuple[Floats, Floats]:
-        """Of the coordinates."""
+        """The number of coordinates."""
         low, high = (
             np.where(self.logarithmic, np.log(np.where(self.logarithmic, end, 1.0)), end)
             for end in (self.low, self.high)
@@ -227,7 +227,7 @@ def emulate(problem: Problem, options: MapOptions = USUAL) -> Tried:
 
 
 def _places(problem: Problem) -> Integers | str:
-    """Of the parameters of a stack for each channel, (C, D); or why there is none."""
+    """Places of the parameters of a stack for each channel, (C, D); or why there is none."""
     model = problem.model
     if model.optics is not None:
         return "an instrument stands between the transport and the data"
@@ -278,7 +278,7 @@ def _terms(values: Floats, sigma: Floats, offset: Floats, tolerance: float) -> i
     if np.any(values + offset <= 0.0):
         return LINE_NODES
     series = np.abs(_series(np.log(values + offset), 1))
-    tails = np.cumsum(series[:, ::-1], axis=1)[:, ::-1]  # of what is left out from each term on
+    tails = np.cumsum(series[:, ::-1], axis=1)[:, ::-1]  # of what is omitted from each term on
     influence = np.max((values + offset) / sigma, axis=1, keepdims=True)
     enough = np.flatnonzero(np.max(tails * influence, axis=(0, 2, 3)) < tolerance)
     return max(2, int(enough[0])) if enough.size else LINE_NODES
@@ -312,7 +312,7 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
         series = _series(series, axis + 1)
     series = series.reshape(len(parts), -1, rank)
     directions = np.stack([np.pad(own, [(0, rank - len(own)), (0, 0)]) for _, own in parts])
-    # terms are left out that come to a fifth of the tolerance at most: signs of so many are as good as random
+    # terms are omitted that come to a fifth of the tolerance at most: signs of so many are as good as random
     sizes = np.max(np.abs(series @ (directions * influence.T[:, None, :])), axis=(0, 2))
     order = np.argsort(sizes)
     kept = np.ones(len(sizes), bool)
@@ -335,7 +335,7 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
 def _compressed(values: Floats, influence: Floats, tolerance: float) -> tuple[Floats, Floats]:
     """Values (G, N) as a product of (G, R) and (R, N), to a fifth of the tolerance."""
     left, sizes, right = np.linalg.svd(values * influence, full_matrices=False)
-    # from each direction on, what is left out at any node is at most the root of the sum of squares
+    # from each direction on, what is omitted at any node is at most the root of the sum of squares
     rest = np.sqrt(np.cumsum((left * sizes)[:, ::-1] ** 2, axis=1))[:, ::-1].max(axis=0)
     rank = max(1, int(np.sum(rest > 0.2 * tolerance)))
     return left[:, :rank] * sizes[:rank], right[:rank] / influence

@@ -60,7 +60,7 @@ def fit_map(
             common, which is held from then on: errors of the others are conditional on it.
         geometry, values, sigma, mask: see `fits.maps.inputs.map_data`: arrays or files, values (..., N, C) in 1/sr.
         out: directory of the store, made here, or begun by an earlier call with the same arguments.
-        noise: as in `fits.fit`, but independent; a floor that it leaves out is one for the whole map.
+        noise: as in `fits.fit`, but independent; without a floor there is one for the whole map.
         client: a `distributed.Client`, or the address of a scheduler, whose workers see `out` under the same path; in
             place of `options.processes`.
         transport: as in `fits.fit`.
@@ -122,8 +122,8 @@ def _fit(
     common = (pilot.problem, pilot.starts, pilot.floor, replace(options, progress=None), pilot.numerical_error)
     job = Job(str(path.resolve()), *common, source)
     if failures := _fit_chunks(store, job, data, client, options):
-        told = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
-        raise ValueError(f"{path}: {'; '.join(told)}; all other chunks are done, and another run does these")
+        named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
+        raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
     if options.spatial_prior is not None:
         job = replace(job, source=data) if client is None else job
         smooth_map(store, job, data, options.spatial_prior, client, options)

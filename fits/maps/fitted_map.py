@@ -22,7 +22,7 @@ SMOOTHED = "smoothed"
 
 
 class FittedMap:
-    """Parameters of every texel of a map, with errors and flags; arrays are read when they are asked for.
+    """Parameters of every texel of a map, with errors and flags; arrays are read when they are accessed.
 
     Of a store that still grows the parts that are not there have flags of 0; asking again reads again.
     `map["values/base.albedo"]` is the array of zarr, to be read in parts.
@@ -96,7 +96,7 @@ class FittedMap:
 
     @property
     def numerical_error(self) -> Floats | None:
-        """Of the model, in standard deviations of the data; None for transports that have none."""
+        """Numerical error of the model, in standard deviations of the data; None for transports that have none."""
         return self.read("numerical_error") if "numerical_error" in self._store.types else None
 
     @property
@@ -144,7 +144,7 @@ class FittedMap:
 
 
 class _Arrays(Mapping[str, Floats]):
-    """Arrays of a group by the names of parameters, each read when it is asked for."""
+    """Arrays of a group by the names of parameters, each read when it is accessed."""
 
     def __init__(self, map: FittedMap, group: str):
         self._map, self._group = map, group

@@ -2,7 +2,7 @@
 
 A map is an array (..., N, C): texels along the leading axes, N measurements of each, C channels; or (..., N) for one
 channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, zarr and xarray all become variables of
-xarray, whose numbers are read when they are asked for.
+xarray, whose numbers are read when they are accessed.
 """
 
 import base64
@@ -26,7 +26,7 @@ from fits.data.formats.csv import read_directions
 from fits.data.geometry import Floats, Geometry, Pairs, direction
 
 Block = tuple[slice, ...]
-"""Of the leading axes of a map, the first ones of an array; what is left out is taken whole."""
+"""A selection of the leading axes of a map, the first ones of an array; other axes are taken whole."""
 
 SAMPLE, CHANNEL = "sample", "channel"
 """Names of the axes of measurements and of channels in xarray; by them they are found wherever they stand."""
@@ -157,7 +157,7 @@ def _group(given: Any, wanted: str) -> tuple[dict[str, Array], str | None, str]:
 
 
 def _members(group: Any, where: str) -> dict[str, Array]:
-    """The arrays of numbers in a group; whatever else lies there is left out."""
+    """The arrays of numbers in a group; whatever else lies there is skipped."""
     items = group.arrays() if hasattr(group, "array_keys") else group.items()
     return {
         str(name): _array(one, f"{where}{name}")
@@ -335,7 +335,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
 
     Args:
         values: (..., N, C), or (..., N) for one channel, BSDF in 1/sr. Where both fit it is (..., N, C). A value that
-            is NaN is left out.
+            is NaN is skipped.
         geometry: `fits.Geometry` (or measurements, for where they were taken), a pair (wi, wo) of arrays, (N, 3) or
             (..., N, 3), a csv of directions, or a mapping or file with the arrays `wi`, `wo`, or `theta_i`, `phi_i`,
             `theta_o`, `phi_o`, (N,) or (..., N), in degrees; None: these stand beside the values.
@@ -349,13 +349,13 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     if isinstance(values, MapData):
         return values
     given = values, geometry, sigma, mask
-    found, beside = _chosen(values, "values")
+    found, neighbours_in_file = _chosen(values, "values")
     if 0 in found.shape:
         raise ValueError(f"{found.where} has shape {found.shape}, must hold something along every axis")
     last = [name for name in (SAMPLE, CHANNEL) if name in found.dims]
     found = found.ordered([*(name for name in found.dims if name not in last), *last])
-    along, samples, over = _directions(geometry, beside, [name for name in found.dims if name != CHANNEL])
-    shape, channels = _told_apart(found, samples)
+    along, samples, over = _directions(geometry, neighbours_in_file, [name for name in found.dims if name != CHANNEL])
+    shape, channels = _split_axes(found, samples)
     if over not in ((), shape):
         raise ValueError(f"geometry has directions of its own for a map of {over}, the measurements are of {shape}")
     more = {
@@ -367,12 +367,14 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     if not over:
         common = Geometry(*_unit_vectors({name: one.read() for name, one in along.items()}, np.ones((), bool), ""))
     whole = MapData(found, along, **more, shape=shape, samples=samples, channels=channels, geometry=common, given=given)
-    if common is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is told now
+    if common is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is refused now
         whole.read_directions(())
     return whole
 
 
-def _directions(given: Any, beside: dict[str, Array], dims: list[str]) -> tuple[dict[str, Array], int, tuple[int, ...]]:
+def _directions(
+    given: Any, neighbours_in_file: dict[str, Array], dims: list[str]
+) -> tuple[dict[str, Array], int, tuple[int, ...]]:
     """Arrays of directions by name, how many there are, and the shape of the map if texels have their own, else ()."""
     if (
         isinstance(given, str | Path)
@@ -386,7 +388,9 @@ def _directions(given: Any, beside: dict[str, Array], dims: list[str]) -> tuple[
         if len(given) != 2:
             raise ValueError(f"geometry has {len(given)} entries, must be two: wi and wo")
         given = dict(zip(VECTORS, given, strict=True))
-    arrays, _, where = (beside, None, "what is beside the values") if given is None else _group(given, "geometry")
+    arrays, _, where = (
+        (neighbours_in_file, None, "what is beside the values") if given is None else _group(given, "geometry")
+    )
     names = next((names for names in (VECTORS, ANGLES) if all(name in arrays for name in names)), None)
     if names is None:
         missing = "geometry is not given, and there is nothing beside the values" if given is None else where
@@ -399,8 +403,8 @@ def _directions(given: Any, beside: dict[str, Array], dims: list[str]) -> tuple[
     counts = {one.shape[-axes] for one in found.values()}
     over = {one.shape[:-axes] for one in found.values()} - {()}
     if len(counts) > 1 or len(over) > 1 or 0 in counts:
-        told = ", ".join(f"{name} {one.shape}" for name, one in found.items())
-        raise ValueError(f"geometry: shapes {told} do not fit together, N and the map's axes must be the same")
+        listed = ", ".join(f"{name} {one.shape}" for name, one in found.items())
+        raise ValueError(f"geometry: shapes {listed} do not fit together, N and the map's axes must be the same")
     return found, counts.pop(), next(iter(over), ())
 
 
@@ -425,7 +429,7 @@ def _unit_vectors(found: Mapping[str, Floats], given: NDArray[np.bool_], where: 
     return checked[0], checked[1]
 
 
-def _told_apart(values: Array, samples: int) -> tuple[tuple[int, ...], int]:
+def _split_axes(values: Array, samples: int) -> tuple[tuple[int, ...], int]:
     """The shape of the map, and how many channels it has."""
     shape, named = values.shape, values.dims
     if len(shape) > 2 and shape[-2] == samples and (CHANNEL in named or SAMPLE not in named):
@@ -441,16 +445,16 @@ def _told_apart(values: Array, samples: int) -> tuple[tuple[int, ...], int]:
 def _require_fitting(sigma: Array | None, mask: Array | None, values: Array, shape: tuple[int, ...]) -> None:
     """Refuse deviations and a mask whose shapes are not those of the values and of the map."""
     rank = len(shape)
-    alike, alone = values.shape[: rank + 1], values.shape[rank : rank + 1]
+    same, alone = values.shape[: rank + 1], values.shape[rank : rank + 1]
     if sigma is not None and sigma.shape != alone:
         fits = [
             len(sigma.shape) == len(full) and sigma.shape[rank:] == full[rank:]
             and all(one in (1, size) for one, size in zip(sigma.shape, full, strict=True))
-            for full in (values.shape, alike)
+            for full in (values.shape, same)
         ]  # fmt: skip
         if not any(fits):
             raise ValueError(
-                f"{sigma.where} has shape {sigma.shape}, sigma must be {values.shape}, {alike}, the same with 1 for "
+                f"{sigma.where} has shape {sigma.shape}, sigma must be {values.shape}, {same}, the same with 1 for "
                 f"axes of texels, or {alone}"
             )
     if mask is not None and mask.shape != shape:

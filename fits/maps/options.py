@@ -15,7 +15,7 @@ from fits.progress import Progress
 
 Kind = Literal["gaussian", "total_variation"]
 SCALES = 1e-6, 1e6
-"""Of a spatial prior, as shares of a parameter's bounds."""
+"""Scales of a spatial prior, as shares of a parameter's bounds."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class MapOptions:
     starts: int = 8
     """Starts of each of the first few pilot texels."""
     seed: int = 0
-    """Of these starts."""
+    """Random seed of these starts."""
     pilot_texels: int = 64
     """Texels that are fitted first: starts, resolution and common parameters come from them."""
     chunk_size: int = 1024
@@ -94,24 +94,24 @@ class MapOptions:
     emulator_max_solves: int = 30_000
     """Solutions of the transport that an emulator may take."""
     emulator_error: float = 0.1
-    """Of an emulator at points that it has not seen, at most, in standard deviations of the data."""
+    """Largest error of an emulator at new points, in standard deviations of the data."""
     spatial_prior: SpatialPrior | None = None
-    """Of neighbouring texels, beside the plain fit and after it, see `FittedMap.smoothed`; with another one the map is
-    smoothed anew, and nothing else fitted again."""
+    """Prior of neighbouring texels, beside the plain fit and after it, see `FittedMap.smoothed`; with another one the
+    map is smoothed anew, and nothing else fitted again."""
     settled: float = 0.01
     """A map is smooth where no texel moved farther in a round, in standard errors."""
 
     poor_probability: float = 1e-6
     """A chi-square that noise exceeds less often is poor, unless those of the pilot are as large."""
     pilot_quantile: float = 0.9
-    """Of the pilot's reduced chi-squares, which counts as explained ..."""
+    """Quantile of the pilot's reduced chi-squares that counts as explained ..."""
     pilot_factor: float = 1.5
     """... up to this multiple."""
 
     converged_share: float = 0.99
-    """Of the fitted texels, that must have converged in a map to be relied on."""
+    """Share of the fitted texels that must have converged in a map to be relied on."""
     flagged_share: float = 0.05
-    """Of the fitted texels, that may be at a bound, poor or unresolved in such a map."""
+    """Share of the fitted texels that may be at a bound, poor or unidentified in such a map."""
     numerical_error: float = 0.1
     """Of the model, in standard deviations of the data, that is small: a resolution that is chosen stays below it."""
     chi_square_sigmas: float = 3.0

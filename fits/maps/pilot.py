@@ -39,7 +39,7 @@ from fits.problem.toml import transport_from_dict, transport_to_dict
 Floats = NDArray[np.float64]
 
 GROUP = "pilot"
-"""Of the store, in which all this is kept."""
+"""Path of the store, in which all this is kept."""
 
 GOLDEN, MOST_TRIED, FEW = 0.6180339887498949, 4096, 8
 """Steps between the texels of a pilot, as a share of the map, how many are tried for it, and how many are enough where
@@ -102,7 +102,7 @@ def pilot_texels(data: MapData, count: int) -> tuple[Texels, NDArray[np.int64]]:
             continue
         try:
             row = read_part(data, tuple(slice(at, at + 1) for at in place)).texels(0.0)
-        except ValueError as error:  # what cannot be read is told of with its chunk
+        except ValueError as error:  # what cannot be read is reported with its chunk
             failure = failure or error
             continue
         if row.measurements[0]:
@@ -142,7 +142,7 @@ def prototype(
 
 
 def _median(values: Floats, used: NDArray[np.bool_]) -> Floats:
-    """Of every datum over the texels where it counts, (N, C); of all data where it counts nowhere."""
+    """Median of every datum over the texels where it counts, (N, C); of all data where it counts nowhere."""
     found = np.ma.median(np.ma.masked_array(values, ~used), axis=0)
     return np.asarray(np.ma.filled(found, np.median(values[used])), float)
 
@@ -154,7 +154,7 @@ def fit_pilot(data: MapData, stack: Any, noise: Noise | None, transport: Any, op
     """Find resolution, emulator, common parameters and starts from the pilot texels.
 
     Raises:
-        ValueError: too many parameters, too few measurements, an emulator is asked for that cannot be made, all
+        ValueError: too many parameters, too few measurements, an emulator is required that cannot be made, all
             parameters are common, or no texel has a fit.
     """
     texels, places = pilot_texels(data, options.pilot_texels)
@@ -186,11 +186,11 @@ def fit_pilot(data: MapData, stack: Any, noise: Noise | None, transport: Any, op
     words: dict[str, str] = {}
 
     def cheap(problem: Problem) -> Problem:
-        """With an emulator, where one is asked for or is worth it."""
+        """The problem with an emulator, where one is required or pays."""
         if own and options.emulator:
             raise ValueError("emulator: there is none where every texel has directions of its own")
-        worth = options.emulator is None and known is not None and np.prod(data.shape) >= options.emulator_min_texels
-        if own or not (options.emulator or worth):
+        pays = options.emulator is None and known is not None and np.prod(data.shape) >= options.emulator_min_texels
+        if own or not (options.emulator or pays):
             return problem
         tried = emulate(problem, options)
         words["emulator"] = tried.words
@@ -264,7 +264,7 @@ def _fit_texels(problem: Problem, texels: Texels, options: MapOptions) -> tuple[
 
 
 def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:
-    """Of the pilot, in standard deviations, at most, as a finer problem tells."""
+    """Largest numerical error of the pilot, in standard deviations, by a finer problem."""
     good = np.isfinite(results.fits.cost)
     if not good.any():
         return 0.0

@@ -148,7 +148,7 @@ def to_units(problem: Problem, vectors: Floats) -> Floats:
 
 
 def padded(array: Floats) -> Floats:
-    """With its last row repeated, so that there are few numbers of rows, and programs for them."""
+    """An array with its last row repeated, so that there are few numbers of rows, and programs for them."""
     return np.concatenate([array, np.repeat(array[-1:], -len(array) % TOGETHER, axis=0)])
 
 
@@ -236,11 +236,13 @@ def _fit_at(model: Model, end: Ending, texel: Texels) -> Fits:
 def _errors(model: Model, end: Ending, root: Array, scatter: Array) -> tuple[Array, Array, Array]:
     """As `fits.optimise.uncertainty`, for a compiled program."""
     box, unit, count = model.box, end.unit, end.unit.size
-    root, pull = root / jnp.sqrt(scatter), LEAST_GRADIENT * scatter
+    root, least_gradient = root / jnp.sqrt(scatter), LEAST_GRADIENT * scatter
     known = jnp.isfinite(end.cost) & jnp.all(jnp.isfinite(root))
     root = jnp.where(known, root, 0.0)
     idle = jnp.linalg.norm(root, axis=0) * UNKNOWN_BEYOND < 1.0
-    held = ((unit <= ON_BOUND) & (end.gradient > pull)) | ((unit >= 1.0 - ON_BOUND) & (end.gradient < -pull))
+    held = ((unit <= ON_BOUND) & (end.gradient > least_gradient)) | (
+        (unit >= 1.0 - ON_BOUND) & (end.gradient < -least_gradient)
+    )
     held &= ~idle & known
     data = jnp.linalg.svd(jnp.concatenate([root, jnp.zeros((count, count))]), compute_uv=False)
     unidentified = (data[-1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known

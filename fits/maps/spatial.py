@@ -9,7 +9,7 @@ spatial prior weighs much more than the data, many rounds are needed.
 All is said in the coordinate of the fit, the unit box: 0 and 1 are the bounds of a parameter, between which it runs in
 the value, or in its logarithm for the priors `LogUniform` and `LogNormal`. Edges lead from each texel to those beside
 it along the axes of the map, and join fitted texels alone. After each round the state is kept in the store as the group
-``smoothing_3``, from which an interrupted run goes on; the last one becomes ``smoothed``.
+``smoothing_3``, from which an interrupted run resumes; the last one becomes ``smoothed``.
 """
 
 import json
@@ -63,7 +63,7 @@ class Edges:
     scales: Floats
 
     def cost(self, units: Floats, fitted: Truths) -> float:
-        """Of all edges of a map, a part of minus its log-posterior.
+        """Part of minus the log-posterior of a map, of all its edges.
 
         units: (map shape, P), in the unit box, finite where `fitted`, (map shape).
         """
@@ -105,8 +105,8 @@ class Half(NamedTuple):
     """The texels of one colour in a chunk.
 
     places: of M texels in the block, counted along its axes. units: where they are, (M, P), in the unit box. centre,
-    inverse_sd: how their neighbours draw them, see `fits.maps.descent.Texels`. first: whether it is told what they cost
-    where they are. part: the measurements of the block, None where the job has them.
+    inverse_sd: how strongly their neighbours hold them, see `fits.maps.descent.Texels`. first: whether it is told what
+    they cost where they are. part: the measurements of the block, None where the job has them.
     """
 
     block: Block
@@ -193,7 +193,7 @@ class _Smoothing:
         self.rounds, scales = prior.rounds, prior.scales(store.names)
         said = {"kind": prior.kind, "scale": scales, "rounds": prior.rounds, "settled": options.settled}
         self.prior = json.loads(json.dumps(plain(said)))
-        """By what a store tells whether it is there already, as JSON gives it back."""
+        """What identifies it in a store, as JSON gives it back."""
         self.edges = Edges(prior.kind, np.array([scales.get(name, math.inf) for name in store.names]))
         box: Any = job.problem.model.box
         self.logarithmic = np.asarray(box.logarithmic)

@@ -206,7 +206,7 @@ class Store:
 
     @cached_property
     def arrays(self) -> dict[str, Any]:
-        """By their paths."""
+        """Checksums by path."""
         return {name: self.root[name] for name in self.types}
 
     def write(self, block: Block, results: Mapping[str, np.ndarray]) -> None:
@@ -319,7 +319,11 @@ def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None
     try:
         store = Store(path)
         stored = store.about.get("fingerprints", {})
-        changed = [name for name in {**stored, **identity} if not alike(stored.get(name, ""), identity.get(name, ""))]
+        changed = [
+            name
+            for name in {**stored, **identity}
+            if not same_but_numbers(stored.get(name, ""), identity.get(name, ""))
+        ]
         if changed:
             raise ValueError(
                 f"{path}: holds a map of another fit, different in {', '.join(changed)} "
@@ -341,7 +345,7 @@ def throw_away(path: Path) -> None:
         shutil.rmtree(old)
 
 
-def alike(one: str, other: str) -> bool:
+def same_but_numbers(one: str, other: str) -> bool:
     """Whether two fingerprints are the same, of which parts may be "?": of what could not be read at the time."""
     parts = [each.split(",") for each in (one, other)]
     same = all(a == b or UNREADABLE in (a, b) for a, b in zip(*parts, strict=False))

@@ -107,7 +107,7 @@ def _unit(fit: "Fit") -> float:
 
 
 def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualStructure:
-    """Summary of standardised residuals (N, C) over the rows of `data`; NaN rows are left out.
+    """Summary of standardised residuals (N, C) over the rows of `data`; NaN rows are skipped.
 
     Raises:
         ValueError: no residual is finite.

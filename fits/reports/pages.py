@@ -42,7 +42,7 @@ def made_with() -> str:
 
 
 def section(head: str, *parts: str) -> str:
-    """A part of a page under a heading; empty parts are left out."""
+    """A part of a page under a heading; empty parts are omitted."""
     return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
 
 

@@ -44,7 +44,7 @@ INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
 """Edges of the cells of the matrix picture, degrees."""
 
 DECADES, MATRIX_BELOW = 4.0, np.radians(75.0)
-"""Of its values at most, from the largest among angles below this."""
+"""Largest share of its values, from the largest among angles below this."""
 
 
 def render(

@@ -400,7 +400,7 @@ def with_error(value: float, error: float) -> tuple[str, str]:
 
 
 def shortened(rows: Sequence[tuple[str, ...]], most: int) -> Sequence[tuple[str, ...]]:
-    """The first and the last of so many rows, and how many are left out between them."""
+    """The first and the last of so many rows, and how many are omitted between them."""
     if len(rows) <= most:
         return rows
     gap = (f"... {len(rows) - most} more", *[""] * (len(rows[0]) - 1))

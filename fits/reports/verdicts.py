@@ -133,7 +133,7 @@ class Assessment:
 
     @property
     def error_factor(self) -> float:
-        """By what the standard errors are too small, for size and correlation of the residuals together."""
+        """Factor by which the standard errors are too small, for size and correlation of the residuals together."""
         return self.size / math.sqrt(self.independent_share)
 
     @property

@@ -113,7 +113,7 @@ def search_picture(search: Search) -> Figure:
                 behind = max(score.elpd_diff, 0.0)
                 left.errorbar(_of_stack(one), behind, yerr=score.dse, fmt="o", color=colour, label=label)
             right.plot(_of_stack(one), one.bic, "o", color=colour)
-        left.set(ylabel="score behind the best", title="Held-out data")
+        left.set(ylabel="elpd difference to the best", title="Held-out data")
         right.set(ylabel="BIC above the lowest", title="Fit with independent noise")
         for axes in (left, right):
             axes.set_yscale("symlog", linthresh=10.0)

@@ -132,7 +132,7 @@ class Search:
 
     @property
     def probabilities(self) -> dict[str, float]:
-        """By name, among the cross-validated stacks, all as probable beforehand."""
+        """Model probabilities by name, among the cross-validated stacks, all as probable beforehand."""
         return {one.name: one.model_score.model_probability for one in self.candidates if one.model_score is not None}
 
 
@@ -246,7 +246,7 @@ class _Run:
         return replace(self.result(), stopped=stopped)
 
     def _coarse_fit(self, structure: Structure) -> Fit:
-        """With independent noise at a coarse resolution."""
+        """The fit with independent noise at a coarse resolution."""
 
         def fitted() -> Fit:
             problem = self._problem(structure)
@@ -296,7 +296,7 @@ class _Run:
     def _in_parallel(
         self, stage: str, call: Callable[[Structure], Result], structures: list[Structure], until: float
     ) -> dict[Structure, Result]:
-        """By structure what the call gives, of the first few whatever the time, of the others until then.
+        """What the call gives by structure, of the first few whatever the time, of the others until then.
 
         Several run at a time, since compiling one keeps a single core busy; none runs while programs are thrown away.
         """
@@ -327,12 +327,12 @@ class _Run:
         return [one for one in dict.fromkeys(different) if one not in self.coarse]
 
     def bic(self, structure: Structure) -> float:
-        """Of the fit with independent noise."""
+        """BIC of the fit with independent noise."""
         fit = self.coarse[structure]
         return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
 
     def lowest_bic(self) -> float:
-        """Of all that was fitted so far."""
+        """Lowest BIC of all that was fitted so far."""
         return min(map(self.bic, self.coarse), default=np.inf)
 
     def ranked(self) -> list[Structure]:

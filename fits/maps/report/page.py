@@ -153,5 +153,5 @@ def _values(map: FittedMap, images: Pictures, part: str) -> str:
             rows[:2] = list(zip(*rows[:2], strict=True))
         parts += [f"<h3>{html.escape(name)}</h3>", *(_pair(*row) for row in rows)]
     note = '<p class="note">Colours run over the middle 98 % of the values; what lies beyond has that of the end.</p>'
-    told = f"<p>{html.escape(tables.smoothing_words(map))}</p>" if map.smoothing is not None else ""
-    return section("Values and errors", note, told, *parts)
+    smoothing = f"<p>{html.escape(tables.smoothing_words(map))}</p>" if map.smoothing is not None else ""
+    return section("Values and errors", note, smoothing, *parts)

@@ -32,7 +32,7 @@ ABSENT, NO_NUMBER = "#d4d4d4", "#ffffff"
 
 
 class Scale(NamedTuple):
-    """From where to where colours or an axis run."""
+    """Limits of colours or of an axis."""
 
     low: float
     high: float

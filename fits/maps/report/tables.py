@@ -75,14 +75,14 @@ def worst_table(map: FittedMap) -> Table:
         pairs = (with_error(float(values[row]), float(errors[row])) for values, errors in columns)
         cells = (value if error == "unknown" else f"{value} ± {error}" for value, error in pairs)
         rows.append(
-            (f"[{', '.join(_strings(place))}]", f"{ratio[tuple(place)]:.4g}", *cells, ", ".join(_told(int(bits))))
+            (f"[{', '.join(_strings(place))}]", f"{ratio[tuple(place)]:.4g}", *cells, ", ".join(_flag_words(int(bits))))
         )
     note = f"Counted from 0, by {'row and column' if len(map.shape) == 2 else 'index'}; value ± standard error."
     return Table("", ("texel", "chi2/dof", *map.names, "flags"), tuple(rows), note if rows else "")
 
 
-def _told(bits: int) -> list[str]:
-    """What is worth telling of a texel that is fitted."""
+def _flag_words(bits: int) -> list[str]:
+    """Words for the flags of a texel that is fitted."""
     usual = ("fitted", "converged")
     found = [WORDS[flag].partition(":")[0] for flag, bit in FLAGS.items() if bits & bit and flag not in usual]
     return found if bits & FLAGS["converged"] else ["not converged", *found]
@@ -103,8 +103,8 @@ def smoothing_words(map: FittedMap) -> str:
         return ""
     prior, (start, *_, end) = said["prior"], said["objective"]
     scales = {f"{one:g}" for one in prior["scale"].values()}
-    alike = len(scales) == 1 and prior["scale"].keys() == set(map.names)
-    each = scales.pop() if alike else ", ".join(f"{name} {one:g}" for name, one in prior["scale"].items())
+    one_scale = len(scales) == 1 and prior["scale"].keys() == set(map.names)
+    each = scales.pop() if one_scale else ", ".join(f"{name} {one:g}" for name, one in prior["scale"].items())
     words = f"Smoothed beside the plain fit by block alternation ({prior['kind'].replace('_', ' ')}, of the bounds: "
     words += f"{each}): {said['rounds']} rounds took {start - end:.4g} off minus the log-posterior. In the last one "
     words += f"texels moved by at most {said['largest_moves'][-1]:.2g} standard errors"

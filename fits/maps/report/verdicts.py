@@ -57,7 +57,7 @@ def own_parameters(map: FittedMap) -> list[str]:
 def _extent(found: Summary) -> tuple[list[str], bool]:
     """How much of the map there is, and why the rest is not."""
     reasons = {"masked": "masked", "too_few_measurements": "with too few measurements", "failed": "failed"}
-    rest = [f"{found.counts[flag]:,} {told}" for flag, told in reasons.items() if found.counts[flag]]
+    rest = [f"{found.counts[flag]:,} {words_of_flag}" for flag, words_of_flag in reasons.items() if found.counts[flag]]
     fitted = ", ".join([f"{found.fitted:,} are fitted", *rest])
     if found.there == found.texels:
         return [f"A map of {found.texels:,} texels: {fitted}."], True

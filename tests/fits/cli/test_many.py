@@ -63,7 +63,7 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
     [
         (["nowhere", "--stacks", "bare.toml"], "nowhere: no such file or folder"),
         (["scans", "--stacks", "nowhere.toml"], "nowhere.toml: no such file"),
-        (["scans"], "no stack is given, nor a search asked for"),
+        (["scans"], "neither a stack nor a search is given"),
         (["scans/broken.csv", "--stacks", "bare.toml"], "'twenty'"),
         (["scans", "scans", "--stacks", "bare.toml"], "results go by this name"),
         (["scans", "--stacks", "bare.toml", "--select", "everything"], "'everything' is no selection"),
