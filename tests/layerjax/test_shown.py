@@ -42,7 +42,7 @@ AGAIN = {
     "Stack(layers=[], base=Lambertian(albedo=[0.5]))": lj.Stack([], lj.Lambertian([0.5])),
     "Stack(layers=[Interface(ior=1.5, alpha=Free(0.2, 0.1, 0.3))])": lj.Stack([lj.Interface(1.5, FREE)]),
     "Free((0.5, 0.6), 0.1, 0.9, LogUniform(), random_walk_sd=0.1)": fits.Free(
-        (0.5, 0.6), 0.1, 0.9, fits.LogUniform(), smooth=0.1
+        (0.5, 0.6), 0.1, 0.9, fits.LogUniform(), random_walk_sd=0.1
     ),
     "PowerLaw(amplitude=Free(0.2, 0.1, 0.3), exponent=1.2, wavelengths=[450.0, 650.0], reference=550.0)": (
         fits.PowerLaw(FREE, 1.2, (450, 650), 550)

@@ -231,7 +231,7 @@ def test_a_mistake_in_one_fit_ends_none_of_the_others(folder: Path, monkeypatch:
         (["nowhere"], STACKS, "no such file or folder: 'nowhere'"),
         (["empty"], STACKS, "empty: holds no measurement file"),
         ([], STACKS, "no file is given"),
-        (["scans"], [], "no stack is given"),
+        (["scans"], [], "neither a stack nor a search is given"),
         (["scans"], ["nowhere.toml"], "no such file: 'nowhere.toml'"),
         (["scans/broken.csv"], STACKS, "no file can be fitted: .*twenty"),
         (["scans", "copies"], STACKS, r"scans/paint.csv and copies/paint.csv: results go by this name"),
