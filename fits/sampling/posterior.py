@@ -21,7 +21,6 @@ from fits.sampling.convergence import (
     BURN_IN,
     LONG_ENOUGH,
     MIXED,
-    STEADY,
     autocorrelation_times,
     long_enough,
     r_hat,
@@ -58,8 +57,8 @@ class Posterior:
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
         autocorrelation_time: (P,), in steps, of the chain without its first tenth.
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
-        converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter, which
-            changed by less than 5 % since the last check, and R-hat is below 1.05.
+        converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter,
+            and R-hat is below 1.05.
         allow_unconverged: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
         divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
@@ -184,7 +183,7 @@ class Posterior:
         raise ValueError(
             f"the chain of {len(self.chain)} steps is too short to report from: its longest autocorrelation time is "
             f"{np.max(self.autocorrelation_time):.0f} steps, and {LONG_ENOUGH:.0f} of them after burn-in are needed, "
-            f"steady to {STEADY:.0%}, with R-hat below {MIXED:g} (it is {np.max(self.r_hat):.3g}); sample again with "
+            f"with R-hat below {MIXED:g} (it is {np.max(self.r_hat):.3g}); sample again with "
             "the same path and a larger max_steps to go on, or with allow_unconverged=True"
         )
 
