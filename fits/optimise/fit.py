@@ -133,7 +133,8 @@ def fit_problem(
 
 def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
     """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit_problem`."""
-    return _with_discrepancy(problem, independent, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
+    before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
+    return _with_discrepancy(problem, independent, before, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
@@ -168,15 +169,14 @@ def _fitted(problem: FittingProblem, run: _Run) -> Fit:
         raise ValueError(f"solver is {run.solver!r}; it must be one of {', '.join(get_args(Solver))}")
     require_kind("options", run.options, FitOptions)
     result = _fit_from(problem, start_points(problem, run.starts, run.seed), run)
-    if not datasets_with_discrepancy(result, run.options):
-        return result
-    return _with_discrepancy(problem, result, run)
+    before = datasets_with_discrepancy(result, run.options)
+    return _with_discrepancy(problem, result, before, run) if before else result
 
 
-def _with_discrepancy(problem: FittingProblem, independent: Fit, run: _Run) -> Fit:
-    """The fit with model discrepancy of the data sets that need it, or of all where none does by the rule."""
-    before = datasets_with_discrepancy(independent, run.options)
-    before = before or {name: without_discrepancy(independent.part(name)) for name in problem.problems}
+def _with_discrepancy(
+    problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
+) -> Fit:
+    """The fit with model discrepancy of these data sets, which were fitted with independent noise before."""
     whole = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in before})
 
     def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:

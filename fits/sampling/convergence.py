@@ -72,7 +72,7 @@ def long_enough(chain: MemoryChain, ess: float | None = None) -> bool:
     """Whether a chain, up to its last check, has 50 autocorrelation times, `ess` effective samples, and an R-hat near
     1."""
     before, check = last_checks(chain.iteration)
-    if not before:
+    if not before:  # of the first 100 steps nothing is said
         return False
     longest = np.max(autocorrelation_times(chain, check))
     kept = check - check // BURN_IN

@@ -251,7 +251,8 @@ def differences(name: str, stored: dict[str, Any], found: dict[str, Any]) -> lis
         old, new = np.asarray(old, float), np.asarray(new, float)
         unit = np.abs(old if unit is None else np.asarray(unit, float))
         same = (old == new) | (np.isnan(old) & np.isnan(new))
-        off = np.where(same, 0.0, np.abs(new - old) / np.where(unit > 0.0, unit, 1.0))
+        apart = np.abs(np.where(same, 0.0, new) - np.where(same, 0.0, old))
+        off = apart / np.where(same | ~(unit > 0.0), 1.0, unit)
         if not np.all(off <= tolerance):
             worst = int(np.argmax(np.nan_to_num(off, nan=np.inf)))
             said.append(f"{name}: {key}: {new.flat[worst]:.8g}, was {old.flat[worst]:.8g}, off {off.flat[worst]:.2g}")
