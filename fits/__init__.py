@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from fits.reports.results import load_posterior as load_posterior
     from fits.reports.results import save_fit as save_fit
     from fits.reports.verdicts import ReportOptions as ReportOptions
+    from fits.sampling.options import SamplerOptions as SamplerOptions
     from fits.sampling.posterior import Mode as Mode
     from fits.sampling.posterior import Posterior as Posterior
     from fits.sampling.sample import sample as sample
@@ -119,6 +120,7 @@ _HOMES = {
     "Uniform": "problem.parameters",
     "Mode": "sampling.posterior",
     "Posterior": "sampling.posterior",
+    "SamplerOptions": "sampling.options",
     "Prediction": "prediction.predict",
     "Scores": "prediction.predict",
     "scores": "prediction.predict",

@@ -1,4 +1,4 @@
-"""Do samplers agree? emcee and NUTS on posteriors of all orders of scattering."""
+"""Do samplers agree, and which is fast? emcee with and without fitted proposals, and NUTS, on difficult posteriors."""
 
 import json
 import time
@@ -13,6 +13,7 @@ import fits
 import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, rounded, table, write
+from benchmarks.studies.calibration.run import fitted_case
 from benchmarks.suite import coated_haze
 
 NAME = "samplers"
@@ -20,22 +21,26 @@ TRANSPORT = lj.AddingDoubling(nodes=6, modes=6)
 NOISE, FLOOR = 0.05, 1e-6
 ESS, QUICK, STEPS = 6000.0, 1000.0, 100_000
 LEAST, APART = 5000.0, 0.1
-"""Effective samples of the worst parameter, and deviations that quantiles may differ by."""
+"""Effective sample size of the worst parameter, and deviations that quantiles may differ by."""
 QUANTILES = (0.158655, 0.5, 0.841345)
 
 PLAIN = "emcee"
 SAMPLERS: dict[str, dict[str, Any]] = {
     PLAIN: {},
+    "emcee, none fitted": {"options": fits.SamplerOptions(independent=0.0)},
     "NUTS": {"sampler": "nuts"},
 }
 
+HEADER = ("posterior", "sampler", "ESS", "steps", "walkers", "taken", "lost", "seconds", "ESS/s", "apart", "verdict")
+
 TEXT = """\
-# Do samplers agree?
+# Do samplers agree, and which is fast?
 
 {environment}
-Posteriors of a rough interface over haze over a diffuse base, all orders of scattering, by `{transport}`: 140
-readings in the plane of incidence, simulated with noise of {noise:.0%}. Each is sampled until its worst parameter has
-{ess:,.0f} effective samples. *taken* is the share of proposals that were, *lost* the number of divergent steps; *apart*
+The first three posteriors are of a rough interface over haze over a diffuse base, all orders of scattering, by
+`{transport}`: 140 measurements in the plane of incidence, simulated with noise of {noise:.0%}; the others are those
+of [calibration](calibration.md). Each is sampled until every parameter has an effective sample size (ESS)
+of {ess:,.0f}. *taken* is the share of proposals that were, *lost* the divergences of NUTS after its warm-up; *apart*
 is the largest difference of a quantile (16, 50 and 84 %) of any parameter from that of emcee, in standard deviations
 of the parameter. Samplers agree where it is below {apart:g} with {least:,.0f} effective samples or more.
 
@@ -87,10 +92,28 @@ def free_noise_level() -> fits.Fit:
     return _fitted(free, fits.Free(0.1, 0.005, 1.0))
 
 
+def banana() -> fits.Fit:
+    """Little is known but a product of two parameters, a curved ridge that ends at the bounds"""
+    return fitted_case("banana")
+
+
+def degenerate() -> fits.Fit:
+    """The data depend on the product of albedo and scale alone"""
+    return fitted_case("degenerate")
+
+
+def bounded() -> fits.Fit:
+    """Roughness and albedo lean on their bounds"""
+    return fitted_case("bounded")
+
+
 POSTERIORS: dict[str, Callable[[], fits.Fit]] = {
     "five parameters": five_parameters,
     "on a bound": on_a_bound,
     "free noise level": free_noise_level,
+    "banana": banana,
+    "degenerate": degenerate,
+    "bounded": bounded,
 }
 
 
@@ -189,7 +212,7 @@ def _save(
         least=LEAST,
         posteriors="".join(f"- *{name}*: {(made.__doc__ or '').strip()}.\n" for name, made in posteriors.items()),
         rows=table(
-            ("posterior", "sampler", "effective", "steps", "walkers", "taken", "lost", "seconds", "apart", "verdict"),
+            HEADER,
             [_row(one, plain.get(one.posterior)) for one in done],
         ),
     )
@@ -217,6 +240,7 @@ def _row(one: Sampled, plain: Sampled | None) -> tuple[str, ...]:
         f"{one.acceptance:.2f}",
         str(one.divergences) if one.sampler == "NUTS" else "-",
         figure(one.seconds),
+        figure(one.effective / one.seconds),
         difference,
         verdict,
     )

@@ -105,7 +105,7 @@ def sample(arguments: Namespace) -> int:
     for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
         print(sentence)
     reached = float(np.min(posterior.effective_samples))
-    enough = posterior.converged and (arguments.ess is None or reached >= arguments.ess)
+    enough = posterior.converged and reached >= posterior.options.ess
     if not enough:
         ess = "" if arguments.ess is None else f" --ess {arguments.ess}"
         print(f"To resume: layerjax sample {directory}{ess} --max-steps {2 * len(posterior.chain)}")
@@ -114,15 +114,18 @@ def sample(arguments: Namespace) -> int:
 
 def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
     """Sampler and walkers: those of the chain that is kept, which arguments must not contradict, or defaults."""
-    from fits.sampling.chain import read_chain
+    from fits.sampling.sample import settings_of
+    from fits.store import Store
 
-    stored = {} if arguments.force or not path.is_file() else read_chain(path)["identity"]
+    stored: dict[str, Any] = {}
+    if not arguments.force and path.is_file() and (there := Store.read(path)).fingerprint:
+        stored = dict(zip(("sampler", "walkers"), settings_of(there), strict=False))
     settings: dict[str, Any] = {}
-    for name, kind, default in (("sampler", str, "emcee"), ("walkers", int, None)):
+    for name, default in (("sampler", "emcee"), ("walkers", None)):
         given, before = getattr(arguments, name), stored.get(name)
         if given is not None and before is not None and given != before:
             raise ValueError(f"--{name} is {given}, the chain in {path} has {before} (--force starts it again)")
-        settings[name] = given if given is not None else default if before is None else kind(before)
+        settings[name] = given if given is not None else default if before is None else before
     return settings
 
 

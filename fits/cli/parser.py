@@ -132,10 +132,10 @@ def _sample(commands: Commands) -> None:
     parser.add_argument(
         "--walkers", type=count, metavar="N", help="even number (default: the chain's, or 32; 4 chains of nuts)"
     )
-    parser.add_argument("--ess", type=count, metavar="N", help="least effective sample size of all parameters")
     parser.add_argument(
-        "--max-steps", type=count, default=20_000, metavar="N", help="most steps (default: %(default)s)"
+        "--ess", type=count, metavar="N", help="effective sample size of every parameter (default: 1000)"
     )
+    parser.add_argument("--max-steps", type=count, metavar="N", help="most steps (default: 20000)")
     parser.add_argument(
         "--allow-unconverged", action="store_true", help="report estimates from a chain that has not converged, too"
     )

@@ -22,7 +22,7 @@ from fits.problem.discrepancy.logarithm import size
 from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
 from fits.progress import Progress
-from fits.sampling.modes import other_minima
+from fits.sampling.initial import other_minima, vector_of
 from layerjax._checks import require_kind
 
 DRAWS = 128
@@ -95,7 +95,7 @@ def cross_validate(
     groups, data = require_groups(fit, options), fit.problem.data.used()
     proposal = None if posterior is None else posterior.mixture(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
-    starts = [fit.vector, *(np.array([one.values[name] for name in fit.problem.names]) for one in other_minima(fit))]
+    starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
     done = {} if done is None else done
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:

@@ -1,7 +1,7 @@
 """Importance sampling of the posterior of a fit: weighted draws, without a chain.
 
-Proposals are the Laplace approximation of the fit, and where it does not suffice, mixtures along the fit's ridge or
-about all of its minima that hold a share of the posterior. The Pareto k of the largest weights says how well the draws
+Proposals are Laplace's approximations about the minima of the fit, and where these do not suffice, mixtures along its
+ridges. The Pareto k of the largest weights says how well the draws
 represent the posterior (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a
 mixture is fitted to the weighted draws, and drawn from as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph.
 Stat. 13, 907); the draws of all proposals are weighted as those of their mixture (Cornuet, Marin, Mira & Robert 2012,
@@ -9,7 +9,6 @@ Scand. J. Stat. 39, 798).
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,8 @@ from scipy.special import logsumexp
 from fits.optimise.result import Fit
 from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import in_shares
-from fits.sampling.laplace import Approximation
-from fits.sampling.modes import other_minima
-
-if TYPE_CHECKING:
-    from fits.sampling.mixture import Mixture
+from fits.sampling.initial import initial_mixture, log_posteriors
+from fits.sampling.mixture import Mixture
 
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 """Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
@@ -67,13 +63,11 @@ class ImportanceDraws:
         weights = self.log_weights if self.pareto_k < MAX_PARETO_K else _tempered(self.log_weights)
         return self.positions[_resample(weights, generator, count)]
 
-    def mixture(self, generator: np.random.RandomState, count: int) -> "Mixture | None":
+    def mixture(self, generator: np.random.RandomState, count: int) -> Mixture | None:
         """A mixture fitted to so many draws of the posterior; None if all weights are 0."""
-        from fits.sampling.mixture import Mixture
-
         if not np.isfinite(self.log_weights).any():
             return None
-        return Mixture.through(self.resample(generator, count), generator)
+        return Mixture.fitted(self.resample(generator, count), generator)
 
 
 def importance_draws(
@@ -83,27 +77,22 @@ def importance_draws(
     *,
     max_pareto_k: float = FINITE_VARIANCE,
     along_ridge: bool = False,
-    proposal: "Mixture | None" = None,
+    proposal: Mixture | None = None,
 ) -> ImportanceDraws:
     """Draw as many of each of several proposals, until their weights suffice; the fit is of a likelihood.
 
     max_pareto_k: the Pareto k that suffices.
-    along_ridge: begin with a mixture along the fit's ridge, if it has one; that takes some hundred Jacobians. Otherwise
-        it is used if the fit has minima that may be other modes, or if neither its own approximation nor `proposal`
-        suffices.
+    along_ridge: begin with mixtures along the ridges of the fit's minima, if they have one; that takes some hundred
+        Jacobians. Otherwise they are used if neither approximations about the minima nor `proposal` suffice.
     proposal: an approximation of a posterior similar to the fit's.
     """
-    from fits.sampling.mixture import Mixture
-
-    along_ridge = along_ridge or bool(other_minima(fit))  # one mode by itself would seem to suffice
-    ridge = Mixture.of(fit) if along_ridge else None
     pool = _Pool(fit, draws, generator)
-    weighted = pool.add(ridge or Approximation.of(fit))
+    weighted = pool.add(initial_mixture(fit, along_ridges=along_ridge))
     if not along_ridge and not weighted.suffices(MAX_PARETO_K):
         if proposal is not None:
             weighted = pool.adapt(pool.add(proposal), max_pareto_k)
-        if not weighted.suffices(MAX_PARETO_K) and (ridge := Mixture.of(fit)) is not None:
-            weighted = pool.add(ridge)
+        if not weighted.suffices(MAX_PARETO_K):
+            weighted = pool.add(initial_mixture(fit))
     return pool.adapt(weighted, max_pareto_k)
 
 
@@ -112,45 +101,43 @@ class _Pool:
 
     def __init__(self, fit: Fit, draws: int, generator: np.random.RandomState):
         self.fit, self.draws, self.generator = fit, draws, generator
-        self.proposals: list[Approximation | Mixture] = []
+        self.proposals: list[Mixture] = []
         self.positions = np.empty((0, len(fit.vector)))
-        self.inside = np.empty(0, bool)
         self.log_posterior = np.empty(0)
 
-    def add(self, proposal: "Approximation | Mixture") -> ImportanceDraws:
+    def add(self, proposal: Mixture) -> ImportanceDraws:
         """Add draws of a proposal; returns all draws of the pool."""
-        import arviz
-
-        from fits.sampling.ensemble import log_posteriors
-
-        if isinstance(proposal, Approximation):
-            positions, inside = proposal.draw(self.generator, self.draws), np.ones(self.draws, bool)
-        else:
-            positions, inside = proposal.draw_all(self.generator, self.draws)
+        positions = proposal.draw(self.generator, self.draws)
         (log_posterior,) = in_shares(lambda part: [self.fit.problem.call(log_posteriors, part)], positions, BATCH)
         self.proposals.append(proposal)
         self.positions = np.concatenate([self.positions, positions])
-        self.inside = np.append(self.inside, inside)
         self.log_posterior = np.append(self.log_posterior, log_posterior)
         densities = [one.log_density(self.positions) for one in self.proposals]
         weights = self.log_posterior - (logsumexp(densities, axis=0) - np.log(len(densities)))
-        weights = np.where(self.inside & np.isfinite(weights), weights, -np.inf)
+        weights = np.where(np.isfinite(weights), weights, -np.inf)
         if not np.isfinite(weights).any():
             return ImportanceDraws(self.positions, weights, np.inf)
-        with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
-            _, pareto_k = arviz.psislw(np.maximum(weights - weights.max(), -700.0))
-        return ImportanceDraws(self.positions, weights, float(pareto_k))
+        return ImportanceDraws(self.positions, weights, _pareto_k(np.maximum(weights - weights.max(), -700.0)))
 
     def adapt(self, weighted: ImportanceDraws, max_pareto_k: float) -> ImportanceDraws:
         """Add draws of mixtures fitted to the weighted ones until they suffice."""
-        from fits.sampling.mixture import Mixture
-
         for _ in range(ROUNDS):
             if weighted.suffices(max_pareto_k) or not np.isfinite(weighted.log_weights).any():
                 break
             rows = _resample(_tempered(weighted.log_weights), self.generator, self.draws)
-            weighted = self.add(Mixture.through(weighted.positions[rows], self.generator))
+            weighted = self.add(Mixture.fitted(weighted.positions[rows], self.generator))
         return weighted
+
+
+def _pareto_k(log_weights: Floats) -> float:
+    import arviz
+
+    if not hasattr(arviz, "psislw"):  # from 1.0 on
+        from arviz_stats.base import array_stats
+
+        return float(array_stats.psislw(log_weights)[1])
+    with np.errstate(over="ignore"):  # in the tail that it fits where all weights but a few are next to nothing
+        return float(arviz.psislw(log_weights)[1])
 
 
 def _resample(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:

@@ -5,7 +5,7 @@ held_out.csv   the held-out data, if any
 problem.toml   the stack with its free parameters, noise and scale, as given
 fitted.toml    the same stack with the fitted values
 fit.json       every number of the fit, its settings, and the versions that made it; checksums of it and of these files
-chain.h5       the posterior's chain, once sampled, and summary.json with its estimates
+chain.db       the posterior's chain, once sampled, and summary.json with its estimates
 report.html    the report, and its pictures as *.png
 """
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 SCHEMA = 4
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.lock"
-DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.h5"
+DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
 _NUMBERS = ("vector", "errors", "covariance", "cost", "condition_number")
 _PLAIN = (
     "converged",

@@ -580,7 +580,8 @@ def sampled(posterior: "Posterior", options: ReportOptions = DEFAULT) -> list[st
         words.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
         words.append(
-            "The chain has not converged: "
+            f"The chain has not converged: {posterior.options.autocorrelation_times:g} autocorrelation times and R-hat "
+            f"of at most {posterior.options.r_hat:g} are needed: "
             + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
         )
     return words

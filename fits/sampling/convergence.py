@@ -1,125 +1,99 @@
-"""How long a chain must be: 50 autocorrelation times, and the effective samples that are requested.
+"""When a chain ends: 50 autocorrelation times, the effective samples that were asked for, and R-hat near 1.
 
-Autocorrelation is that within walkers: those that each stay in a mode of their own look as good as any. So R-hat, which
-compares what is between them with what is within (Vehtari, Gelman, Simpson, Carpenter & Buerkner 2021), has to be near
-1 as well; of a few chains that are 50 autocorrelation times long it is up to 1.04 by chance.
-
-Looked at after whole checks only, which come at the same steps however often a run resumes.
+R-hat compares draws between and within four groups of walkers, each split into halves in time: that of single walkers
+exceeds 1.01 by chance alone until each has some hundred independent draws (nested R-hat: Margossian, Hoffman, Sountsov,
+Riou-Durand, Vehtari & Gelman 2024). The effective sample size counts every walker as a chain, so that walkers which
+each stay in a mode of their own have next to none.
 """
 
 import math
-import time
+from dataclasses import dataclass, replace
 
 import emcee
 import numpy as np
 from numpy.typing import NDArray
 
-from fits.progress import in_words
-from fits.sampling.chain import MemoryChain
+from fits.sampling.options import FIRST_CHECK, SamplerOptions
 
-FIRST_CHECK = 100
-LONG_ENOUGH = 50.0
-MIXED = 1.05
-BURN_IN = 10
-FEWEST_STEPS = 4
-PATIENCE = 10.0  # seconds between two looks at a chain that grows slowly
+GROUPS = 4
+FEWEST_DRAWS = 8
 
 Floats = NDArray[np.float64]
 
 
+CHECKS = FIRST_CHECK * np.unique(np.ceil(1.1 ** np.arange(100.0)).astype(int))
+"""Steps after which a chain is looked at, however often a run resumes: 100, 200, ... 1000, then a tenth farther."""
+
+
 def next_check(step: int) -> int:
-    """Checks come after 100, 200, ... steps, later a tenth further each."""
-    check = FIRST_CHECK
-    while check <= step:
-        check += _interval(check)
-    return check
+    """The first check after this step."""
+    return int(CHECKS[step < CHECKS].min(initial=CHECKS[-1]))
 
 
-def last_checks(step: int) -> tuple[int, int]:
-    """The last check up to this step, and the one before; 0 for none."""
-    before, check, following = 0, 0, FIRST_CHECK
-    while following <= step:
-        before, check, following = check, following, following + _interval(following)
-    return before, check
+@dataclass(frozen=True, eq=False)
+class Convergence:
+    """How far a chain of P parameters has come, by its draws after the burn-in.
 
+    draws: steps after the burn-in. autocorrelation_time: (P,), in steps. ess: (P,), the smaller of bulk and tail.
+    r_hat: (P,).
+    """
 
-def _interval(check: int) -> int:
-    return FIRST_CHECK * max(1, round(check / BURN_IN / FIRST_CHECK))
+    draws: int
+    autocorrelation_time: Floats
+    ess: Floats
+    r_hat: Floats
 
+    @classmethod
+    def of(cls, chain: Floats, options: SamplerOptions) -> "Convergence":
+        """Of a chain (steps, walkers, P) from its start on."""
+        import arviz
 
-def autocorrelation_times(chain: MemoryChain, steps: int) -> Floats:
-    """Of each parameter, (P,), in steps, of the first `steps` of a chain without their first tenth."""
-    kept = chain.chain[steps // BURN_IN : steps]
-    with np.errstate(invalid="ignore"):  # a single step has no variance to divide by
-        times = emcee.autocorr.integrated_time(kept, tol=0)
-    return np.where(np.isfinite(times) & (times > 0.0), times, math.inf)  # 0 of the first few steps
+        kept = after_burn_in(chain, options)
+        draws, walkers, count = kept.shape
+        if draws < FEWEST_DRAWS:
+            return cls(draws, np.full(count, math.inf), np.zeros(count), np.full(count, math.inf))
+        number = min(GROUPS, walkers)
+        dealt = kept[:, : walkers - walkers % number].reshape(draws, -1, number, count)
+        groups = np.moveaxis(dealt, 2, 0).reshape(number, -1, count)  # draws of each group in the order of time
+        with np.errstate(invalid="ignore", divide="ignore"):  # of walkers that never moved
+            times = emcee.autocorr.integrated_time(kept, tol=0)
+            times = np.where(np.isfinite(times) & (times > 0.0), times, math.inf)
+            ess, r_hat = np.empty(count), np.empty(count)
+            for place in range(count):
+                one = np.ascontiguousarray(kept[..., place].T)
+                ess[place] = min(float(arviz.ess(one, method=method)) for method in ("bulk", "tail"))
+                r_hat[place] = float(arviz.rhat(np.ascontiguousarray(groups[..., place])))
+        same = np.ptp(kept, axis=(0, 1)) == 0.0  # next to a bound numbers may be rounded to it
+        r_hat = np.where(same, 1.0, np.where(np.isfinite(r_hat), r_hat, math.inf))
+        return cls(draws, times, np.where(np.isfinite(ess), ess, 0.0), r_hat)
 
+    def is_converged(self, options: SamplerOptions) -> bool:
+        """Whether the chain is long enough in autocorrelation times, and R-hat near 1."""
+        long_enough = self.draws >= options.autocorrelation_times * np.max(self.autocorrelation_time)
+        return bool(long_enough and np.max(self.r_hat) <= options.r_hat)
 
-def r_hat(chain: Floats) -> Floats:
-    """Rank-normalised split R-hat of each parameter, (P,), of walkers (steps, walkers, P) without their first tenth."""
-    import arviz
+    def is_finished(self, options: SamplerOptions) -> bool:
+        """Whether it is converged, and has the effective samples that were asked for."""
+        return self.is_converged(options) and float(np.min(self.ess)) >= options.ess
 
-    kept = chain[len(chain) // BURN_IN :]
-    if len(kept) < FEWEST_STEPS:
-        return np.full(chain.shape[-1], math.inf)
-    with np.errstate(invalid="ignore", divide="ignore"):  # walkers that never moved
-        found = np.array([float(arviz.rhat(kept[..., place].T)) for place in range(chain.shape[-1])])
-    same = np.ptp(kept, axis=(0, 1)) == 0.0  # next to a bound numbers may be rounded to it
-    return np.where(same, 1.0, np.where(np.isfinite(found), found, math.inf))
-
-
-def long_enough(chain: MemoryChain, ess: float | None = None) -> bool:
-    """Whether a chain, up to its last check, has 50 autocorrelation times, `ess` effective samples, and an R-hat near
-    1."""
-    before, check = last_checks(chain.iteration)
-    if not before:  # of the first 100 steps nothing is said
-        return False
-    longest = np.max(autocorrelation_times(chain, check))
-    kept = check - check // BURN_IN
-    enough = kept > LONG_ENOUGH * longest and kept >= _asked_for(chain, ess) * longest
-    return bool(enough and np.max(r_hat(chain.chain[:check])) < MIXED)
-
-
-def finished(chain: MemoryChain, max_steps: int, ess: float | None) -> bool:
-    """Whether sampling ends here."""
-    if chain.iteration:
-        return chain.iteration >= max_steps or (
-            chain.iteration in last_checks(chain.iteration) and long_enough(chain, ess)
+    def note(self, options: SamplerOptions) -> str:
+        """What is there, and what is asked for, in words."""
+        return (
+            f"{np.min(self.ess):.0f} of {options.ess:g} effective samples, autocorrelation time "
+            f"{np.max(self.autocorrelation_time):.0f} steps, R-hat {np.max(self.r_hat):.3f}"
         )
-    return False
 
 
-def _asked_for(chain: MemoryChain, ess: float | None) -> float:
-    """Effective samples that are asked for, of each walker."""
-    return (ess or 0.0) / chain.shape[0]
+def after_burn_in(chain: Floats, options: SamplerOptions) -> Floats:
+    """The draws of a chain (steps, walkers, P) that estimates use."""
+    return chain[int(options.burn_in * len(chain)) :]
 
 
-class Outlook:
-    """How far a chain is from its end, in words, and how long that takes at the pace since the last look."""
-
-    def __init__(self, chain: MemoryChain, max_steps: int, ess: float | None):
-        self.chain, self.max_steps, self.ess = chain, max_steps, ess
-        self._seen, self._at = chain.iteration, time.monotonic()
-
-    @property
-    def overdue(self) -> bool:
-        """Whether the last look was long ago."""
-        return time.monotonic() - self._at > PATIENCE
-
-    def note(self) -> str:
-        """What is there, what is needed, and the time left."""
-        step, now = self.chain.iteration, time.monotonic()
-        pace, self._seen, self._at = (now - self._at) / max(step - self._seen, 1), step, now
-        longest = float(np.max(autocorrelation_times(self.chain, step)))
-        effective = (step - step // BURN_IN) * self.chain.shape[0] / longest
-        wanted = "" if self.ess is None else f" of {self.ess:g}"
-        words = f"autocorrelation time {longest:.0f}, {effective:.0f}{wanted} effective samples"
-        needed = max(LONG_ENOUGH, _asked_for(self.chain, self.ess)) * longest * BURN_IN / (BURN_IN - 1)
-        if not math.isfinite(needed):
-            return words
-        words += f", needs {needed:.0f} steps"
-        if finished(self.chain, self.max_steps, self.ess):
-            return words
-        # where it is long enough already it waits for the next check
-        left = min(max(needed, next_check(step)), self.max_steps) - step
-        return f"{words}, about {in_words(pace * left)} left"
+def expected_steps(chain: Floats, options: SamplerOptions) -> int | None:
+    """Steps that a chain will have in the end, by what its second half gains a step; None where nothing can be said."""
+    recent, step = Convergence.of(chain, replace(options, burn_in=0.5)), len(chain)
+    longest, least = float(np.max(recent.autocorrelation_time)), float(np.min(recent.ess))
+    if not (math.isfinite(longest) and least > 0.0):
+        return None
+    needed = max(options.ess / least * recent.draws, options.autocorrelation_times * longest)
+    return min(next_check(max(math.ceil(needed / (1.0 - options.burn_in)) - 1, step)), options.max_steps)

@@ -1,101 +1,85 @@
-"""An ensemble of walkers moved by emcee, in unconstrained coordinates, where the box has no walls.
+"""emcee's ensemble: walkers that move together, in unconstrained coordinates, where the box has no walls.
 
-Half the steps are stretch moves, and half independent proposals from an approximation, the fit's own or one learned
-from the chain (`laplace`).
+Half of the steps are stretch moves and differential evolution, neither of which is the better one everywhere, half
+independent proposals from a mixture that is fitted to the chain as it grows (`mixture`).
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import emcee
-import jax
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 
 from fits.optimise.result import Fit
-from fits.problem.compilation import cores, in_shares
-from fits.problem.model import Model
-from fits.sampling.chain import MemoryChain
-from fits.sampling.convergence import last_checks
-from fits.sampling.laplace import Approximation, first_positions
-from fits.sampling.mixture import MODES, Mixture
+from fits.problem.compilation import cores, in_shares, one_thread
+from fits.sampling.chain import Chain
+from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
+from fits.sampling.mixture import Mixture
+from fits.sampling.options import SamplerOptions
 
-INDEPENDENT = 0.5
+FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
+"""Steps after which the mixture is fitted again: often while the chain is short, seldom once it is long."""
 
 Floats = NDArray[np.float64]
-Proposals = Approximation | Mixture
 
 
 class Ensemble:
     """Moves the walkers of a chain about the optimum of a fit."""
 
-    def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
-        self.problem, self.chain, self.seed = fit.problem, chain, seed
-        self._compiled: set[int] = set()  # sizes of batches
-        self.initial: Proposals = Mixture.of(fit) or Approximation.of(fit)
-
-    def decide(self) -> None:
-        """Before the first step, and for all: between which modes walkers jump."""
-        self.chain.decide(modes_of(self.initial))
+    def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions):
+        self.problem, self.chain, self.seed, self.options = fit.problem, chain, seed, options
+        self._compiled = False
+        if not chain.moves:
+            chain.decide({"initial": initial_mixture(fit, options.smallest_mode).record()})
 
     def advance(self, step: int, tell: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""
-        chain = self.chain
-        state = chain.get_last_sample() if chain.iteration else self._first_state()
-        # walkers are drawn from a density of full rank: emcee need not look whether they are
-        for _ in self.sampler().sample(state, iterations=step - chain.iteration, skip_initial_state_check=True):
-            tell()
+        while (begin := self.chain.iteration) < step:
+            proposals = proposals_of(self.chain)
+            state = self.chain.get_last_sample() if begin else self._first_state(proposals)
+            share = self.options.independent
+            moves = [
+                (emcee.moves.MHMove(proposals.propose), share),
+                (emcee.moves.StretchMove(), 0.5 * (1.0 - share)),
+                (emcee.moves.DEMove(), 0.5 * (1.0 - share)),
+            ]
+            sampler = emcee.EnsembleSampler(
+                *self.chain.shape, self.log_posteriors, moves=moves, vectorize=True, backend=self.chain
+            )
+            count = min(step, next_fit(begin)) - begin
+            # walkers are drawn from a density of full rank: emcee need not look whether they are
+            for _ in sampler.sample(state, iterations=count, skip_initial_state_check=True):
+                tell()
 
-    def sampler(self) -> emcee.EnsembleSampler:
-        """emcee with the moves of the steps up to the next check."""
-        independent = emcee.moves.MHMove(adapted(self.chain, self.initial).propose)
-        moves = [(independent, INDEPENDENT), (emcee.moves.StretchMove(), 1.0 - INDEPENDENT)]
-        walkers, count = self.chain.shape
-        return emcee.EnsembleSampler(
-            walkers, count, self._log_posteriors, moves=moves, vectorize=True, backend=self.chain
+    def log_posteriors(self, positions: Floats) -> Floats:
+        """At positions (count, P), on all cores: half of the walkers, which move together, are a share for each."""
+        share = max(1, self.chain.shape[0] // (2 * cores()))
+        (found,) = in_shares(
+            lambda part: [self.problem.call(log_posteriors, part)], positions, share, compiled=self._compiled
         )
+        self._compiled = True
+        return found
 
-    def _log_posteriors(self, positions: Floats) -> Floats:
-        share = max(1, len(positions) // cores())
-        (heights,) = in_shares(
-            lambda part: [self.problem.call(log_posteriors, part)], positions, share, share in self._compiled
-        )
-        self._compiled.add(share)
-        return heights
-
-    def _first_state(self) -> emcee.State:
-        def finite(positions: Floats) -> bool:
-            return bool(np.all(np.isfinite(self._log_posteriors(positions))))
-
+    def _first_state(self, proposals: Mixture) -> emcee.State:
         generator = np.random.RandomState(self.seed)
-        positions = first_positions(self.initial.draw, finite, self.chain.shape[0], generator)
+        positions = first_positions(proposals, self.log_posteriors, self.chain.shape[0], generator)
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
-def modes_of(proposals: Proposals | None) -> dict[str, Any]:
-    """What a chain keeps of the modes of its posterior; nothing, where one is known."""
-    several = isinstance(proposals, Mixture) and proposals.mode_count > 1
-    return proposals.arrays(MODES) if isinstance(proposals, Mixture) and several else {}
+def proposals_of(chain: Chain) -> Mixture:
+    """The mixture that proposals come from until the next fit: that of the second half of the chain up to the last one.
 
-
-def adapted(chain: MemoryChain, initial: Proposals) -> Proposals:
-    """The fit's approximation, or one learned from the second half of the chain up to its last check if that is closer.
-
-    As checks grow apart, so the adaptation fades; and it depends on whole checks only, so that a resumed chain is the
-    same.
+    As fits grow apart, so the adaptation fades; and a chain that is gone on with is the same, for it depends on whole
+    fits only.
     """
-    _, check = last_checks(chain.iteration)
-    if not check:
+    initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
+    if not last:
         return initial
-    positions = chain.chain[check // 2 : check]
-    positions = positions.reshape(-1, positions.shape[-1])
-    candidates: list[Proposals] = [initial, Approximation.learned(positions)]
-    if isinstance(initial, Mixture):
-        candidates.append(initial.refined(positions))
-    return max(candidates, key=lambda candidate: candidate.mean_log_density(positions))
+    positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
+    with one_thread():  # the same to the last bit, whatever else runs
+        return Mixture.fitted(positions.copy(), np.random.RandomState(last)).beside(initial)
 
 
-def log_posteriors(model: Model, positions: Array) -> Array:
-    """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
-    return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
+def next_fit(step: int) -> int:
+    """The first step after this one that proposals are fitted at again."""
+    return int(FITS[step < FITS].min())

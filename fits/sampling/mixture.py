@@ -1,256 +1,171 @@
-"""The posterior along a ridge, or about several minima: a mixture of heavy-tailed densities in the box, to draw from.
+"""Proposals that do not depend on where a walker stands: a mixture of heavy-tailed densities, to draw from.
 
-In the box, not in log-odds: there a posterior has no long tails towards its bounds. What is drawn outside is refused.
+It begins as approximations about the minima of a fit (`initial`), and is fitted again to what walkers have visited:
+where it is close to the posterior a chain forgets its past in a few steps, and jumps between its modes. Metropolis'
+rule keeps every step exact, however poor the mixture is.
 """
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.cluster.vq import ClusterError, kmeans2
-from scipy.special import expit, logit, logsumexp
+from scipy.special import expit, gammaln, logit, logsumexp
 
-from fits.optimise.result import Fit
-from fits.optimise.uncertainty import local_information
-from fits.problem.problem import Problem
-from fits.sampling.laplace import DEGREES_OF_FREEDOM, slope_at_bounds, student, student_draws, student_peak
-from fits.sampling.modes import WITHIN, places
-from fits.sampling.ridge import open_directions, ridge
-
-LEAST_PART = 0.01  # of the squared length of an open direction
-LOOSE = 10.0  # in the log-posterior, a box
-SMALLEST_REACH, WIDEST_REACH = 1e-9, 0.3  # of the box
-LEAST = 1e-12  # variance, of a unit, that a combination of parameters keeps
-REFINEMENTS = 10
-MOST_SAMPLES = 4000
-OWN_SAMPLES = 2.0  # that a component counts as
-KEPT = 0.1  # of a mixture that is refined
-MIXTURE, MODES = "mixture_", "modes_"  # how names of arrays begin: of proposals, and of where modes are
-COMPONENTS = 12  # of one that is fitted to samples
-APART = 3.0  # standard deviations: minima that are closer are one mode
-HALF_LOG = 0.5 * np.log(2.0 * np.pi)
+DEGREES_OF_FREEDOM = 6.0
+COMPONENTS = 12  # of mixtures that are fitted to samples
+INITIAL_SHARE = 0.1  # of proposals from the approximations of the fit, whatever is learned
+ITERATIONS = 10
+MOST_SAMPLES = 2000
+SMALLEST_VARIANCE = 1e-12  # of a unit, that a combination of parameters keeps
+NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A density over the unconstrained vectors of a problem with P parameters: M Student-t densities in the box.
+    """A density over the unconstrained vectors of a problem with P parameters: M multivariate Student-t densities.
 
-    centre: (M, P). root: (M, P, P), whose product with its transpose is a covariance. log_weight: (M,). held: (P,)
-    bool, at a bound: a component is folded over there, and the parameter independent of the others; none where there
-    are several modes. modes: (M,), to which of the modes of the posterior a component belongs, 0 the best minimum's.
+    A parameter at a bound follows none of them: its distance from the bound is exponentially distributed.
+
+    centre: (M, P). root: (M, P, P), whose product with its transpose is the scale matrix, 0 for parameters at a
+    bound. at_bound: (M, P) bool. distance: (M, P), mean distance from the bound in boxes. log_weight: (M,). mode: (M,),
+    which mode of the posterior a component belongs to; 0 is that of the best minimum.
     """
 
     centre: Floats
     root: Floats
+    at_bound: NDArray[np.bool_]
+    distance: Floats
     log_weight: Floats
-    held: NDArray[np.bool_]
-    modes: NDArray[np.int64]
+    mode: NDArray[np.int64]
 
     @classmethod
-    def of(cls, fit: Fit) -> "Mixture | None":
-        """The mixture about the points of a fit's ridge, and of those of its other minima that hold a share of the
-        posterior, as wide as the information there; None where there is one point alone."""
-        parts: list[Mixture] = []
-        for place in places(fit):
-            if any(part._holds(place.unit) for part in parts):
-                continue
-            parts.append(cls._about(fit.problem, place.unit, place.held))
-        # by Laplace's approximation; of what a bound holds it is half a density, and falls off otherwise
-        masses = [logsumexp(part.log_weight) - HALF_LOG * np.sum(part.held) for part in parts]
-        parts = [part for part, mass in zip(parts, masses, strict=True) if mass > max(masses) - WITHIN]
-        if len(parts) == 1:
-            (only,) = parts
-            return None if len(only.centre) == 1 else only._normalised()
-        weights = [part.log_weight - HALF_LOG * np.sum(part.held) for part in parts]
-        return cls(
-            np.concatenate([part.centre for part in parts]),
-            np.concatenate([part.root for part in parts]),
-            np.concatenate(weights),
-            np.zeros(len(fit.problem.names), bool),
-            np.repeat(np.arange(len(parts)), [len(part.centre) for part in parts]),
-        )._normalised()
+    def students(cls, centre: Floats, root: Floats, log_weight: Floats) -> "Mixture":
+        """Without parameters at a bound, and of one mode."""
+        nowhere = np.zeros(centre.shape, bool)
+        return cls(centre, root, nowhere, np.ones(centre.shape), log_weight, np.zeros(len(centre), int))
 
     @classmethod
-    def _about(cls, problem: Problem, optimum: Floats, held: NDArray[np.bool_]) -> "Mixture":
-        """The mixture about the points of the ridge of a minimum, its weights those of the posterior but for a factor
-        that all minima have in common."""
-        slope = slope_at_bounds(problem, optimum, held)
-        # what is hardly pressed against its bound, and open with others, lies along the ridge
-        if held.any():
-            part = np.sum(open_directions(local_information(problem, optimum)[0]) ** 2, axis=0)
-            held = held & ((part < LEAST_PART) | (slope > LOOSE))
-        found = ridge(problem, optimum, ~held)
-        count = len(found.points)
-        reach = np.clip(1.0 / np.maximum(slope, SMALLEST_REACH), SMALLEST_REACH, WIDEST_REACH)
-        data = np.where(held, 0.0, found.rows)
-        at_bound, wide = np.diag(1.0 / reach)[held], np.eye(len(held)) / WIDEST_REACH
-        rows = [data, found.bounds, *(np.tile(part, (count, 1, 1)) for part in (at_bound, wide))]
-        _, values, directions = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
-        root = np.swapaxes(directions, 1, 2) / values[:, None]
-        log_weight = found.height + np.linalg.slogdet(root)[1]
-        return cls(found.points, root, log_weight, held, np.zeros(count, int))
+    def of_modes(cls, parts: Sequence["Mixture"]) -> "Mixture":
+        """Mixtures about the modes of a posterior, by the masses that they have as weights."""
+        mode = np.repeat(np.arange(len(parts)), [len(part.centre) for part in parts])
+        joined = cls.joined(parts)
+        return replace(joined, mode=mode, log_weight=joined.log_weight - logsumexp(joined.log_weight))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Mixture"]) -> "Mixture":
+        """All components of several mixtures."""
+        return cls(**{name: np.concatenate([vars(part)[name] for part in parts]) for name in cls.__dataclass_fields__})
+
+    @classmethod
+    def fitted(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
+        """Fitted to samples (count, P) of a posterior, two at least, by expectation and maximisation.
+
+        Each component counts as a few samples of its own, so that it keeps its full rank.
+        """
+        samples = positions[generator.permutation(len(positions))[:MOST_SAMPLES]]  # of all walkers alike
+        dimension = samples.shape[1]
+        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
+        whole = directions * np.sqrt(np.maximum(values, NARROWEST**2))
+        white = np.linalg.solve(whole, samples.T).T
+        centres, nearest = _clusters(white, generator)
+        prior = whole @ np.atleast_2d(np.cov((white - centres[nearest]).T)) @ whole.T
+        count, own = len(centres), 2.0 + dimension
+        now = cls.students(centres @ whole.T, np.tile(_root(prior), (count, 1, 1)), np.full(count, -np.log(count)))
+        for _ in range(ITERATIONS):
+            parts = now.log_parts(samples)
+            share = np.exp(parts - logsumexp(parts, axis=0))
+            near = share * (DEGREES_OF_FREEDOM + dimension) / (DEGREES_OF_FREEDOM + now.squared_distance(samples))
+            centre = (near @ samples + own * now.centre) / (near.sum(axis=1) + own)[:, None]
+            away = samples - centre[:, None]
+            scatter = np.swapaxes(away * near[..., None], 1, 2) @ away
+            scale = (scatter + own * prior) / (share.sum(axis=1) + own)[:, None, None]
+            weight = share.sum(axis=1) + 1.0
+            now = cls.students(centre, _root(scale), np.log(weight / weight.sum()))
+        return now
+
+    def beside(self, initial: "Mixture") -> "Mixture":
+        """This one with a share of `initial`, which knows of modes that may not have been visited."""
+        shares = zip((self, initial), (1.0 - INITIAL_SHARE, INITIAL_SHARE), strict=True)
+        return Mixture.joined([replace(one, log_weight=one.log_weight + np.log(share)) for one, share in shares])
+
+    @property
+    def best(self) -> "Mixture":
+        """The component about the best minimum."""
+        return Mixture(*(vars(self)[name][:1] for name in self.__dataclass_fields__))
 
     @property
     def mode_count(self) -> int:
-        """How many modes the posterior has, as far as it is known."""
-        return int(self.modes.max()) + 1
+        """How many modes the posterior has, as far as the fit knows."""
+        return int(self.mode.max()) + 1
 
     def mode_of(self, positions: Floats) -> NDArray[np.int64]:
-        """Which mode each of unconstrained `positions` (count, P) belongs to, (count,)."""
-        return self.modes[np.argmax(self._log_parts(expit(positions)), axis=0)]
-
-    def _holds(self, unit: Floats) -> bool:
-        """Whether a point (P,) of the box lies so close to a component that it is no mode of its own."""
-        away = np.linalg.solve(self.root, (unit - self.centre)[..., None])[..., 0]
-        return bool(np.min(np.linalg.norm(away, axis=1)) < APART)
-
-    def _normalised(self) -> "Mixture":
-        return replace(self, log_weight=self.log_weight - logsumexp(self.log_weight))
-
-    @classmethod
-    def through(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
-        """The mixture fitted to samples (count, P) of a posterior, two at least; any may be there repeatedly."""
-        samples = expit(positions)
-        values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
-        root = directions * np.sqrt(np.maximum(values, SMALLEST_REACH**2))
-        white = np.linalg.solve(root, samples.T).T
-        centres, nearest = _clusters(white, generator)
-        within = _root(np.atleast_2d(np.cov((white - centres[nearest]).T)))
-        log_weight = np.full(len(centres), -np.log(len(centres)))
-        roots = np.tile(root @ within, (len(centres), 1, 1))
-        dimension = white.shape[1]
-        mixture = cls(centres @ root.T, roots, log_weight, np.zeros(dimension, bool), np.zeros(len(centres), int))
-        return mixture.refined(positions)
-
-    def arrays(self, prefix: str = MIXTURE) -> dict[str, Any]:
-        """What `from_arrays` makes it of, named apart from what else a chain keeps of its moves."""
-        return {f"{prefix}{field.name}": getattr(self, field.name) for field in fields(self)}
-
-    @classmethod
-    def within(cls, arrays: dict[str, Any], prefix: str = MIXTURE) -> bool:
-        """Whether a mixture's `arrays` are among these."""
-        return f"{prefix}centre" in arrays
-
-    @classmethod
-    def from_arrays(cls, arrays: dict[str, Any], prefix: str = MIXTURE) -> "Mixture":
-        """The mixture of these `arrays`."""
-        # of a chain that was begun before there were several modes
-        one = {f"{prefix}modes": np.zeros(len(arrays[f"{prefix}log_weight"]), int)}
-        return cls(*(np.asarray((one | arrays)[f"{prefix}{field.name}"]) for field in fields(cls)))
-
-    def leaps(self) -> "Leaps":
-        """The mixture in JAX; none of its parameters is held at a bound."""
-        assert not self.held.any()
-        dimension = self.centre.shape[1]
-        level = self.log_weight - np.linalg.slogdet(self.root)[1] + student_peak(dimension)
-        parts = self.centre, self.root, np.linalg.inv(self.root), self.log_weight, level
-        return Leaps(*(jnp.asarray(part) for part in parts))
-
-    def refined(self, positions: Floats) -> "Mixture":
-        """The mixture fitted to samples (count, P) of the posterior, with a share of what it was.
-
-        By expectation and maximisation; every component counts as samples of its own, so that it keeps its full rank.
-        """
-        samples = expit(positions[:: -(-len(positions) // MOST_SAMPLES)])
-        dimension = samples.shape[1]
-        prior = self.root @ np.swapaxes(self.root, 1, 2)
-        now = self
-        for _ in range(REFINEMENTS):
-            parts = now._log_parts(samples)
-            share = np.exp(parts - logsumexp(parts, axis=0))
-            count = share.sum(axis=1)
-            centre = (share @ samples + OWN_SAMPLES * self.centre) / (count + OWN_SAMPLES)[:, None]
-            centre[:, self.held] = self.centre[:, self.held]
-            away, moved = samples - centre[:, None], (self.centre - centre)[:, :, None]
-            scatter = np.einsum("mn,mni,mnj->mij", share, away, away) + OWN_SAMPLES * moved * np.swapaxes(moved, 1, 2)
-            own = OWN_SAMPLES + dimension
-            covariance = (scatter + own * prior) / (count + own)[:, None, None]
-            covariance *= np.where(self.held[:, None] | self.held, np.eye(dimension), 1.0)
-            log_weight = np.log((count + 1.0) / (count + 1.0).sum())
-            now = Mixture(centre, _root(covariance), log_weight, self.held, self.modes)
-        centres, roots = np.concatenate([now.centre, self.centre]), np.concatenate([now.root, self.root])
-        weights = np.concatenate([np.log1p(-KEPT) + now.log_weight, np.log(KEPT) + self.log_weight])
-        return Mixture(centres, roots, weights, self.held, np.concatenate([self.modes, self.modes]))
-
-    def mean_log_density(self, positions: Floats) -> float:
-        """Mean log-density over samples of the posterior: the higher, the closer the mixture is to it."""
-        return float(np.mean(self.log_density(positions)))
+        """Which mode each of `positions` (count, P) belongs to, (count,)."""
+        return self.mode[np.argmax(self.log_parts(positions), axis=0)]
 
     def log_density(self, positions: Floats) -> Floats:
-        """Log-density at unconstrained `positions` (count, P); what is drawn outside the box counts in its integral."""
-        units = expit(positions)
-        stretch = np.sum(stats.logistic.logpdf(positions), axis=1)  # d box / d log-odds
-        return logsumexp(self._log_parts(units), axis=0) + np.log(2.0) * np.sum(self.held) + stretch
+        """Log-density, (count,), at unconstrained `positions` (count, P)."""
+        return np.asarray(logsumexp(self.log_parts(positions), axis=0))
 
     def draw(self, generator: np.random.RandomState, count: int, shrink: float = 1.0) -> Floats:
-        """(count, P) independent draws inside the box, `shrink` times closer to points of the ridge."""
-        drawn = np.empty((0, len(self.held)))
-        while len(drawn) < count:
-            more = self._draw(generator, count, shrink)
-            drawn = np.concatenate([drawn, more[_inside(more)]])
-        return logit(drawn[:count])
-
-    def draw_all(self, generator: np.random.RandomState, count: int) -> tuple[Floats, NDArray[np.bool_]]:
-        """(count, P) independent draws, and which of them, (count,), lie inside the box; the others mean nothing."""
-        drawn = self._draw(generator, count, 1.0)
-        inside = _inside(drawn)
-        return logit(np.where(inside[:, None], drawn, 0.5)), inside
+        """(count, P) independent draws, `shrink` times closer to the centre of their component."""
+        chances = np.exp(self.log_weight - logsumexp(self.log_weight))
+        which = generator.choice(len(chances), count, p=chances)
+        normal = generator.standard_normal((count, self.centre.shape[1]))
+        heavy = normal * np.sqrt(DEGREES_OF_FREEDOM / generator.chisquare(DEGREES_OF_FREEDOM, (count, 1)))
+        drawn = self.centre[which] + shrink * np.einsum("nij,nj->ni", self.root[which], heavy)
+        mean = self.distance[which]
+        distance = -mean * np.log1p(generator.random_sample(mean.shape) * np.expm1(-1.0 / mean))
+        log_odds = logit(np.clip(shrink * distance, INSIDE, 1.0 - INSIDE))
+        return np.where(self.at_bound[which], np.where(self.centre[which] < 0.0, log_odds, -log_odds), drawn)
 
     def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
         """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
-        drawn = self._draw(generator, len(positions), 1.0)
-        inside = _inside(drawn)
-        proposed = positions.copy()
-        proposed[inside] = logit(drawn[inside])
-        ratio = self.log_density(positions) - self.log_density(proposed)
-        return proposed, np.where(inside, ratio, -np.inf)
+        drawn = self.draw(generator, len(positions))
+        return drawn, self.log_density(positions) - self.log_density(drawn)
 
-    def _draw(self, generator: np.random.RandomState, count: int, shrink: float) -> Floats:
-        which = generator.choice(len(self.centre), count, p=np.exp(self.log_weight))
-        away = np.einsum("nij,nj->ni", self.root[which], student_draws(generator, count, len(self.held)))
-        bound = np.where(self.centre[which] < 0.5, 1.0, -1.0)
-        away = np.where(self.held, bound * np.abs(away), away)
-        return self.centre[which] + shrink * away
+    def log_parts(self, positions: Floats) -> Floats:
+        """What every component adds to the density, as logarithms, (M, count)."""
+        power, level = self._of_components
+        found = level[:, None] - power[:, None] * np.log1p(self.squared_distance(positions) / DEGREES_OF_FREEDOM)
+        if self.at_bound.any():
+            mean = self.distance[:, None]
+            log_odds = np.where(self.centre[:, None] < 0.0, positions, -positions)
+            exponential = -expit(log_odds) / mean - np.log(-mean * np.expm1(-1.0 / mean))
+            held = exponential + stats.logistic.logpdf(log_odds)  # d distance / d log-odds
+            found = found + np.sum(np.where(self.at_bound[:, None], held, 0.0), axis=-1)
+        return found
 
-    def _log_parts(self, units: Floats) -> Floats:
-        """What every component adds to the log-density in the box, unfolded, (M, count)."""
-        parts = zip(self.log_weight, self.centre, self.root, strict=True)
-        return np.stack([weight + student(centre, root, units) for weight, centre, root in parts])
+    def squared_distance(self, positions: Floats) -> Floats:
+        """From every centre in units of its scale matrix, (M, count); parameters at a bound do not count."""
+        away = np.where(self.at_bound[:, None], 0.0, positions - self.centre[:, None])
+        return np.sum((away @ np.swapaxes(self._inverse, 1, 2)) ** 2, axis=-1)
 
+    @cached_property
+    def _inverse(self) -> Floats:
+        return np.asarray(np.linalg.inv(self._full_root), float)
 
-class Leaps(NamedTuple):
-    """A `Mixture` for programs: inverse of its roots, and level: what a component adds to the log-density's peak."""
+    @property
+    def _full_root(self) -> Floats:
+        return self.root + self.at_bound[:, None] * np.eye(self.centre.shape[1])
 
-    centre: Array
-    root: Array
-    inverse: Array
-    log_weight: Array
-    level: Array
+    @cached_property
+    def _of_components(self) -> tuple[Floats, Floats]:
+        """The power of every Student-t, and the logarithm of its height, (M,) each."""
+        dimension = np.sum(~self.at_bound, axis=1)
+        power = 0.5 * (DEGREES_OF_FREEDOM + dimension)
+        peak = gammaln(power) - gammaln(0.5 * DEGREES_OF_FREEDOM) - 0.5 * dimension * np.log(DEGREES_OF_FREEDOM * np.pi)
+        return power, self.log_weight + peak - np.linalg.slogdet(self._full_root)[1]
 
-    def log_density(self, position: Array) -> Array:
-        """Log-density at an unconstrained position (P,)."""
-        white = jnp.einsum("mij,mj->mi", self.inverse, jax.nn.sigmoid(position) - self.centre)
-        freedom = 0.5 * (DEGREES_OF_FREEDOM + position.shape[0])
-        parts = self.level - freedom * jnp.log1p(jnp.sum(white**2, axis=1) / DEGREES_OF_FREEDOM)
-        return jax.nn.logsumexp(parts) + jnp.sum(jax.nn.log_sigmoid(position) + jax.nn.log_sigmoid(-position))
-
-    def draw(self, key: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
-        """Independent draws (*shape, P), unconstrained, and whether they are inside the box (*shape)."""
-        of_components, of_normals, of_widths = jax.random.split(key, 3)
-        which = jax.random.categorical(of_components, self.log_weight, shape=shape)
-        normal = jax.random.normal(of_normals, (*shape, self.centre.shape[1]), self.centre.dtype)
-        squares = jax.random.normal(of_widths, (*shape, int(DEGREES_OF_FREEDOM)), normal.dtype) ** 2
-        normal /= jnp.sqrt(jnp.mean(squares, axis=-1, keepdims=True))
-        unit = self.centre[which] + jnp.einsum("...ij,...j->...i", self.root[which], normal)
-        inside = jnp.all((unit > 0.0) & (unit < 1.0), axis=-1)
-        return jax.scipy.special.logit(jnp.where(inside[..., None], unit, 0.5)), inside
+    def record(self) -> dict[str, Any]:
+        """Its arrays by name, as a store keeps them."""
+        return {name: np.ascontiguousarray(array) for name, array in asdict(self).items()}
 
 
 def _clusters(points: Floats, generator: np.random.RandomState) -> tuple[Floats, NDArray[np.int_]]:
@@ -264,13 +179,11 @@ def _clusters(points: Floats, generator: np.random.RandomState) -> tuple[Floats,
 
 
 def _root(covariance: Floats) -> Floats:
-    """Roots (..., P, P) of covariances, of full rank however little rounding has left of it."""
+    """Roots (..., P, P) of covariances, of full rank however little rounding has left of them."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.maximum(variance, SMALLEST_REACH**2))
+    scale = np.sqrt(np.maximum(variance, NARROWEST**2))
     scaled = covariance / (scale[..., None] * scale[..., None, :])
     short = 1.0 - variance / scale**2  # of a unit, where there is next to no variance
-    return scale[..., None] * np.linalg.cholesky(scaled + (short + LEAST)[..., None] * np.eye(scaled.shape[-1]))
-
-
-def _inside(units: Floats) -> NDArray[np.bool_]:
-    return np.all((units > 0.0) & (units < 1.0), axis=1)
+    return scale[..., None] * np.linalg.cholesky(
+        scaled + (short + SMALLEST_VARIANCE)[..., None] * np.eye(scaled.shape[-1])
+    )

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import jax
 import jax.numpy as jnp
@@ -16,24 +16,18 @@ from fits._lazy import shown_by
 from fits.optimise.result import Fit
 from fits.problem.discrepancy.logarithm import logarithm
 from fits.problem.model import Model
-from fits.sampling.chain import MemoryChain
-from fits.sampling.convergence import (
-    BURN_IN,
-    LONG_ENOUGH,
-    MIXED,
-    autocorrelation_times,
-    long_enough,
-    r_hat,
-)
-from fits.sampling.mixture import MODES, Mixture
+from fits.sampling.chain import Chain
+from fits.sampling.convergence import Convergence, after_burn_in
+from fits.sampling.mixture import Mixture
+from fits.sampling.options import SamplerOptions
 from layerjax._checks import require_kind
 
 if TYPE_CHECKING:
     from arviz import InferenceData
 
 REPORTED_DRAWS = 2048
-LOOKED_AT = 1000
-"""Steps of a chain by which shares of modes are told."""
+MODE_STEPS = 1000
+"""Steps of a chain by which shares of modes are estimated."""
 
 Floats = NDArray[np.float64]
 
@@ -55,15 +49,16 @@ class Posterior:
     Attributes:
         chain: (steps, walkers, P), physical values, from the start on.
         log_probability: (steps, walkers), of the unconstrained coordinates, not normalised.
-        autocorrelation_time: (P,), in steps, of the chain without its first tenth.
+        autocorrelation_time: (P,), in steps, of the chain without its burn-in.
         acceptance: mean share of proposals taken; of NUTS, of steps that moved.
-        converged: the chain without its first tenth is longer than 50 autocorrelation times of every parameter,
-            and R-hat is below 1.05.
+        converged: without its burn-in the chain is as long as `options` ask for in autocorrelation times of every
+            parameter, and R-hat as near to 1.
         allow_unconverged: estimates may be had from a chain that has not converged.
         status: what is to be said of the sampler, if anything.
-        divergences: steps of NUTS that lost their way, where the posterior is too narrow for them.
+        divergences: trajectories of NUTS, after its warm-up, whose energy diverged.
         modes: where the fit knows several minima that hold a share of the posterior: these, the largest share first.
             Estimates are of all of them together. Empty where one is known.
+        options: that it was sampled with.
     """
 
     fit: Fit
@@ -76,6 +71,7 @@ class Posterior:
     status: str = ""
     divergences: int = 0
     modes: tuple[Mode, ...] = ()
+    options: SamplerOptions = field(default_factory=SamplerOptions)
 
     def __repr__(self) -> str:
         steps, walkers = self.chain.shape[:2]
@@ -104,8 +100,8 @@ class Posterior:
 
     @property
     def burn_in(self) -> int:
-        """Steps left out at the start: a tenth of the chain."""
-        return len(self.chain) // BURN_IN
+        """Steps left out at the start."""
+        return len(self.chain) - len(after_burn_in(self.chain, self.options))
 
     @property
     def thin(self) -> int:
@@ -113,22 +109,26 @@ class Posterior:
         shortest = float(np.min(self.autocorrelation_time))
         return max(1, int(shortest / 2)) if math.isfinite(shortest) else 1
 
+    @cached_property
+    def convergence(self) -> Convergence:
+        """Effective sample size, autocorrelation time and R-hat of each parameter."""
+        return Convergence.of(self.chain, self.options)
+
     @property
     def effective_samples(self) -> Floats:
-        """Effective number of independent samples of each parameter, (P,)."""
-        return (len(self.chain) - self.burn_in) * self.chain.shape[1] / self.autocorrelation_time
+        """Effective sample size of each parameter, (P,): the smaller one of bulk and tail, by ArviZ."""
+        return self.convergence.ess
 
-    @cached_property
+    @property
     def r_hat(self) -> Floats:
-        """Rank-normalised split R-hat of each parameter, (P,): 1 where all walkers tell the same, above 1.01 where some
-        do not yet, or stay in modes of their own."""
-        return r_hat(self.chain)
+        """Rank-normalised R-hat between halves of groups of walkers, of each parameter, (P,)."""
+        return self.convergence.r_hat
 
     @cached_property
     def samples(self) -> Floats:
         """Thinned samples after the burn-in, (S, P), in physical units."""
         self._require_converged()
-        return self.chain[self.burn_in :: self.thin].reshape(-1, len(self.names))
+        return after_burn_in(self.chain, self.options)[:: self.thin].reshape(-1, len(self.names))
 
     def summary(self) -> dict[str, tuple[float, float, float, float, float]]:
         """For each parameter: median, ends of the central 68 % interval, mean, standard deviation.
@@ -136,7 +136,7 @@ class Posterior:
         Raises ValueError for a chain that has not converged, unless it was sampled with `allow_unconverged`.
         """
         self._require_converged()
-        kept = self.chain[self.burn_in :].reshape(-1, len(self.names))
+        kept = after_burn_in(self.chain, self.options).reshape(-1, len(self.names))
         median, low, high = np.quantile(kept, [0.5, 0.158655, 0.841345], axis=0)
         columns = (median, low, high, kept.mean(axis=0), kept.std(axis=0))
         return {
@@ -155,11 +155,12 @@ class Posterior:
         self.fit.require_one("inference_data")
         self._require_converged()
         import arviz
+        from xarray import Dataset, DataTree
 
-        steps, walkers, count = self.chain[self.burn_in :].shape
+        kept = after_burn_in(self.chain, self.options)
+        steps, walkers, count = kept.shape
         draws = min(max(REPORTED_DRAWS // walkers, 1), steps)
-        picked = np.linspace(0, steps - 1, draws).astype(int)
-        chosen = np.swapaxes(self.chain[self.burn_in :][picked], 0, 1)
+        chosen = np.swapaxes(kept[np.linspace(0, steps - 1, draws).astype(int)], 0, 1)
         problem, generator = self.fit.problem, np.random.default_rng(0)
         shape, process = (walkers, draws, *problem.model.values.shape), problem.model.process
         white = generator.standard_normal((walkers * draws, shape[-1], 0 if process is None else len(process.where)))
@@ -168,60 +169,63 @@ class Posterior:
         freedom = problem.noise.degrees_of_freedom
         noise = generator.standard_t(freedom, shape) if student else generator.standard_normal(shape)
         simulated = np.asarray(expected).reshape(shape) + np.asarray(sigma).reshape(shape) * noise
-        return arviz.from_dict(
-            posterior={name: chosen[..., index] for index, name in enumerate(self.names)},
-            log_likelihood={"value": np.asarray(density).reshape(shape)},
-            posterior_predictive={"value": simulated},
-            observed_data={"value": np.asarray(problem.model.values)},
-            dims={"value": ["sample", "channel"]},
-            coords={"channel": list(problem.data.channels)},
-        )
+        draw, datum = ("chain", "draw"), ("sample", "channel")
+        at_draws = {"chain": np.arange(walkers), "draw": np.arange(draws)}
+        at = {"sample": np.arange(shape[2]), "channel": list(problem.data.channels)}
+        groups = {
+            "posterior": Dataset({name: (draw, chosen[..., place]) for place, name in enumerate(self.names)}, at_draws),
+            "log_likelihood": Dataset({"value": (draw + datum, np.asarray(density).reshape(shape))}, at_draws | at),
+            "posterior_predictive": Dataset({"value": (draw + datum, simulated)}, at_draws | at),
+            "observed_data": Dataset({"value": (datum, np.asarray(problem.model.values))}, at),
+        }
+        tree, old = DataTree.from_dict(groups), hasattr(arviz, "InferenceData")  # which is a tree from ArviZ 1.0 on
+        return cast("InferenceData", arviz.InferenceData.from_datatree(tree) if old else tree)
 
     def _require_converged(self) -> None:
         if self.converged or self.allow_unconverged:
             return
         raise ValueError(
             f"the chain of {len(self.chain)} steps is too short to report from: its longest autocorrelation time is "
-            f"{np.max(self.autocorrelation_time):.0f} steps, and {LONG_ENOUGH:.0f} of them after burn-in are needed, "
-            f"with R-hat below {MIXED:g} (it is {np.max(self.r_hat):.3g}); sample again with "
-            "the same path and a larger max_steps to go on, or with allow_unconverged=True"
+            f"{np.max(self.autocorrelation_time):.0f} steps, and {self.options.autocorrelation_times:g} of them after "
+            f"burn-in are needed, with R-hat of at most {self.options.r_hat:g} (it is {np.max(self.r_hat):.3g}); "
+            "sample again with the same path and a larger max_steps to go on, or with allow_unconverged=True"
         )
 
 
-def posterior_of(fit: Fit, chain: MemoryChain, allow_unconverged: bool = False) -> Posterior:
+def posterior_of(fit: Fit, chain: Chain, allow_unconverged: bool = False) -> Posterior:
     """What a chain of a fit's posterior says."""
-    positions, moves = chain.get_chain(), chain.moves
-    count = positions.shape[-1]
+    positions, options = chain.steps(), SamplerOptions(**chain.options)
+    count, nuts = positions.shape[-1], "metrics" in chain.moves
     values = np.asarray(fit.problem.call(_constrained, positions.reshape(-1, count))).reshape(positions.shape)
-    taken = float(np.mean(chain.accepted) / chain.iteration)
-    divergences, words = 0, str(moves.get("words", ""))
-    if moves.get("sampler") == "nuts":
-        divergences = round((1.0 - taken) * positions[..., 0].size)  # what its records hold
+    taken, divergences, status = float(np.mean(chain.accepted) / chain.iteration), 0, ""
+    if nuts:  # whose records hold which steps did not diverge
+        divergences = round((1.0 - taken) * positions[..., 0].size)
         taken = float(np.mean(np.any(np.diff(positions, axis=0), axis=-1))) if len(positions) > 1 else 1.0
-        words = f"NUTS, {divergences} divergent steps of {positions[..., 0].size}"
-        words += ", near which it may have missed a part of the posterior" if divergences else ""
+        status = f"NUTS, {divergences} divergences in {positions[..., 0].size} steps after the warm-up"
+        status += ", near which it may have missed a part of the posterior" if divergences else ""
+    found = Convergence.of(positions, options)
     return Posterior(
         fit=fit,
         chain=values,
-        log_probability=chain.get_log_prob(),
-        autocorrelation_time=autocorrelation_times(chain, len(positions)),
+        log_probability=chain.log_prob[: chain.iteration],
+        autocorrelation_time=found.autocorrelation_time,
         acceptance=taken,
-        converged=long_enough(chain),
+        converged=found.is_converged(options),
         allow_unconverged=allow_unconverged,
-        status=words,
+        status=status,
         divergences=divergences,
-        modes=_modes(fit, moves, positions, values),
+        modes=_modes(fit, Mixture(**chain.moves["initial"]), positions, values, options),
+        options=options,
     )
 
 
-def _modes(fit: Fit, moves: dict[str, Any], positions: Floats, values: Floats) -> tuple[Mode, ...]:
-    """Where the samples are, if the chain was begun with several modes: positions and values (steps, walkers, P)."""
-    if not Mixture.within(moves, MODES):
+def _modes(fit: Fit, initial: Mixture, positions: Floats, values: Floats, options: SamplerOptions) -> tuple[Mode, ...]:
+    """Where the samples are, if the chain began with several modes: positions and values (steps, walkers, P)."""
+    if initial.mode_count == 1:
         return ()
-    kept = slice(len(positions) // BURN_IN, None, max(1, len(positions) // LOOKED_AT))
-    positions, values = positions[kept], values[kept]
-    which = Mixture.from_arrays(moves, MODES).mode_of(positions.reshape(-1, positions.shape[-1]))
-    which = which.reshape(positions.shape[:2])
+    every = max(1, len(positions) // MODE_STEPS)
+    positions, values = (after_burn_in(part, options)[::every] for part in (positions, values))
+    which = initial.mode_of(positions.reshape(-1, positions.shape[-1])).reshape(positions.shape[:2])
     found = []
     for mode in np.unique(which):
         shares, at = np.mean(which == mode, axis=0), values[which == mode].mean(axis=0)

@@ -29,12 +29,11 @@ Floats = NDArray[np.float64]
 class Ridge(NamedTuple):
     """Points of a ridge of a problem with P parameters, and what is known there.
 
-    points: (M, P), of the unit box. height: (M,), of the log-posterior. rows: (M, R, P), of information, in boxes^-1.
-    bounds: (M, D, P), more rows, which keep the D directions that are open from reaching beyond the next point.
+    points: (M, P), of the unit box. rows: (M, R, P), of information, in boxes^-1. bounds: (M, D, P), more rows, which
+    keep the D directions that are open from reaching beyond the next point.
     """
 
     points: Floats
-    height: Floats
     rows: Floats
     bounds: Floats
 
@@ -85,8 +84,7 @@ def ridge(problem: Problem, optimum: Floats, free: NDArray[np.bool_]) -> Ridge:
     bounds = np.zeros((len(found), dimension, len(optimum)))
     if dimension:
         bounds[:, :, free] = np.stack(tangents) / (_stretch(points[:, free])[:, None] * step)
-    heights = np.array([-known.cost for known in found])
-    return Ridge(points, heights, np.stack([known.rows for known in found]), bounds)
+    return Ridge(points, np.stack([known.rows for known in found]), bounds)
 
 
 def open_directions(rows: Floats) -> Floats:

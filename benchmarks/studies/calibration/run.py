@@ -144,20 +144,7 @@ def _work(settings: tuple[str, lj.Transport | None], index: int) -> Repeat:
 def run_repeat(index: int, case: Case, model: Callable[..., Any]) -> Repeat:
     """A truth from the prior, its data, fit and posterior, and its ranks; all of them drawn with `index`."""
     began = time.perf_counter()
-    generator = np.random.default_rng([2018, index])
-    truth = {name: drawn(free, generator) for name, free in case.free.items()}
-    own = {name: truth[name] for name in case.own}
-    data = fits.simulate(case.stack(own), case.readings, model, case.noise, FLOOR, seed=index)
-    data = replace(data, values=truth.get("scale", 1.0) * data.values)
-    if case.errors:
-        data = shared.with_errors(data, truth, generator)
-    # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
-    correlated = fits.Discrepancy(**shared.FREE) if case.errors else False
-    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, discrepancy=correlated)
-    scale = case.free["scale"] if case.scale else None
-    fit = fits.fit(
-        case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
-    )
+    truth, fit = _fitted(index, case, model)
     posterior = fits.sample(fit, walkers=_walkers(case), seed=index, max_steps=case.most_steps, allow_unconverged=True)
     draws, apart = spread_draws(posterior)
     return Repeat(
@@ -172,6 +159,30 @@ def run_repeat(index: int, case: Case, model: Callable[..., Any]) -> Repeat:
         converged=posterior.converged,
         seconds=time.perf_counter() - began,
     )
+
+
+def _fitted(index: int, case: Case, model: Callable[..., Any]) -> tuple[dict[str, float], fits.Fit]:
+    """A truth from the prior, and the fit of its data."""
+    generator = np.random.default_rng([2018, index])
+    truth = {name: drawn(free, generator) for name, free in case.free.items()}
+    own = {name: truth[name] for name in case.own}
+    data = fits.simulate(case.stack(own), case.readings, model, case.noise, FLOOR, seed=index)
+    data = replace(data, values=truth.get("scale", 1.0) * data.values)
+    if case.errors:
+        data = shared.with_errors(data, truth, generator)
+    # sigma is what the model says that it is: the data's own was made with the truth, which it would give away
+    correlated = fits.Discrepancy(**shared.FREE) if case.errors else False
+    noise = fits.Noise(relative=case.noise, floor=FLOOR, use_sigma=False, discrepancy=correlated)
+    scale = case.free["scale"] if case.scale else None
+    fit = fits.fit(
+        case.stack(case.own), data, transport=case.transport, noise=noise, scale=scale, starts=STARTS, seed=index
+    )
+    return truth, fit
+
+
+def fitted_case(posterior: str, index: int = 0) -> fits.Fit:
+    """The fit of a repeat."""
+    return _fitted(index, _case(posterior, None), _simulator(posterior, None))[1]
 
 
 def _walkers(case: Case) -> int:

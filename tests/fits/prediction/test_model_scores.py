@@ -1,6 +1,7 @@
 """Cross-validation, evidence and stacking weights, beside linear regression, where all of them are known."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.reports import tables
-from fits.sampling.mixture import Mixture
+from fits.sampling import initial
 from tests.helpers.models import line
 
 SIGMA = 0.05
@@ -100,8 +101,8 @@ def test_held_out_data_of_a_ridge_are_predicted(known: bool, monkeypatch: pytest
     stack, scale = {"a": Free(0.5, 0.0, 1.0), "b": 0.0}, Free(1.0, 0.1, 10.0, LogUniform())
     ridge_fit = fit(stack, level, transport=line, scale=scale, noise=Noise(discrepancy=False), starts=2)
     draws = posterior_draws(ridge_fit) if known else None
-    followed: list[Fit] = []
-    monkeypatch.setattr(Mixture, "of", lambda fit, of=Mixture.of: followed.append(fit) or of(fit))
+    followed: list[Any] = []
+    monkeypatch.setattr(initial, "ridge", lambda *given, ridge=initial.ridge: followed.append(given) or ridge(*given))
     left = cross_validate(ridge_fit, draws=2000, posterior=draws)
     assert len(followed) == (0 if known else 3)
     for rows in left.rows:

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import emcee
-import h5py
 import numpy as np
 import pytest
 from scipy import stats
@@ -17,11 +16,12 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.sampling import convergence as length
-from fits.sampling.chain import FileChain, MemoryChain
-from fits.sampling.ensemble import Ensemble, adapted
-from fits.sampling.laplace import Approximation
-from fits.sampling.sample import _walkers, identity_of, load, sample
+from fits.sampling.chain import Chain
+from fits.sampling.ensemble import proposals_of
+from fits.sampling.initial import initial_mixture
+from fits.sampling.options import SamplerOptions
+from fits.sampling.sample import load, sample, settings
+from fits.store import Store
 from tests.helpers.models import COUNT, LINE, design, line, line_data, line_fit, measured
 from tests.helpers.places import ROOT
 
@@ -52,8 +52,10 @@ def test_the_posterior_of_a_line_is_its_regression(result: Fit, posterior) -> No
 
 def test_it_stops_when_the_chain_is_long_enough(posterior) -> None:
     kept = len(posterior.chain) - posterior.burn_in
-    assert np.all(kept > 50 * posterior.autocorrelation_time)
-    assert len(posterior.chain) < 2000
+    assert np.all(kept >= 50 * posterior.autocorrelation_time)
+    assert np.all(posterior.effective_samples >= 1000.0)
+    assert np.all(posterior.r_hat <= 1.01)
+    assert len(posterior.chain) < 500
     assert 0.2 < posterior.acceptance < 1.0
     again = emcee.autocorr.integrated_time(posterior.chain[posterior.burn_in :], tol=0)
     np.testing.assert_allclose(posterior.autocorrelation_time, again, rtol=0.05)  # of log-odds and of values
@@ -63,26 +65,28 @@ def test_it_stops_when_the_chain_is_long_enough(posterior) -> None:
 def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, posterior, tmp_path: Path) -> None:
     """A chain goes on for more of them, to the same end as one that was asked for them at once, and is left as it is
     for fewer."""
-    path, notes = tmp_path / "chain.h5", []
+    path, shown = tmp_path / "chain", []
     sample(result, walkers=16, seed=1, path=path)
     wanted = 4.0 * posterior.effective_samples.min()
-    more = sample(result, walkers=16, seed=1, path=path, ess=wanted, progress=lambda *given: notes.append(given[-1]))
+    more = sample(result, walkers=16, seed=1, path=path, ess=wanted, progress=lambda *given: shown.append(given))
     assert more.effective_samples.min() >= wanted
     assert len(more.chain) < 6 * len(posterior.chain)
     np.testing.assert_array_equal(more.chain[: len(posterior.chain)], posterior.chain)
     np.testing.assert_array_equal(sample(result, walkers=16, seed=1, ess=wanted).chain, more.chain)
     assert len(sample(result, walkers=16, seed=1, path=path, ess=1.0).chain) == len(more.chain)
-    assert f"of {wanted:g} effective samples, needs" in notes[0]
-    assert notes[0].endswith("s left")
-    assert not notes[-1].endswith("left")
+    steps = [step for _, step, *_ in shown]
+    assert steps == [*range(len(posterior.chain) + 1, len(more.chain) + 1), len(more.chain)]
+    assert f"of {wanted:g} effective samples" in shown[0][3]
+    # the steps that are left: right within a factor of two, as far as whole checks tell
+    assert 0.5 < (shown[150][2] - steps[150]) / (len(more.chain) - steps[150]) < 2.0
 
 
-def test_a_slow_chain_is_told_of_between_its_checks(result: Fit, posterior, monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = []
-    monkeypatch.setattr(length, "PATIENCE", 0.0)
-    again = sample(result, walkers=16, seed=1, max_steps=120, progress=lambda *given: steps.append(given[1]))
-    assert steps == [*range(1, 101), 100, *range(101, 121), 120]
-    np.testing.assert_array_equal(again.chain, posterior.chain[:120])
+def test_options_are_kept_with_the_chain(result: Fit, tmp_path: Path) -> None:
+    options = SamplerOptions(ess=100.0, autocorrelation_times=10.0, r_hat=1.1, walkers=8, burn_in=0.25)
+    posterior = sample(result, options=options, path=tmp_path / "chain")
+    assert posterior.options == options
+    assert posterior.burn_in == len(posterior.chain) // 4
+    assert load(result, tmp_path / "chain").options == options
 
 
 def test_the_same_seed_gives_the_same_chain_whatever_numpys_global_state(result: Fit, posterior) -> None:
@@ -110,20 +114,16 @@ def test_a_parameter_on_its_bound_has_a_truncated_posterior() -> None:
     assert [median, lower, upper] == pytest.approx(law.ppf([0.5, 0.158655, 0.841345]), abs=2 * error * law.std())
 
 
-@pytest.mark.parametrize("offset", [0.0, 6.0])
-def test_the_approximation_is_learned_where_the_fits_own_is_poor(result: Fit, offset: float) -> None:
-    """Samples of the fit's own approximation leave it in use; a Gaussian elsewhere is learned, to 1 / sqrt(samples)."""
-    own = Approximation.of(result)
-    generator = np.random.RandomState(0)
-    law = stats.multivariate_normal(own.centre + offset, [[0.5, 0.3], [0.3, 0.4]])
-    positions = law.rvs(1600, random_state=generator) if offset else own.draw(generator, 1600)
-    chain = MemoryChain(16, 2)
-    chain.chain, chain.iteration = positions.reshape(100, 16, 2), 100
-    chosen = adapted(chain, own)
-    assert (chosen is own) == (offset == 0.0)
-    if offset:
-        np.testing.assert_allclose(chosen.centre, law.mean, atol=5 * np.sqrt(0.5 / 800))
-        np.testing.assert_allclose(chosen.root @ chosen.root.T, law.cov, atol=5 * 0.5 * np.sqrt(2 / 800))
+def test_proposals_are_learned_from_the_chain(result: Fit) -> None:
+    """A Gaussian far from the fit's own approximation, which keeps a share of them."""
+    initial, generator = initial_mixture(result), np.random.RandomState(0)
+    law = stats.multivariate_normal(initial.centre[0] + 6.0, [[0.5, 0.3], [0.3, 0.4]])
+    chain = Chain(16, 2)
+    chain.decide({"initial": initial.record()})
+    chain.chain, chain.iteration = law.rvs(1600, random_state=generator).reshape(100, 16, 2), 100
+    learned, fresh = proposals_of(chain), law.rvs(4000, random_state=generator)
+    assert 0.0 < np.mean(law.logpdf(fresh) - learned.log_density(fresh)) < 0.4
+    assert np.mean(initial.log_density(learned.draw(generator, 1000)) > -20.0) == pytest.approx(0.1, abs=0.05)
 
 
 def test_parameters_tied_together_on_one_bound() -> None:
@@ -153,53 +153,23 @@ def test_parameters_tied_together_on_one_bound() -> None:
 
 
 def test_a_short_chain_reports_nothing_unless_told_to(result: Fit, tmp_path: Path) -> None:
-    short = sample(result, walkers=16, seed=1, max_steps=100, path=tmp_path / "chain.h5")
+    short = sample(result, walkers=16, seed=1, max_steps=100, path=tmp_path / "chain")
     assert not short.converged
     with pytest.raises(ValueError, match=r"chain of 100 steps is too short.*autocorrelation time.*larger max_steps"):
         short.summary()
     with pytest.raises(ValueError, match="too short"):
         _ = short.inference_data
-    told = load(result, tmp_path / "chain.h5", allow_unconverged=True)
+    told = load(result, tmp_path / "chain", allow_unconverged=True)
     assert set(told.summary()) == set(short.names)
 
 
 def test_a_longer_limit_goes_on_to_the_same_end(result: Fit, posterior, tmp_path: Path) -> None:
-    path = tmp_path / "chain.h5"
+    path = tmp_path / "chain"
     sample(result, walkers=16, seed=1, max_steps=150, path=path)
     whole = sample(result, walkers=16, seed=1, path=path)
     np.testing.assert_array_equal(whole.chain, posterior.chain)
     assert whole.summary() == posterior.summary()
-    backend = emcee.backends.HDFBackend(path, read_only=True)
-    assert backend.iteration == len(whole.chain)
-    np.testing.assert_array_equal(backend.get_log_prob(), whole.log_probability)
-    assert not path.with_suffix(".journal").exists()
-
-
-def test_a_torn_journal_costs_one_step(result: Fit, posterior, tmp_path: Path) -> None:
-    """The last record cut off and another one damaged: what comes before them is kept."""
-
-    class Stop(Exception):
-        pass
-
-    path = tmp_path / "chain.h5"
-
-    def stop(stage, done, total, info):
-        raise Stop
-
-    with pytest.raises(Stop):
-        sample(result, walkers=16, seed=1, path=path, progress=stop)
-    chain = FileChain(path, 16, 2, identity_of(result.problem, 16, 1))
-    Ensemble(result, chain, 1).sampler().run_mcmc(chain.get_last_sample(), 7, skip_initial_state_check=True)
-    chain.close()
-    journal = path.with_suffix(".journal")
-    whole = journal.read_bytes()
-    journal.write_bytes(whole[:-5])
-    torn = load(result, path)
-    assert len(torn.chain) == 106
-    np.testing.assert_array_equal(torn.chain, posterior.chain[:106])
-    journal.write_bytes(whole[: len(whole) // 2] + b"\x00" + whole[len(whole) // 2 + 1 :])
-    assert len(load(result, path).chain) == 103
-    assert sample(result, walkers=16, seed=1, path=path).summary() == posterior.summary()
+    assert [entry.name for entry in tmp_path.iterdir()] == ["chain"]
 
 
 SCRIPT = """
@@ -218,7 +188,7 @@ np.save(sys.argv[2], posterior.chain)
 
 
 def test_killed_at_any_moment_it_ends_with_the_same_summary(result: Fit, posterior, tmp_path: Path) -> None:
-    path, saved = tmp_path / "chain.h5", tmp_path / "chain.npy"
+    path, saved = tmp_path / "chain", tmp_path / "chain.npy"
     root = ROOT
     command = [sys.executable, "-c", SCRIPT, str(path), str(saved)]
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
@@ -233,7 +203,7 @@ def test_killed_at_any_moment_it_ends_with_the_same_summary(result: Fit, posteri
                 assert process.wait() == 0
                 break
             while process.poll() is None and _stored_steps(path) <= kept:
-                time.sleep(0.001)
+                time.sleep(0.01)
             time.sleep(generator.uniform(0.0, 0.1))
             process.send_signal(signal.SIGKILL)
         kills, before, kept = kills + 1, kept, _stored_steps(path)
@@ -245,45 +215,27 @@ def test_killed_at_any_moment_it_ends_with_the_same_summary(result: Fit, posteri
 
 
 def _stored_steps(path: Path) -> int:
-    """Steps in the file and whole records in its journal, by arithmetic rather than by the code under test."""
-    if not path.exists():
-        return 0
-    with h5py.File(path) as file:
-        steps = int(file["mcmc"].attrs["iteration"])
-    journal = path.with_suffix(".journal")
-    record = 8 + 8 + 16 * 2 * 8 + 16 * 8 + 16 + 624 * 4 + 8 + 8 + 8 + 4
-    content = journal.read_bytes() if journal.exists() else b""
-    last = len(content) // record - 1
-    return max(steps, int.from_bytes(content[last * record + 8 :][:8], "little")) if last >= 0 else steps
+    return sum(len(block["coords"]) for block in Store.read(path).all("steps")) if path.exists() else 0
 
 
 def test_a_chain_of_something_else_is_refused(result: Fit, tmp_path: Path) -> None:
-    path = tmp_path / "chain.h5"
+    path = tmp_path / "chain"
     sample(result, walkers=16, seed=1, max_steps=100, path=path)
-    with pytest.raises(ValueError, match=r"another problem or setting \(posterior differs\)"):
+    with pytest.raises(ValueError, match=r"another problem \(posterior\)"):
         sample(line_fit(seed=5), walkers=16, seed=1, path=path)
-    with pytest.raises(ValueError, match=r"\(seed differs\)"):
+    with pytest.raises(ValueError, match=r"\(seed 1, not 2\)"):
         sample(result, walkers=16, seed=2, path=path)
-    with pytest.raises(ValueError, match=r"\(walkers differs\)"):
+    with pytest.raises(ValueError, match=r"\(walkers 16, not 18\)"):
         sample(result, walkers=18, seed=1, path=path)
     fresh = sample(line_fit(seed=5), walkers=16, seed=2, path=path, resume=False, max_steps=100)
     assert len(fresh.chain) == 100
-    path.write_bytes(b"not HDF5")
-    with pytest.raises(ValueError, match="is not a chain of layerjax"):
+    path.write_bytes(b"not SQLite")
+    with pytest.raises(ValueError, match="no store of this version"):
         sample(result, walkers=16, seed=1, path=path)
-
-
-@pytest.mark.parametrize(("one", "other"), [("chain_0.1", "chain_0.2"), ("chain", "chain.1")])
-def test_chains_whose_names_differ_after_a_dot_have_nothing_in_common(one: str, other: str, tmp_path: Path) -> None:
-    first, second = (FileChain(tmp_path / name, 4, 1, {}) for name in (one, other))
-    assert {path.name for path in tmp_path.glob("*.journal")} == {f"{one}.journal", f"{other}.journal"}
-    first.close()
-    second.close()
 
 
 def test_inference_data(result: Fit, posterior) -> None:
     data = posterior.inference_data
-    assert set(data.groups()) == {"posterior", "log_likelihood", "posterior_predictive", "observed_data"}
     a, b = (data.posterior[name].to_numpy() for name in ("['a']", "['b']"))
     predicted = a[..., None, None] + b[..., None, None] * design(COUNT)[:, 1:]
     expected = stats.norm.logpdf(result.problem.data.values, predicted, 0.05)
@@ -319,9 +271,8 @@ def test_refused(result: Fit, options: dict, message: str) -> None:
 
 
 def test_there_are_enough_walkers_for_many_parameters() -> None:
-    assert _walkers("emcee", None, 3) == 32
-    assert _walkers("emcee", None, 20) == 42
-    assert _walkers("nuts", None, 20) == 4
+    assert [settings(count, "emcee").walkers for count in (3, 20)] == [32, 42]
+    assert settings(20, "nuts").walkers == 4
 
 
 def test_a_named_objective_has_no_posterior() -> None:

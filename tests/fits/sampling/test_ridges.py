@@ -9,7 +9,6 @@ from scipy import stats
 import layerjax as lj
 from fits.optimise.fit import fit
 from fits.problem.parameters import Free, LogUniform
-from fits.sampling.ridge import ridge
 from fits.sampling.sample import sample
 from tests.helpers.models import directions, measured
 
@@ -51,8 +50,8 @@ def test_albedo_times_scale(seed):
 
 
 @pytest.mark.slow
-def test_trajectories_leap_along_it_and_go_on_from_their_file(tmp_path):
-    """By NUTS, from end to end within steps: correlation goes with the leaps that are taken, not with the length."""
+def test_trajectories_jump_along_it_and_go_on_from_their_file(tmp_path):
+    """By NUTS, from end to end within steps: correlation goes with the jumps that are taken, not with the length."""
     pytest.importorskip("blackjax")
     fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
     how = {"sampler": "nuts", "seed": 0, "allow_unconverged": True}
@@ -60,9 +59,9 @@ def test_trajectories_leap_along_it_and_go_on_from_their_file(tmp_path):
     levels = LEVEL / 10.0 + (1.0 - LEVEL / 10.0) * np.array([0.1, 0.3, 0.5, 0.7, 0.9])
     found, error = shares_below(posterior, "base.albedo", levels)
     np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
-    assert posterior.effective_samples.min() > 200  # of 2,400 steps; without leaps chains stay about where they began
-    sample(fitted, **how, max_steps=200, path=tmp_path / "chain.h5")
-    longer = sample(fitted, **how, max_steps=600, path=tmp_path / "chain.h5")
+    assert posterior.effective_samples.min() > 200  # of 2,400 steps; without jumps chains stay about where they began
+    sample(fitted, **how, max_steps=200, path=tmp_path / "chain")
+    longer = sample(fitted, **how, max_steps=600, path=tmp_path / "chain")
     np.testing.assert_array_equal(longer.chain, posterior.chain)
 
 
@@ -90,44 +89,3 @@ def test_haze_and_albedo_times_scale(seed):
         levels = np.interp([0.1, 0.3, 0.5, 0.7, 0.9], below, grid + 0.5 * (grid[1] - grid[0]))
         found, error = shares_below(posterior, name, levels)
         np.testing.assert_allclose(found, [0.1, 0.3, 0.5, 0.7, 0.9], atol=4 * 0.5 * error + 0.005)
-
-
-def test_a_ridge_is_followed_from_end_to_end():
-    """albedo * scale is the same at every point, and no two neighbours are far apart: in albedo it starts at 0.05."""
-    fitted = fit(PAINT, paint(0), scale=SCALE, transport=lj.SingleScattering(), starts=2)
-    unit = np.asarray(fitted.problem.model.box.to_unit(jnp.asarray(fitted.vector)), float)
-    points = ridge(fitted.problem, unit, np.ones(2, bool)).points
-    albedo, scale = points[:, 0], 0.1 * 100.0 ** points[:, 1]
-    np.testing.assert_allclose(albedo * scale, fitted.vector.prod(), rtol=0.02)
-    ends = np.concatenate([[0.05], np.sort(albedo), [1.0]])
-    assert np.all(np.diff(ends) < 0.15)
-
-
-def test_what_is_known_has_no_ridge():
-    fitted = fit(PAINT, paint(0), transport=lj.SingleScattering(), starts=2)
-    found = ridge(fitted.problem, np.array([0.5]), np.ones(1, bool))
-    assert found.points.shape == (1, 1)
-    assert found.bounds.shape == (1, 0, 1)
-
-
-def test_a_ridge_ends_where_the_model_has_no_value(monkeypatch):
-    """A bent ridge, y = x^2 to a hundredth, whose log-posterior is not a number beyond x = 0.7."""
-    asked = []
-
-    def information(_, unit):
-        asked.append(unit)
-        x, y = unit
-        rows = 100.0 * np.array([[-2.0 * x, 1.0]])
-        distance = 100.0 * (y - x * x)
-        if x > 0.7:
-            return np.full((1, 2), np.nan), np.full(2, np.nan), np.inf
-        return rows, distance * rows[0], 0.5 * distance**2
-
-    monkeypatch.setattr("fits.sampling.ridge.local_information", information)
-    found = ridge(None, np.array([0.5, 0.25]), np.ones(2, bool))
-    x, y = found.points.T
-    np.testing.assert_allclose(y, x * x, atol=0.1 / 100.0)  # a tenth of a standard deviation
-    assert x.min() < 0.05
-    assert 0.6 < x.max() <= 0.7
-    np.testing.assert_allclose(found.height, -0.5 * (100.0 * (y - x * x)) ** 2, atol=1e-12)
-    assert len({tuple(unit) for unit in asked}) == len(asked)  # every place is looked at once

@@ -1,0 +1,128 @@
+"""Where chains begin: Laplace's approximations of the posterior about the minima of a fit, and along their ridges.
+
+A parameter at a bound lies at an exponentially distributed distance from it, by the slope of the posterior there; the
+others follow the information at the minimum. Where that leaves a direction open, the approximation goes on along the
+ridge, however it bends.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+from scipy.special import logit, logsumexp
+
+from fits.optimise.multi_start import least_squares_descent, unit_of
+from fits.optimise.result import Fit, Minimum
+from fits.optimise.uncertainty import local_information, uncertainty
+from fits.problem.model import Model
+from fits.problem.problem import Problem
+from fits.sampling.mixture import Mixture
+from fits.sampling.options import SamplerOptions
+from fits.sampling.ridge import Ridge, open_directions, ridge
+
+WIDEST = 2.0  # in log-odds, where a uniform density over the box has a standard deviation of 1.8
+WIDEST_IN_BOX = 0.3
+INSIDE = 1e-9  # of the box
+OPEN_SHARE = 0.01  # of the squared length of an open direction: a parameter at a bound that has more lies along it,
+PRESSED = 10.0  # unless the log-posterior falls by more than this from the bound across the box
+APART = 3.0  # standard deviations: minima that are closer are one mode
+MOST_MODES = 8
+LOWEST_MINIMUM = 8.0  # in the log-posterior, below the best: what lies lower holds next to nothing, however broad it is
+
+Floats = NDArray[np.float64]
+
+
+def initial_mixture(
+    fit: Fit, smallest_mode: float = SamplerOptions.smallest_mode, *, along_ridges: bool = True
+) -> Mixture:
+    """About those minima of a fit that hold a share of its posterior, in whose modes its components are.
+
+    along_ridges: which takes some hundred Jacobians where the data leave a direction open.
+    """
+    problem = fit.problem
+    found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), along_ridges)]
+    for minimum in other_minima(fit):
+        end = least_squares_descent(problem, unit_of(problem, vector_of(fit, minimum)), fresh=False)
+        position = logit(np.clip(unit_of(problem, end.vector), INSIDE, 1.0 - INSIDE))[None]
+        if end.cost >= fit.cost + LOWEST_MINIMUM or any(
+            np.min(one.squared_distance(position)) < APART**2 for one in found
+        ):
+            continue
+        found.append(_about(problem, end.vector, uncertainty(problem, end.vector, end.cost).at_bound, along_ridges))
+    mass = np.array([logsumexp(one.log_weight) for one in found])
+    kept = [one for one, its in zip(found, mass, strict=True) if its > np.max(mass) + np.log(smallest_mode)]
+    return Mixture.of_modes(kept)
+
+
+def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_ridges: bool) -> Mixture:
+    """About the points of the ridge of a minimum (P,), or that alone; weights are logarithms of masses of posterior.
+
+    By the information there: the covariance of a fit has lost what data know where they leave something else open.
+    """
+    unit = unit_of(problem, vector)
+    rows, gradient, _ = local_information(problem, unit)
+    if at_bound.any():
+        along = np.sum(open_directions(rows) ** 2, axis=0)
+        at_bound = at_bound & ((along < OPEN_SHARE) | (np.abs(gradient) > PRESSED))
+    alone = Ridge(unit[None], rows[None], np.zeros((1, 0, len(unit))))
+    found = ridge(problem, unit, ~at_bound) if along_ridges else alone
+    information = np.concatenate([found.rows, found.bounds], axis=1)
+    # no closer to a bound than half a deviation, that of the others given: there is no slope in log-odds next to it
+    within = np.minimum(0.5 / np.maximum(np.linalg.norm(information, axis=1), 0.5 / WIDEST_IN_BOX), 0.5)
+    points = np.where(
+        at_bound, np.clip(found.points, INSIDE, 1.0 - INSIDE), np.clip(found.points, within, 1.0 - within)
+    )
+    free, count = np.flatnonzero(~at_bound), len(points)
+    in_log_odds = (information * (points * (1.0 - points))[:, None])[..., free]
+    widest = np.tile(np.eye(len(free)) / WIDEST, (count, 1, 1))
+    _, values, directions = np.linalg.svd(np.concatenate([in_log_odds, widest], axis=1), full_matrices=False)
+    root = np.zeros((count, len(vector), len(vector)))
+    root[:, free[:, None], free] = np.swapaxes(directions, 1, 2) / values[:, None]
+    distance = np.clip(1.0 / np.maximum(np.abs(gradient), INSIDE), INSIDE, WIDEST_IN_BOX)
+    mixture = Mixture(
+        centre=logit(points),
+        root=root,
+        at_bound=np.tile(at_bound, (count, 1)),
+        distance=np.tile(distance, (count, 1)),
+        log_weight=np.zeros(count),
+        mode=np.zeros(count, int),
+    )
+    heights = np.asarray(problem.call(log_posteriors, mixture.centre), float)
+    own = np.diagonal(mixture.log_parts(mixture.centre))
+    return replace(mixture, log_weight=np.where(np.isfinite(heights), heights, -np.inf) - own)
+
+
+def other_minima(fit: Fit) -> list[Minimum]:
+    """Minima of a likelihood's fit, beside the best, that its posterior may have a mode at."""
+    if not fit.is_posterior:
+        return []
+    return [one for one in fit.minima[1:] if one.cost < fit.cost + LOWEST_MINIMUM][: MOST_MODES - 1]
+
+
+def vector_of(fit: Fit, minimum: Minimum) -> Floats:
+    """The values of a minimum of a fit, (P,)."""
+    return np.array([minimum.values[name] for name in fit.problem.names])
+
+
+def log_posteriors(model: Model, positions: Array) -> Array:
+    """Log-posterior at each of `positions` (count, P) in unconstrained coordinates."""
+    return jax.lax.map(model.log_posterior_unconstrained, positions)  # one walker fits the cache: twice as fast as vmap
+
+
+def first_positions(
+    mixture: Mixture, log_posterior: Callable[[Floats], Floats], walkers: int, generator: np.random.RandomState
+) -> Floats:
+    """Draws (walkers, P), all of finite posterior; closer to the centres if that is needed.
+
+    Raises ValueError if even a narrow cloud holds points of posterior zero.
+    """
+    for shrink in 0.5 ** np.arange(12):
+        positions = mixture.draw(generator, walkers, float(shrink))
+        if np.all(np.isfinite(log_posterior(positions))):
+            return positions
+    raise ValueError(
+        "sampling: points next to the optimum have posterior zero; the model gives values that are not finite"
+    )
