@@ -93,7 +93,7 @@ def cross_validate(
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
     """
     groups, data = require_groups(fit, options), fit.problem.data.used()
-    proposal = None if posterior is None else posterior.mixture(np.random.RandomState(seed), 2 * draws)
+    proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
     starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
     done = {} if done is None else done

@@ -18,7 +18,7 @@ from fits.optimise.result import Fit
 from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import in_shares
 from fits.sampling.initial import initial_mixture, log_posteriors
-from fits.sampling.mixture import Mixture
+from fits.sampling.proposals import Density, FittedProposal
 
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 """Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
@@ -63,11 +63,11 @@ class ImportanceDraws:
         weights = self.log_weights if self.pareto_k < MAX_PARETO_K else _tempered(self.log_weights)
         return self.positions[_resample(weights, generator, count)]
 
-    def mixture(self, generator: np.random.RandomState, count: int) -> Mixture | None:
-        """A mixture fitted to so many draws of the posterior; None if all weights are 0."""
+    def proposal(self, generator: np.random.RandomState, count: int) -> FittedProposal | None:
+        """A proposal fitted to so many draws of the posterior; None if all weights are 0."""
         if not np.isfinite(self.log_weights).any():
             return None
-        return Mixture.fitted(self.resample(generator, count), generator)
+        return FittedProposal.to(self.resample(generator, count), generator)
 
 
 def importance_draws(
@@ -77,7 +77,7 @@ def importance_draws(
     *,
     max_pareto_k: float = FINITE_VARIANCE,
     along_ridge: bool = False,
-    proposal: Mixture | None = None,
+    proposal: Density | None = None,
 ) -> ImportanceDraws:
     """Draw as many of each of several proposals, until their weights suffice; the fit is of a likelihood.
 
@@ -101,11 +101,11 @@ class _Pool:
 
     def __init__(self, fit: Fit, draws: int, generator: np.random.RandomState):
         self.fit, self.draws, self.generator = fit, draws, generator
-        self.proposals: list[Mixture] = []
+        self.proposals: list[Density] = []
         self.positions = np.empty((0, len(fit.vector)))
         self.log_posterior = np.empty(0)
 
-    def add(self, proposal: Mixture) -> ImportanceDraws:
+    def add(self, proposal: Density) -> ImportanceDraws:
         """Add draws of a proposal; returns all draws of the pool."""
         positions = proposal.draw(self.generator, self.draws)
         (log_posterior,) = in_shares(lambda part: [self.fit.problem.call(log_posteriors, part)], positions, BATCH)
@@ -125,7 +125,7 @@ class _Pool:
             if weighted.suffices(max_pareto_k) or not np.isfinite(weighted.log_weights).any():
                 break
             rows = _resample(_tempered(weighted.log_weights), self.generator, self.draws)
-            weighted = self.add(Mixture.fitted(weighted.positions[rows], self.generator))
+            weighted = self.add(FittedProposal.to(weighted.positions[rows], self.generator))
         return weighted
 
 

@@ -36,7 +36,7 @@ from layerjax._checks import in_short, require_kind
 from layerjax.mixture import stacks_of
 
 if TYPE_CHECKING:
-    from fits.sampling.mixture import Mixture
+    from fits.sampling.proposals import Density
 
 LEVELS = (0.025, 0.25, 0.5, 0.75, 0.975)
 """Quantiles that are computed by default: the ends of the central 50 % and 95 % intervals, and the median."""
@@ -309,7 +309,7 @@ def posterior_predictive(
     draws: int,
     seed: int,
     levels: tuple[float, ...] = LEVELS,
-    proposal: "Mixture | None" = None,
+    proposal: "Density | None" = None,
 ) -> Prediction:
     """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
     fit = fitted.fit if isinstance(fitted, Posterior) else fitted
@@ -367,7 +367,7 @@ def _require_visible(fit: Fit, at: Geometry) -> None:
 
 
 def _posterior_draws(
-    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Mixture | None" = None
+    fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Density | None" = None
 ) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the Pareto k of their weights."""
     if isinstance(fitted, Fit) and fitted.within is not None and fitted.dataset is not None:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from fits.sampling.posterior import Posterior
 
 SCHEMA = 4
-FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.lock"
+FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
 _NUMBERS = ("vector", "errors", "covariance", "cost", "condition_number")
 _PLAIN = (

@@ -1,10 +1,11 @@
 """emcee's ensemble: walkers that move together, in unconstrained coordinates, where the box has no walls.
 
 Half of the steps are stretch moves and differential evolution, neither of which is the better one everywhere, half
-independent proposals from a mixture that is fitted to the chain as it grows (`mixture`).
+independent proposals from a density that is fitted to the chain as it grows (`proposals`).
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import emcee
 import numpy as np
@@ -16,9 +17,14 @@ from fits.sampling.chain import Chain
 from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
+from fits.sampling.proposals import Density, FittedProposal, propose
 
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
-"""Steps after which the mixture is fitted again: often while the chain is short, seldom once it is long."""
+"""Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
+
+DIFFERENCE = 1.2
+"""Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
+long."""
 
 Floats = NDArray[np.float64]
 
@@ -36,12 +42,12 @@ class Ensemble:
         """Append steps to the chain until it has `step` of them, and `tell` of each."""
         while (begin := self.chain.iteration) < step:
             proposals = proposals_of(self.chain)
-            state = self.chain.get_last_sample() if begin else self._first_state(proposals)
+            state = self.chain.get_last_sample() if begin else self._first_state()
             share = self.options.independent
             moves = [
-                (emcee.moves.MHMove(proposals.propose), share),
+                (emcee.moves.MHMove(partial(propose, proposals)), share),
                 (emcee.moves.StretchMove(), 0.5 * (1.0 - share)),
-                (emcee.moves.DEMove(), 0.5 * (1.0 - share)),
+                (emcee.moves.DEMove(gamma0=DIFFERENCE / np.sqrt(2.0 * self.chain.shape[1])), 0.5 * (1.0 - share)),
             ]
             sampler = emcee.EnsembleSampler(
                 *self.chain.shape, self.log_posteriors, moves=moves, vectorize=True, backend=self.chain
@@ -60,14 +66,16 @@ class Ensemble:
         self._compiled = True
         return found
 
-    def _first_state(self, proposals: Mixture) -> emcee.State:
+    def _first_state(self) -> emcee.State:
         generator = np.random.RandomState(self.seed)
-        positions = first_positions(proposals, self.log_posteriors, self.chain.shape[0], generator)
+        positions = first_positions(
+            Mixture(**self.chain.moves["initial"]), self.log_posteriors, self.chain.shape[0], generator
+        )
         return emcee.State(positions, random_state=generator.get_state())  # else emcee copies numpy's global state
 
 
-def proposals_of(chain: Chain) -> Mixture:
-    """The mixture that proposals come from until the next fit: that of the second half of the chain up to the last one.
+def proposals_of(chain: Chain) -> Density:
+    """What proposals are drawn from until the next fit: fitted to the second half of the chain up to the last one.
 
     As fits grow apart, so the adaptation fades; and a chain that is gone on with is the same, for it depends on whole
     fits only.
@@ -77,7 +85,7 @@ def proposals_of(chain: Chain) -> Mixture:
         return initial
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs
-        return Mixture.fitted(positions.copy(), np.random.RandomState(last)).beside(initial)
+        return FittedProposal.to(positions.copy(), np.random.RandomState(last), initial)
 
 
 def next_fit(step: int) -> int:

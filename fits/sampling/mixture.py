@@ -1,9 +1,4 @@
-"""Proposals that do not depend on where a walker stands: a mixture of heavy-tailed densities, to draw from.
-
-It begins as approximations about the minima of a fit (`initial`), and is fitted again to what walkers have visited:
-where it is close to the posterior a chain forgets its past in a few steps, and jumps between its modes. Metropolis'
-rule keeps every step exact, however poor the mixture is.
-"""
+"""A mixture of heavy-tailed densities: about the minima of a fit (`initial`), or fitted to draws (`proposals`)."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,10 +12,9 @@ from scipy.cluster.vq import ClusterError, kmeans2
 from scipy.special import expit, gammaln, logit, logsumexp
 
 DEGREES_OF_FREEDOM = 6.0
-COMPONENTS = 12  # of mixtures that are fitted to samples
-INITIAL_SHARE = 0.1  # of proposals from the approximations of the fit, whatever is learned
+COMPONENTS = 4  # of mixtures that are fitted to draws: more follow what is there by chance
 ITERATIONS = 10
-MOST_SAMPLES = 2000
+MOST_SAMPLES = 8000
 SMALLEST_VARIANCE = 1e-12  # of a unit, that a combination of parameters keeps
 NARROWEST, INSIDE = 1e-9, 1e-9  # in log-odds; of the box
 
@@ -65,7 +59,7 @@ class Mixture:
 
     @classmethod
     def fitted(cls, positions: Floats, generator: np.random.RandomState) -> "Mixture":
-        """Fitted to samples (count, P) of a posterior, two at least, by expectation and maximisation.
+        """Fitted to samples (count, P), two at least, by expectation and maximisation.
 
         Each component counts as a few samples of its own, so that it keeps its full rank.
         """
@@ -89,11 +83,6 @@ class Mixture:
             weight = share.sum(axis=1) + 1.0
             now = cls.students(centre, _root(scale), np.log(weight / weight.sum()))
         return now
-
-    def beside(self, initial: "Mixture") -> "Mixture":
-        """This one with a share of `initial`, which knows of modes that may not have been visited."""
-        shares = zip((self, initial), (1.0 - INITIAL_SHARE, INITIAL_SHARE), strict=True)
-        return Mixture.joined([replace(one, log_weight=one.log_weight + np.log(share)) for one, share in shares])
 
     @property
     def best(self) -> "Mixture":
@@ -124,11 +113,6 @@ class Mixture:
         distance = -mean * np.log1p(generator.random_sample(mean.shape) * np.expm1(-1.0 / mean))
         log_odds = logit(np.clip(shrink * distance, INSIDE, 1.0 - INSIDE))
         return np.where(self.at_bound[which], np.where(self.centre[which] < 0.0, log_odds, -log_odds), drawn)
-
-    def propose(self, positions: Floats, generator: np.random.RandomState) -> tuple[Floats, Floats]:
-        """Independent proposals for `emcee.moves.MHMove`, and the log-ratio of densities it asks for."""
-        drawn = self.draw(generator, len(positions))
-        return drawn, self.log_density(positions) - self.log_density(drawn)
 
     def log_parts(self, positions: Floats) -> Floats:
         """What every component adds to the density, as logarithms, (M, count)."""

@@ -25,6 +25,7 @@ from fits.sampling.ensemble import FITS, proposals_of
 from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
+from fits.sampling.proposals import propose
 
 CHAINS = 4
 DRAWS = 4096  # of the approximation, for its covariance
@@ -72,7 +73,7 @@ class Nuts:
             if chain.iteration in FITS:
                 proposals = proposals_of(chain)
             generator = np.random.RandomState([self.seed, chain.iteration])
-            drawn, log_ratio = proposals.propose(positions, generator)
+            drawn, log_ratio = propose(proposals, positions, generator)
             gain = log_ratio + self._log_posteriors(drawn) - self._log_posteriors(positions)
             positions = np.where((np.log(generator.random_sample(len(drawn))) < gain)[:, None], drawn, positions)
             positions, heights, divergent = self._on_all_cores(
