@@ -131,10 +131,12 @@ def fit_problem(
     return _fitted(problem, _Run(starts, seed, solver, options, progress or silent, checkpoint, screen))
 
 
-def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
+def fit_with_discrepancy(
+    problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0, options: FitOptions = DEFAULT
+) -> Fit:
     """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit_problem`."""
     before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
-    return _with_discrepancy(problem, independent, before, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
+    return _with_discrepancy(problem, independent, before, _Run(starts, seed, "least_squares", options, silent, None))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:

@@ -78,7 +78,7 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
 
     require_kind("fit", fit, Fit)
     fit.require_one("save_fit")
-    with reserved(directory, force), replacing(directory, force) as folder:
+    with writing(directory, force) as folder:
         write_fit(fit, folder)
 
 
@@ -319,52 +319,41 @@ def check_directory(directory: Path, force: bool) -> None:
 
 
 @contextmanager
-def reserved(directory: str | Path, force: bool = False) -> Iterator[None]:
-    """While the block lasts, no other process writes this result: a ValueError where one does, or as `replacing`."""
-    directory = Path(directory)
-    check_directory(directory, force)
-    target = directory.resolve()
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
-        new, old = _beside(target)  # as a killed process left them
-        if old.exists() and not target.exists():
-            old.rename(target)
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
-        yield
-
-
-def _beside(target: Path) -> tuple[Path, Path]:
-    return target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
-
-
-@contextmanager
-def replacing(directory: str | Path, force: bool = False) -> Iterator[Path]:
+def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     """A new folder beside `directory` that takes its place when the block ends well, and is removed when it does not.
 
-    The directory must be `reserved`. Raises ValueError for one that is not empty, unless `force` is given and it is an
-    earlier result.
+    While the block lasts, no other process writes this result.
+
+    Raises:
+        ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
     directory = Path(directory)
     check_directory(directory, force)
     target = directory.resolve()
-    folder, old = _beside(target)
-    try:
-        folder.mkdir()
-        yield folder
-        check_directory(directory, force)  # someone else may have written there in the meantime
-        if not target.exists():
-            folder.rename(target)
-            return
-        with locked(target / LOCK, str(directory)):
-            target.rename(old)
-            try:
+    folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
+        # as a killed process left them
+        if old.exists() and not target.exists():
+            old.rename(target)
+        for left in (folder, old):
+            shutil.rmtree(left, ignore_errors=True)
+        try:
+            folder.mkdir()
+            yield folder
+            check_directory(directory, force)  # someone else may have written there in the meantime
+            if not target.exists():
                 folder.rename(target)
-            except OSError:
-                old.rename(target)
-                raise
-        shutil.rmtree(old)
-    except BaseException as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
-            error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
-        raise
+                return
+            with locked(target / LOCK, str(directory)):
+                target.rename(old)
+                try:
+                    folder.rename(target)
+                except OSError:
+                    old.rename(target)
+                    raise
+            shutil.rmtree(old)
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
+                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+            raise

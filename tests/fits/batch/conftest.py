@@ -1,4 +1,4 @@
-"""A folder of readings, and reports that cost nothing."""
+"""A folder of measurements, and reports that cost nothing."""
 
 from collections.abc import Iterator
 from pathlib import Path

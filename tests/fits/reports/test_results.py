@@ -15,7 +15,7 @@ from fits.optimise.result import Fit, Minimum
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.reports.results import load_fit, load_posterior, replacing, save_fit
+from fits.reports.results import load_fit, load_posterior, save_fit, writing
 from fits.sampling.sample import sample
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
@@ -128,7 +128,7 @@ def test_a_failure_leaves_what_was_there(coat_fit: Fit, tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in directory.iterdir()}
 
     def half_way() -> None:
-        with replacing(directory, force=True) as folder:
+        with writing(directory, force=True) as folder:
             (folder / "fit.json").write_text("half")
             raise RuntimeError("half way")
 
