@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from fits.any_report import report as report
     from fits.batch.fit_files import FittedFiles as FittedFiles
     from fits.batch.fit_files import fit_files as fit_files
-    from fits.data.formats import read as read
     from fits.data.formats.csv import write_csv as write_csv
     from fits.data.formats.rxt import Slab as Slab
     from fits.data.formats.rxt import read_slab as read_slab
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
     from fits.data.reading import ReadOptions as ReadOptions
+    from fits.data.reading import read as read
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
@@ -94,7 +94,7 @@ _HOMES = {
     "MapOptions": "maps.options",
     "SpatialPrior": "maps.options",
     "ModelScore": "prediction.model_scores",
-    "read": "data.formats",
+    "read": "data.reading",
     "ReadOptions": "data.reading",
     "write_csv": "data.formats.csv",
     "read_slab": "data.formats.rxt",

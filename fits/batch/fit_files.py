@@ -237,7 +237,10 @@ class Job:
     def fingerprint(self, task: "Task") -> dict[str, str]:
         """Key of a result."""
         how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
-        return fingerprint(file=task.content, **vars(self.reading), **(how or {}))
+        reading = {f"read {name}": value for name, value in vars(self.reading).items()}
+        at = self.reading.geometry
+        reading["read geometry"] = None if at is None else [at.wi, at.wo]
+        return fingerprint(file=task.content, **reading, **(how or {}))
 
 
 class Task(NamedTuple):

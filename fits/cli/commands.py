@@ -26,8 +26,6 @@ from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
-from fits.data.reading import select_channels
-from fits.data.selection import select
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
@@ -146,11 +144,7 @@ def predict(arguments: Namespace) -> int:
     if arguments.score is None:
         at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,))
     else:
-        at, selections = select_channels(read_options(arguments).read(arguments.score), arguments.select)
-        for words in selections:
-            at = at.where(select(at, words))
-        if not at.mask.any():
-            raise ValueError(f"{arguments.score}: --select leaves nothing to predict")
+        at = read_options(arguments).read(arguments.score)
     found = run_prediction(source, at)
     if isinstance(at, Measurements):
         tables.print_table(tables.scores_table(found, at, f"Prediction of {arguments.score}"), sys.stdout)

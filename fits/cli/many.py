@@ -18,7 +18,7 @@ DONE, DOUBTFUL = 0, 1
 
 def search(arguments: Namespace) -> int:
     """Search for the stack behind the data among those of a library, and write the report."""
-    data = read_options(arguments).masked(arguments.data)
+    data = read_options(arguments).read(arguments.data)
     if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
         raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
     use_jax()

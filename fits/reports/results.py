@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import locked, read_json, require_there, text_checksum, write_json, write_text
-from fits.data.formats import read, totals_csv
+from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
+from fits.data.reading import read
 from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import Totals
 

@@ -130,7 +130,7 @@ def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: li
         assert contents(folder / "out") == before
 
     refused(r"out/paint.csv/coat: holds the work of another problem \(starts 2, not 3\); --force", starts=3)
-    refused(r"\(max_polar_angle None, not 60.0\)", reading=ReadOptions(max_polar_angle=60.0))
+    refused(r"\(read max_polar_angle None, not 60.0\)", reading=ReadOptions(max_polar_angle=60.0))
     (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
     refused(r"out/paint.csv/bare: holds the work of another problem \(stack\)")
     del counted[:]

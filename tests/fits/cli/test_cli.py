@@ -17,8 +17,8 @@ import pytest
 
 from fits.cli.interrupts import raised_again
 from fits.cli.parser import main
-from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.data.reading import read
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 from fits.reports.plots.data import MOST_CHANNELS, data_picture

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fits.data.formats import read
 from fits.data.geometry import Floats, direction
+from fits.data.reading import read
 
 RANDOM = np.random.default_rng(1)
 LIGHT = direction(RANDOM.uniform(1, 80, 40), RANDOM.uniform(-180, 180, 40))

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
 
 HEAD = "ASTM 1\nDATE 4/8/1998\nSAMPLE Paint, blue\nNUM_POINTS 2\nVARS theta_i,phi_i,theta_s,phi_s"
 

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read, write_csv
+from fits.data.formats import write_csv
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements, Source
+from fits.data.reading import read
 from tests.helpers.places import COATINGS as DATA
 
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf"

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.measurements import LARGEST, Measurements
+from fits.data.reading import read
 from tests.helpers.data_files import FILES
 
 BINARY = ("merl", "rgl")

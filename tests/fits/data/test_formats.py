@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.formats._text import read_lines
 from fits.data.geometry import direction, slices
+from fits.data.reading import ReadOptions, read
 from fits.names import FORMATS
 from tests.helpers.places import COATINGS as DATA
 
@@ -123,3 +123,18 @@ def test_fred_by_hand(tmp_path):
 def test_bad_fred(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         read(_file(tmp_path, text))
+
+
+def test_keywords_and_options_are_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = [f"{incidence},180,{theta},0,0.1" for incidence in (10, 50) for theta in range(0, 90, 10)]
+    path.write_text("\n".join(["theta_i,phi_i,theta_o,phi_o,brdf", *rows]))
+    given = {"max_polar_angle": 60.0, "select": ["incidence=10"]}
+    assert read(path, **given).used().values.shape == (7, 1)
+    np.testing.assert_array_equal(read(path, **given).mask, ReadOptions(**given).read(path).mask)
+    fitted, held_out = ReadOptions(hold_out=["incidence=50"]).split(path)
+    assert (len(fitted.used()), len(held_out.used())) == (9, 9)
+    with pytest.raises(ValueError, match="hold_out: it is for a fit"):
+        read(path, hold_out=["incidence=50"])
+    with pytest.raises(TypeError, match="bin"):
+        read(path, bin=4)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
 
 HEAD = """# a comment
 Symmetry {symmetry}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.formats import read
 from fits.data.formats.merl import half_difference
 from fits.data.geometry import Geometry, direction, slices
 from fits.data.measurements import Measurements
+from fits.data.reading import read
 from fits.data.scans import in_plane, incidences, relative_azimuth
 from fits.optimise.fit import fit
 from fits.problem.parameters import Free

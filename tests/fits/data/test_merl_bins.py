@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fits.cli.parser import main
-from fits.data.formats import read
 from fits.data.formats.merl import half_difference
+from fits.data.reading import read
 from tests.helpers.commands import refused
 from tests.helpers.merl import SCALE, SHAPE, centre_angles, centre_pairs, smooth_bsdf, write_merl
 

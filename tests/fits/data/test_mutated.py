@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.data.reading import read
 from fits.names import FORMATS
 from tests.helpers.data_files import FILES
 from tests.helpers.mutations import mutated

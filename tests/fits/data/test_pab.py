@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction, slices
+from fits.data.reading import read
 
 MANUAL = """#sample_name "a sample"
 #incident_angle 82.5 180

@@ -5,8 +5,8 @@ import pytest
 
 import layerjax as lj
 from fits.cli.parser import main
-from fits.data.formats import read
 from fits.data.formats.rxt import SMOOTH, read_slab
+from fits.data.reading import read
 
 SAMPLE = """\
 IAD1   # first four characters

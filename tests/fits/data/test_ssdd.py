@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
 
 LAMBERTIAN = """VERSION 0.2
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.formats.tensor_tree import boxes, disk, look_up, parse
 from fits.data.geometry import Floats
+from fits.data.reading import read
 
 HEAD = "<?xml version='1.0'?>\n<WindowElement><Optical><Layer><DataDefinition><IncidentDataStructure>TensorTree{rank}"
 HEAD += "</IncidentDataStructure></DataDefinition>"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.formats import read
 from fits.data.geometry import slices
+from fits.data.reading import read
 from fits.optimise import multi_start as starts_module
 from fits.optimise.bounded import cost_and_gradient
 from fits.optimise.fit import fit
