@@ -4,7 +4,6 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 """
 
 import os
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import write_bytes, write_text
+from fits.cli.input_output import read_options, refuse_alone, refuse_existing, require_free_place, show
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
 from fits.cli.many import search as search
@@ -21,8 +21,6 @@ from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
 from fits.cli.materials import write_measurements
-from fits.cli.options import read_options, refuse_alone
-from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
@@ -31,7 +29,6 @@ from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 DONE, DOUBTFUL = 0, 1
@@ -60,11 +57,9 @@ def fit(arguments: Namespace) -> int:
             force=arguments.force,
             progress=progress,
         )
-    tables.print_table(tables.parameter_table(result), sys.stdout)
-    for sentence in (*verdicts.summary(result), f"Report: {directory / results.REPORT}"):
-        print(sentence)
+    show(tables.parameter_table(result), *verdicts.summary(result), f"Report: {directory / results.REPORT}")
     if predicted is not None:
-        tables.print_table(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"), sys.stdout)
+        show(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"))
     return DONE if result.converged else DOUBTFUL
 
 
@@ -99,9 +94,8 @@ def sample(arguments: Namespace) -> int:
         write_report(directory, directory.resolve().name, result, posterior)
         progress("pictures and report", 1, 1)
     if verdicts.reportable(posterior):
-        tables.print_table(tables.posterior_table(posterior), sys.stdout)
-    for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
-        print(sentence)
+        show(tables.posterior_table(posterior))
+    show(*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}")
     reached = float(np.min(posterior.effective_samples))
     enough = posterior.converged and (arguments.ess is None or reached >= arguments.ess)
     if not enough:
@@ -147,22 +141,15 @@ def predict(arguments: Namespace) -> int:
         at = read_options(arguments).read(arguments.score)
     found = run_prediction(source, at)
     if isinstance(at, Measurements):
-        tables.print_table(tables.scores_table(found, at, f"Prediction of {arguments.score}"), sys.stdout)
+        show(tables.scores_table(found, at, f"Prediction of {arguments.score}"))
     if arguments.out is not None:
-        _write_prediction(found, arguments)
+        write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
+        show(
+            f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack "
+            "without model discrepancy (latent_*)",
+            *([] if found.reliable else [tables.UNRELIABLE]),
+        )
     return DONE
-
-
-def _write_prediction(found: "Prediction", arguments: Namespace) -> None:
-    from fits.reports import tables
-
-    write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
-    print(
-        f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack without "
-        "model discrepancy (latent_*)"
-    )
-    if not found.reliable:
-        print(tables.UNRELIABLE)
 
 
 def report(arguments: Namespace) -> int:
@@ -204,9 +191,7 @@ def compare(arguments: Namespace) -> int:
     candidates = _candidates([Path(directory) for directory in arguments.directories])
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
-    tables.print_table(tables.comparison_table(compared), sys.stdout)
-    for sentence in compared.verdict:
-        print(sentence)
+    show(tables.comparison_table(compared), *compared.verdict)
     if arguments.out:
         write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
@@ -240,16 +225,12 @@ def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
     from fits.reports.data_summary import data_statements, data_table, source_table
     from fits.reports.plots.data import as_png, data_picture, totals_picture
-    from fits.reports.tables import print_table
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
         refuse_existing(out, arguments.force)
     data = read_options(arguments).read(arguments.data)
-    for table in (source_table(data), data_table(data)):
-        print_table(table, sys.stdout)
-    for sentence in data_statements(data):
-        print(sentence)
+    show(source_table(data), data_table(data), *data_statements(data))
     if Path(out).exists() and not arguments.force:
         print(f"Picture: {out} exists already (--force draws it again)")
         return DONE

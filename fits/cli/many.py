@@ -1,14 +1,13 @@
 """The search for the stack behind data, and the fits of many files, on the command line."""
 
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fits.cli.input_output import read_options, refuse_alone, show
 from fits.cli.interrupts import hint
-from fits.cli.options import read_options, refuse_alone
 from fits.cli.setting import use_jax
 from fits.data.totals import Totals
 from fits.progress import show_progress
@@ -22,18 +21,15 @@ def search(arguments: Namespace) -> int:
     if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
         raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
     use_jax()
-    from fits.reports import tables
     from fits.structure_search import report
     from fits.structure_search.search import search as run_search
 
     directory = Path(arguments.out)
+    settings = search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
     with show_progress() as progress, hint(_resume(directory)):
-        settings = search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
         found = run_search(data, **settings, directory=directory, progress=progress)
         report.write_report(found, directory)
-    tables.print_table(report.search_table(found), sys.stdout)
-    for sentence in (*report.search_sentences(found), f"Report: {directory / report.PAGE}"):
-        print(sentence)
+    show(report.search_table(found), *report.search_sentences(found), f"Report: {directory / report.PAGE}")
     return DONE
 
 
@@ -61,7 +57,6 @@ def fit_many(arguments: Namespace) -> int:
     use_jax()
     from fits.batch.fit_files import PAGE, SHOWN, TABLE, fit_files, overview, statements
     from fits.problem.compilation import cores
-    from fits.reports.tables import print_table
 
     if not arguments.search:
         refuse_alone(arguments, ("library", "noise", "scale_sd"), "search: a stack file states it")
@@ -79,9 +74,7 @@ def fit_many(arguments: Namespace) -> int:
             force=arguments.force,
             progress=progress,
         )
-    print_table(overview(found.rows, SHOWN), sys.stdout)
-    for sentence in (*statements(found), f"Table: {out / TABLE}", f"Report: {out / PAGE}"):
-        print(sentence)
+    show(overview(found.rows, SHOWN), *statements(found), f"Table: {out / TABLE}", f"Report: {out / PAGE}")
     return DONE if found.complete else DOUBTFUL
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fits._files import write_bytes
-from fits.cli.places import refuse_existing, require_free_place
+from fits.cli.input_output import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals

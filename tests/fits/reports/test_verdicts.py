@@ -58,8 +58,8 @@ def fitted() -> Fit:
 
 def said(facts: Assessment) -> list[verdicts.Statement]:
     """All statements of a report that depend on facts."""
-    opening = [verdicts.description(facts), verdicts.errors(facts), verdicts.parameters(facts)]
-    return [*opening, *verdicts.remarks(facts), *verdicts.residuals(facts), *verdicts.identification(facts)]
+    more = (verdicts.remarks(facts), verdicts.residuals(facts), verdicts.identification(facts))
+    return [*verdicts.opening(facts), *(one for section in more for one in section)]
 
 
 def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
@@ -125,10 +125,10 @@ def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -
     case = replace(facts, excess=-9.0, ratio=0.19, structure=structure, discrepancy=(TERM, 0.9))
     factor = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
     assert f"too small by a factor of about {factor:.2g} (0.44 for the size of the whitened residuals times 4.4" in (
-        verdicts.errors(case).sentence
+        verdicts.opening(case)[1].sentence
     )
     large = replace(facts, excess=9.0, ratio=9.0, structure=replace(facts.structure, lag_one_sigma=0.0))
-    assert "too small by a factor of about 3 (3 for the size of the residuals)" in verdicts.errors(large).sentence
+    assert "too small by a factor of about 3 (3 for the size of the residuals)" in verdicts.opening(large)[1].sentence
 
 
 def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> None:
@@ -204,7 +204,7 @@ def test_a_large_misfit_is_a_factor(fitted: Fit, factor: float, words: str) -> N
         off = replace(fitted, problem=problem_of(values))
         vars(off)["predicted"] = fitted.predicted
         facts = replace(assess(off), described=True)
-        assert verdicts.description(facts).sentence.startswith(f"{near}within {words}, ")
+        assert verdicts.opening(facts)[0].sentence.startswith(f"{near}within {words}, ")
 
 
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
