@@ -26,7 +26,7 @@ class Fitted(NamedTuple):
 
 def fit_into(
     directory: str | Path,
-    given: ProblemFile,
+    problem: ProblemFile,
     data: Measurements,
     held_out: Measurements | None = None,
     *,
@@ -40,7 +40,7 @@ def fit_into(
 
     Args:
         directory: as of `save_fit`.
-        given: the stack file.
+        problem: the stack file.
         data, held_out: what is fitted, and what its prediction is scored by.
         starts, seed, progress: see `fit`; starts are kept beside the directory until it is there.
         force: replace an earlier result.
@@ -49,46 +49,46 @@ def fit_into(
     Raises:
         ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
     """
-    require_score(given, held_out is not None)
+    require_score(problem, held_out is not None)
     target = Path(directory).resolve()
     kept = target.with_name(f".{target.name}.starts")
     with results.writing(directory, force) as folder:
-        found = run_fit(
-            given.stack,
+        fit = run_fit(
+            problem.stack,
             data,
-            transport=given.transport,
-            noise=given.noise,
-            scale=given.scale,
-            objective=given.objective,
-            instrument=given.instrument,
+            transport=problem.transport,
+            noise=problem.noise,
+            scale=problem.scale,
+            objective=problem.objective,
+            instrument=problem.instrument,
             starts=starts,
             seed=seed,
-            options=options_from(given.options),
+            options=options_from(problem.options),
             progress=progress,
             checkpoint=kept,
         )
-        predicted = _write(folder, target.name, found, held_out, given.text, report, progress or silent)
+        predicted = _write(folder, target.name, fit, held_out, problem.text, report, progress or silent)
     for one in (kept, discrepancy_checkpoint(kept)):
         one.unlink(missing_ok=True)
-    return Fitted(found, predicted)
+    return Fitted(fit, predicted)
 
 
-def write_into(directory: str | Path, found: Fit, *, report: bool = True) -> Fitted:
+def write_into(directory: str | Path, fit: Fit, *, report: bool = True) -> Fitted:
     """Write the result directory of a fit with its report, in place of an earlier one."""
     with results.writing(directory, force=True) as folder:
-        return Fitted(found, _write(folder, Path(directory).resolve().name, found, None, None, report, silent))
+        return Fitted(fit, _write(folder, Path(directory).resolve().name, fit, None, None, report, silent))
 
 
-def require_score(given: ProblemFile, held_out: bool) -> None:
+def require_score(problem: ProblemFile, held_out: bool) -> None:
     """ValueError if data are held out of an objective that has no predictive score."""
-    if held_out and given.objective != "likelihood":
-        raise ValueError(f"--hold-out needs the objective 'likelihood': {given.objective!r} has no predictive score")
+    if held_out and problem.objective != "likelihood":
+        raise ValueError(f"--hold-out needs the objective 'likelihood': {problem.objective!r} has no predictive score")
 
 
 def _write(
     folder: Path,
     name: str,
-    found: Fit,
+    fit: Fit,
     held_out: Measurements | None,
     text: str | None,
     report: bool,
@@ -96,12 +96,12 @@ def _write(
 ) -> HeldOut | None:
     """The files of a result; text: of the stack file, None for one that the fit makes."""
     progress(DRAWING, 0, 1)
-    results.write_fit(found, folder, text)
+    results.write_fit(fit, folder, text)
     if held_out is not None:
         write_csv(held_out, folder / results.HELD_OUT)
     if report:
-        predicted = write_report(folder, name, found)
+        predicted = write_report(folder, name, fit)
     else:
-        predicted = None if held_out is None else predict_held_out(found, None, held_out)
+        predicted = None if held_out is None else predict_held_out(fit, None, held_out)
     progress(DRAWING, 1, 1)
     return predicted

@@ -91,7 +91,7 @@ def fit_files(
     processes: int = 1,
     client: Any = None,
     search: bool | Mapping[str, Any] = False,
-    reading: ReadOptions | None = None,
+    read_options: ReadOptions | None = None,
     starts: int = 32,
     seed: int = 0,
     reports: bool = True,
@@ -110,7 +110,7 @@ def fit_files(
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a mapping has the arguments of `fits.search`.
-        reading: how all files are read, see `fits.ReadOptions`.
+        read_options: how all files are read, see `fits.ReadOptions`.
         starts, seed: of each fit of `stacks`, see `fits.fit`.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
@@ -122,16 +122,16 @@ def fit_files(
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     # what is fitted by what
-    reading, out, progress = reading or ReadOptions(), Path(out), progress or silent
-    found, skipped = measurement_files(_several(files), reading.format)
+    read_options, out, progress = read_options or ReadOptions(), Path(out), progress or silent
+    found, skipped = measurement_files(_several(files), read_options.format)
     named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in named_stacks.items()}
     if not given and search is False:
         raise ValueError("neither a stack nor a search is given; there must be one of them")
     for problem in given.values():
-        require_score(problem, bool(reading.hold_out))
+        require_score(problem, bool(read_options.hold_out))
     searching = None if search is False else {"seed": seed} | ({} if search is True else dict(search))
-    job = Job(out.absolute(), given, searching, reading, {"starts": starts, "seed": seed}, reports, force)
+    job = Job(out.absolute(), given, searching, read_options, {"starts": starts, "seed": seed}, reports, force)
     if not out.resolve().parent.is_dir():
         raise ValueError(f"{out}: there is no directory {out.parent}")
     if out.exists() and not out.is_dir():
@@ -172,16 +172,16 @@ def fit_files(
 # ---- what is fitted by what ----
 
 
-def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Files by name, those of folders among them; and what folders hold beside measurements.
+def measurement_files(places: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Files by name, those of folders among them; and what folders hold that are no measurements.
 
     Raises:
         FileNotFoundError: no such file or folder.
         ValueError: a folder without measurements, or a name that is there twice.
     """
     files: list[Path] = []
-    beside: list[str] = []
-    for place in map(Path, given):
+    skipped: list[str] = []
+    for place in map(Path, places):
         require_there(place, "no such file or folder")
         if not place.is_dir():
             files.append(place)
@@ -191,10 +191,10 @@ def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[
         if not some:
             raise ValueError(f"{place}: holds no measurement file")
         files += some
-        beside += [str(one) for one in every if one not in some]
+        skipped += [str(one) for one in every if one not in some]
     if not files:
         raise ValueError("no file is given; there must be at least one")
-    return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(beside)
+    return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(skipped)
 
 
 def _has_known_content(path: Path) -> bool:
@@ -224,7 +224,7 @@ class Job:
     out: Path
     stacks: Mapping[str, ProblemFile]
     searching: Mapping[str, Any] | None
-    reading: ReadOptions
+    read_options: ReadOptions
     fitting: Mapping[str, Any]
     reports: bool
     force: bool
@@ -237,10 +237,10 @@ class Job:
     def fingerprint(self, task: "Task") -> dict[str, str]:
         """Key of a result."""
         how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
-        reading = {f"read {name}": value for name, value in vars(self.reading).items()}
-        at = self.reading.geometry
-        reading["read geometry"] = None if at is None else [at.wi, at.wo]
-        return fingerprint(file=task.content, **reading, **(how or {}))
+        how_read = {f"read {name}": value for name, value in vars(self.read_options).items()}
+        at = self.read_options.geometry
+        how_read["read geometry"] = None if at is None else [at.wi, at.wo]
+        return fingerprint(file=task.content, **how_read, **(how or {}))
 
 
 class Task(NamedTuple):
@@ -275,7 +275,7 @@ def _planned(job: Job, files: list[Path], done: Store | None) -> tuple[dict[str,
         left = [task for task in every if known.get(task.key) is None]
         try:
             if left and content:
-                job.reading.split(path)  # before any is fitted
+                job.read_options.split(path)  # before any is fitted
                 tasks += left
         except (ValueError, OSError) as error:
             why = one_line(error)
@@ -302,8 +302,8 @@ def _done_before(job: Job, task: Task, done: Store) -> Row | None:
     return None if words else kept["row"]
 
 
-def _several(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    return [given] if isinstance(given, str | Path) else list(given)
+def _several(items: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    return [items] if isinstance(items, str | Path) else list(items)
 
 
 # ---- a worker's task ----
@@ -326,7 +326,7 @@ def fit_one(job: Job, task: Task) -> Row:
 
 def _fitted(job: Job, task: Task) -> Row:
     began, directory, structure = time.monotonic(), job.out / task.key, ""
-    data, held_out = job.reading.split(task.path)
+    data, held_out = job.read_options.split(task.path)
     with named(directory.parent):
         directory.parent.mkdir(exist_ok=True)
     if task.stack == SEARCH:
@@ -352,7 +352,7 @@ def _fitted(job: Job, task: Task) -> Row:
         "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
     }
     if predicted is not None and (scores := predicted.prediction.scores) is not None:
-        row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
+        row |= {"criterion": "-2 elpd", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
     row |= {"at_bound": " ".join(fit.at_bound), "measurements": int(fit.problem.data.mask.sum())}
@@ -375,12 +375,12 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
         if len(own) < 2 or len({row["criterion"] for row in own}) > 1:
             continue
         best = min(own, key=lambda row: (row["result"] != "converged", row["loss"]))
-        likelihood = best["criterion"] in ("AIC", "-2 log score")
+        likelihood = best["criterion"] in ("AIC", "-2 elpd")
         excess = max(1.0, np.nan_to_num(best["reduced_chi_square"])) if best["criterion"] == "AIC" else 1.0
         for row in own:
-            behind = (row["loss"] - best["loss"]) / excess
-            close = likelihood and row["result"] == "converged" and behind < ComparisonOptions().slight_difference
-            standing[id(row)] = "best" if row is best else "as good" if close else f"{behind:+.1f}"
+            difference = (row["loss"] - best["loss"]) / excess
+            close = likelihood and row["result"] == "converged" and difference < ComparisonOptions().slight_difference
+            standing[id(row)] = "best" if row is best else "as good" if close else f"{difference:+.1f}"
     return tuple(row | {"standing": standing.get(id(row), "")} for row in rows)
 
 
@@ -410,16 +410,16 @@ def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
     shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
     note = (
         "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC: as good as "
-        "the best, or by how much behind; where the best misses the data, the scatter that it leaves counts as noise."
+        "the best, or the difference; where the best misses the data, the scatter that it leaves counts as noise."
     )
     return tables.Table(
         "Fits", tuple(columns), tuple(shown if most is None else tables.shortened(shown, most)), note, keys=2
     )
 
 
-def statements(found: FittedFiles) -> list[str]:
+def statements(result: FittedFiles) -> list[str]:
     """What became of them, in sentences."""
-    rows = found.rows
+    rows = result.rows
     files, stacks = ({row[name]: None for row in rows} for name in ("file", "stack"))
     results = [row["result"] for row in rows]
     best = [row["stack"] for row in rows if row["standing"] == "best"]
@@ -427,7 +427,7 @@ def statements(found: FittedFiles) -> list[str]:
         "No result of": list(dict.fromkeys(row["file"] for row in rows if row["result"] == "failed")),
         "Not converged:": [f"{row['file']} by {row['stack']}" for row in rows if row["result"] == "not converged"],
         "Best of a file:": [f"{name} {_count(best.count(name), 'time')}" for name in stacks if len(stacks) > 1],
-        "Not taken for measurements:": list(found.skipped),
+        "Not taken for measurements:": list(result.skipped),
     }
     return [
         f"{_count(len(files), 'file')} by {_count(len(stacks), 'stack')}: {len(rows) - results.count('failed')} of "
@@ -436,18 +436,18 @@ def statements(found: FittedFiles) -> list[str]:
     ]
 
 
-def page(found: FittedFiles) -> str:
+def page(result: FittedFiles) -> str:
     """The table with a link to each report, as one HTML file that stands beside the results."""
-    title = f"Fits of {_count(len({row['file'] for row in found.rows}), 'file')}"
-    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in found.rows if row["result"] != "failed"]
+    title = f"Fits of {_count(len({row['file'] for row in result.rows}), 'file')}"
+    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in result.rows if row["result"] != "failed"]
     links = [
         f'<li><a href="{quote(place)}">{html.escape(place)}</a></li>'
         for place in places
-        if (found.directory / place).is_file()
+        if (result.directory / place).is_file()
     ]
     reports = [section("Reports", f"<ul>{''.join(links)}</ul>")] if links else []
-    body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(found))]
-    return document(title, [*body, section("All fits", tables.html_table(overview(found.rows))), *reports])
+    body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(result))]
+    return document(title, [*body, section("All fits", overview(result.rows)), *reports])
 
 
 def _count(number: int, what: str) -> str:

@@ -157,6 +157,7 @@ def report(arguments: Namespace) -> int:
     if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
+    from fits.any_report import report as write_elsewhere
     from fits.reports import html, results
 
     refuse_existing(arguments.out, arguments.force)
@@ -172,7 +173,7 @@ def report(arguments: Namespace) -> int:
             html.write_report(directory, name, result, posterior, others)
         else:
             held_out = results.load_held_out(directory)
-            html.report(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
+            write_elsewhere(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
         progress("pictures and report", 1, 1)
     print(f"Report: {out}")
     return DONE

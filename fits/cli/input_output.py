@@ -15,8 +15,8 @@ def read_options(arguments: Namespace) -> "ReadOptions":
     from fits.data.reading import ReadOptions
 
     names = ("min_retro_angle", "max_polar_angle", "select", "hold_out")
-    given: dict[str, Any] = {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
-    return ReadOptions.parse(arguments.read, **given)
+    masks: dict[str, Any] = {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
+    return ReadOptions.parse(arguments.read, **masks)
 
 
 def refuse_alone(arguments: Namespace, names: tuple[str, ...], needed: str) -> None:

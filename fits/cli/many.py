@@ -33,8 +33,8 @@ def search(arguments: Namespace) -> int:
     return DONE
 
 
-def search_settings(arguments: Namespace, **given: Any) -> dict[str, Any]:
-    """Arguments of `fits.search` from the options of a search; given: further ones of `SearchOptions`."""
+def search_settings(arguments: Namespace, **options: Any) -> dict[str, Any]:
+    """Arguments of `fits.search` from the options of a search; options: further ones of `SearchOptions`."""
     from fits.problem.noise import Noise
     from fits.problem.parameters import Free, LogNormal
     from fits.problem.stack_file import read_instrument
@@ -48,7 +48,7 @@ def search_settings(arguments: Namespace, **given: Any) -> dict[str, Any]:
         "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
         "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
         "instrument": None if instrument is None else read_instrument(instrument),
-        "options": SearchOptions(**given),
+        "options": SearchOptions(**options),
     }
 
 
@@ -69,7 +69,7 @@ def fit_many(arguments: Namespace) -> int:
             processes=cores() if arguments.processes is None else arguments.processes,
             client=arguments.scheduler,
             search=search_settings(arguments) if arguments.search else False,
-            reading=read_options(arguments),
+            read_options=read_options(arguments),
             starts=arguments.starts,
             force=arguments.force,
             progress=progress,

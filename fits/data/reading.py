@@ -80,22 +80,22 @@ class ReadOptions:
         Raises:
             ValueError: an unknown option, one that is given twice, or a bad value.
         """
-        found: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         for word in words:
             name, equals, text = word.partition("=")
             if not equals or name not in READERS:
                 raise ValueError(
-                    f"{word!r} is no option of reading; it must be {', '.join(f'{o}=...' for o in READERS)}"
+                    f"{word!r} is no option of a reader; it must be {', '.join(f'{o}=...' for o in READERS)}"
                 )
-            if name in found:
+            if name in options:
                 raise ValueError(f"{name} is given twice")
-            found[name] = READERS[name](name, text)
-        return cls(**found, **more)
+            options[name] = READERS[name](name, text)
+        return cls(**options, **more)
 
     def read(self, path: str | Path) -> Measurements:
         """What a file holds, masked and selected. ValueError as `fits.read`, and for data that are to be held out."""
         if self.hold_out:
-            raise ValueError("hold_out: it is for a fit and a score; `fits.Measurements.drop` leaves data out")
+            raise ValueError("hold_out: it is for a fit and a score; `fits.Measurements.drop` omits data")
         return self.split(path)[0]
 
     def split(self, path: str | Path) -> tuple[Measurements, Measurements | None]:

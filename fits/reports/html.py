@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from fits._files import write_text, write_together
+from fits._files import write_together
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.reports import tables, verdicts
 from fits.reports.diagnostics import residual_label, standardised
-from fits.reports.pages import Pictures, document, image, made_with, section, sentences
+from fits.reports.pages import Pictures, document, html_table, image, made_with, section, sentences, verdict
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.plots import parameters as parameter_pictures
@@ -37,24 +37,6 @@ class HeldOut(NamedTuple):
 
     data: Measurements
     prediction: "Prediction"
-
-
-def report(
-    fit: "Fit",
-    posterior: "Posterior | None" = None,
-    path: str | Path = "report.html",
-    *,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: Measurements | None = None,
-    options: ReportOptions = verdicts.DEFAULT,
-    force: bool = True,
-) -> None:
-    """Writes the report of a fit to `path`, whole or not at all: see `fits.report`, which calls this."""
-    fit.require_one("report")
-    predicted = None if held_out is None else predict_held_out(fit, posterior, held_out)
-    images = draw(fit, posterior, others, name, predicted)
-    write_text(path, page(fit, posterior, images, others, name, predicted, options), force=force)
 
 
 def write_report(
@@ -87,7 +69,6 @@ def draw(
     data = fit.problem.data
     estimates = posterior if posterior is not None and reportable(posterior) else None
     figures: dict[str, Figure | None] = {
-        "stack": parameter_pictures.stack_picture(fit.stack),
         "correlation": parameter_pictures.correlation_picture(fit),
     }
     if isinstance(data, Totals):
@@ -125,45 +106,40 @@ def page(
     curves = "In the plane of incidence. Grey: one sigma of the noise model."
     if fit.problem.noise.discrepancy:
         curves += " Residuals are those of the curve with model discrepancy."
+    directions = verdicts.sentences(verdicts.identification(facts))
     body = [
         f"<h1>{html.escape(title)}</h1>",
-        f'<p class="verdict{" fine" if found.sound else ""}">{html.escape(" ".join(found.sentences))}</p>',
+        verdict(found.sentences, found.sound),
         sentences(found.remarks) if found.remarks else "",
         section(
             "Values",
-            tables.html_table(tables.parameter_table(fit)),
-            "" if fit.without_discrepancy is None else tables.html_table(tables.discrepancy_table(fit)),
-            image(images, "stack", "Fitted stack, from top to bottom; not to scale."),
+            tables.parameter_table(fit),
+            None if fit.without_discrepancy is None else tables.discrepancy_table(fit),
             _stack_text(fit),
         ),
         section(
             "Data and model",
-            tables.html_table(tables.problem_table(fit)),
+            tables.problem_table(fit),
             image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
             image(images, "model", curves),
             image(
                 images, "maps", "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
             ),
-            "" if held_out is None else _scores(held_out),
+            None if held_out is None else tables.scores_table(held_out.prediction, held_out.data, "Held-out data"),
             image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
         ),
         section(
             "Diagnostics",
-            sentences(verdicts.sentences(verdicts.residuals(facts))),
-            tables.html_table(tables.incidence_table(facts.structure)),
+            verdicts.sentences(verdicts.residuals(facts)),
+            tables.incidence_table(facts.structure),
             image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
-            sentences(verdicts.minima(fit)),
-            tables.html_table(tables.minima_table(fit)),
+            verdicts.minima(fit),
+            tables.minima_table(fit),
         ),
         section(
             "Identifiability",
-            sentences(
-                [
-                    f"The condition number of the scaled problem is {fit.condition_number:.3g}.",
-                    *verdicts.sentences(verdicts.identification(facts)),
-                ]
-            ),
-            tables.html_table(tables.unidentified_table(fit)) if fit.unidentified else "",
+            [f"The condition number of the scaled problem is {fit.condition_number:.3g}.", *directions],
+            tables.unidentified_table(fit) if fit.unidentified else None,
             image(images, "correlation", "Correlation of the fitted parameters."),
         ),
         section("Posterior", *_posterior(fit, posterior, images, options)),
@@ -183,14 +159,10 @@ def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, opti
         return ("<p>There is none: the objective is a named residual, not a likelihood.</p>",)
     return (
         sentences(verdicts.sampled(posterior, options)),
-        tables.html_table(tables.posterior_table(posterior)) if reportable(posterior) else "",
+        html_table(tables.posterior_table(posterior)) if reportable(posterior) else "",
         image(images, "corner", "Samples of the posterior; orange: the best fit."),
         image(images, "trace", "Every walker; estimates use the steps right of the orange line."),
     )
-
-
-def _scores(held_out: HeldOut) -> str:
-    return tables.html_table(tables.scores_table(held_out.prediction, held_out.data, "Held-out data"))
 
 
 def _stack_text(fit: "Fit") -> str:
@@ -213,17 +185,16 @@ def comparison_page(candidates: Results, compared: "Comparison") -> str:
     images = {} if figure is None else {"comparison": pictures.as_png(figure)}
     title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
     body = [f"<h1>{html.escape(title)}</h1>", _comparison(compared, images)]
-    body += [
-        section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
-    ]
-    return document(title, body)
+    return document(
+        title, [*body, *(section(name, _stack_text(fit), tables.parameter_table(fit)) for name, fit in fits.items())]
+    )
 
 
 def _comparison(compared: "Comparison", images: Pictures) -> str:
     return section(
         "Comparison",
-        sentences(compared.verdict),
-        tables.html_table(tables.comparison_table(compared)),
+        compared.verdict,
+        tables.comparison_table(compared),
         image(images, "comparison", "The fits beside the same data."),
     )
 
@@ -247,21 +218,21 @@ def fit_fragment(fit: "Fit") -> str:
         fragments += [
             f"<h4>{html.escape(name)}</h4>" if name else "",
             _paragraph(words),
-            tables.html_table(tables.parameter_table(part)),
-            tables.html_table(tables.unidentified_table(part)) if part.unidentified else "",
+            html_table(tables.parameter_table(part)),
+            html_table(tables.unidentified_table(part)) if part.unidentified else "",
         ]
     return "".join(fragments)
 
 
 def posterior_fragment(posterior: "Posterior") -> str:
     """How far the chain has converged, and its estimates, if there are any."""
-    table = tables.html_table(tables.posterior_table(posterior)) if reportable(posterior) else ""
+    table = html_table(tables.posterior_table(posterior)) if reportable(posterior) else ""
     return _paragraph(verdicts.sampled(posterior)) + table
 
 
 def comparison_fragment(comparison: "Comparison") -> str:
     """Which of several fits predicts the data best, and by how much."""
-    return _paragraph(list(comparison.verdict)) + tables.html_table(tables.comparison_table(comparison))
+    return _paragraph(list(comparison.verdict)) + html_table(tables.comparison_table(comparison))
 
 
 def _paragraph(words: list[str]) -> str:

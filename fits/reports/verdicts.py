@@ -422,7 +422,7 @@ def residuals(f: Assessment) -> list[Statement]:
         words = f"Neighbouring {which} are {words}; their root mean square is {structure.rms:.2f}."
         found.append(Statement(f"{words} Independent ones of unit variance have 0 and 1."))
     if f.correlated:
-        words = "Correlated residuals come from structure that the model lacks, or from a smooth calibration error."
+        words = "Correlated residuals come from structure that is not in the model, or from a smooth calibration error."
         found.append(Statement(words, {"residuals": "misfit"}))
     words = f"{structure.beyond_three:.1%} of the {which} are beyond 3 sigma (normal distribution: 0.3 %)."
     return [*found, Statement(words)]
@@ -522,7 +522,7 @@ def noise_statements(problem: "Problem") -> list[str]:
     more = "a fitted relative part" if is_free(noise.relative) else f"relative = {noise.relative:g}"
     return [
         f"Noise: the data's own sigma{own}, and {more}, added in quadrature. Leave `relative` out if sigma holds it "
-        "already; `use_sigma = false` leaves sigma out."
+        "already; `use_sigma = false` ignores sigma."
     ]
 
 

@@ -130,7 +130,7 @@ def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: li
         assert contents(folder / "out") == before
 
     refused(r"out/paint.csv/coat: holds the work of another problem \(starts 2, not 3\); --force", starts=3)
-    refused(r"\(read max_polar_angle None, not 60.0\)", reading=ReadOptions(max_polar_angle=60.0))
+    refused(r"\(read max_polar_angle None, not 60.0\)", read_options=ReadOptions(max_polar_angle=60.0))
     (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
     refused(r"out/paint.csv/bare: holds the work of another problem \(stack\)")
     del counted[:]
@@ -160,10 +160,12 @@ def test_held_out_data_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(
         "fits.batch.fit_file.write_report", lambda at, name, fit: predict_held_out(fit, None, load_held_out(at))
     )
-    found = fits.fit_files(["scans/coated.csv"], STACKS, "out", reading=ReadOptions(hold_out=("incidence=50",)), **FEW)
+    found = fits.fit_files(
+        ["scans/coated.csv"], STACKS, "out", read_options=ReadOptions(hold_out=("incidence=50",)), **FEW
+    )
     assert found.best == {"coated.csv": "coat"}
     coat, bare = found.rows
-    assert coat["criterion"] == bare["criterion"] == "-2 log score"
+    assert coat["criterion"] == bare["criterion"] == "-2 elpd"
     assert coat["loss"] < bare["loss"]
     fit = fits.load_fit("out/coated.csv/coat")
     seen = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
@@ -289,10 +291,7 @@ def row(stack: str, loss: float, file: str = "a.csv", **more: object) -> batch.R
         ),
         # of held-out data it does not
         (
-            [
-                row(name, loss, criterion="-2 log score", reduced_chi_square=4.0)
-                for name, loss in (("a", 9.0), ("b", 1.0))
-            ],
+            [row(name, loss, criterion="-2 elpd", reduced_chi_square=4.0) for name, loss in (("a", 9.0), ("b", 1.0))],
             ["+8.0", "best"],
         ),
         # what did not converge is not the best of what did

@@ -98,7 +98,7 @@ def test_sampling_resumes_until_it_is_enough(work: Path, capsys: pytest.CaptureF
         assert abs(entry["mean"] - coat_fit.values[entry["name"]]) < coat_fit.standard_errors[entry["name"]]
         assert entry["low_68"] < entry["median"] < entry["high_68"]
     text = (work / "result" / "report.html").read_text()
-    assert text.count("data:image/png") == 7  # stack, curves, maps, residuals, correlation, corner, trace
+    assert text.count("data:image/png") == 6  # curves, maps, residuals, correlation, corner, trace
     assert main(["sample", "result"]) == 0
     assert (work / "result" / "summary.json").read_text() == summary
     assert main(["sample", "result", "--ess", "1000000", "--max-steps", str(len(longer.chain))]) == 1

@@ -65,7 +65,7 @@ REFUSALS = (
     ("info short.binary", "short.binary"),
     ("info data.csv --out coat.toml", "--force"),
     ("info data.csv --read format=mrel", "format is 'mrel'; it must be one of csv, "),
-    ("info data.csv --read csv", "'csv' is no option of reading; it must be format=..., quantity=..., bins=..."),
+    ("info data.csv --read csv", "'csv' is no option of a reader; it must be format=..., quantity=..., bins=..."),
     ("info data.csv --read format=csv format=csv", "format is given twice"),
     ("info data.csv --read bins=0", "bins is '0'; it must be a number of at least 1, or all"),
     ("info data.csv --read corrected=maybe", "corrected is 'maybe'; it must be yes or no"),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fits.any_report import report
 from fits.data.geometry import slices
 from fits.optimise.discrepancy import with_discrepancy
 from fits.optimise.fit import fit
@@ -17,7 +18,6 @@ from fits.problem.joint import Joint
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, Normal
 from fits.problem.problem import Problem
-from fits.reports.html import report
 from fits.reports.results import save_fit
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import sample

@@ -11,8 +11,6 @@ from benchmarks.measuring.repeats import fit_many
 from fits.cli.parser import main
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
-from fits.reports.plots.data import as_png
-from fits.reports.plots.parameters import stack_picture
 
 FILE = """\
 transport = "SingleScattering"
@@ -99,10 +97,6 @@ def test_it_is_fitted_and_reported_on_the_command_line(file: Path, tmp_path: Pat
     assert tuple(loaded.values) == NAMES
     report = (tmp_path / "result" / "report.html").read_text()
     assert "[mixture.dust]" in report
-
-
-def test_parts_stand_in_the_picture_of_the_stack() -> None:
-    assert as_png(stack_picture(mixture(0.6, 0.25, 0.3))).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
+from fits.any_report import report
 from fits.data.geometry import direction, slices
 from fits.data.measurements import Measurements, Source
 from fits.data.neighbours import autocorrelation
@@ -19,10 +20,9 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.reports import tables
 from fits.reports.diagnostics import residual_structure, standardised
-from fits.reports.html import page, report
+from fits.reports.html import page
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
-from fits.reports.plots import parameters as parameter_pictures
 
 
 def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:
@@ -146,7 +146,7 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
-    assert len(pictured) == 6  # stack, curves, maps, residuals, correlation, comparison
+    assert len(pictured) == 5  # curves, maps, residuals, correlation, comparison
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
 
@@ -223,10 +223,3 @@ def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
     assert pictures.is_logarithmic(np.array([0.0, 0.01, 0.2]))
     assert not pictures.is_logarithmic(np.array([0.0, 0.1, 0.2]))
     assert not pictures.is_logarithmic(np.array([0.0]))
-
-
-def test_the_stack_is_drawn_with_its_numbers(coat_fit: Fit) -> None:
-    figure = parameter_pictures.stack_picture(coat_fit.stack)
-    words = " ".join(text.get_text() for text in figure.axes[0].texts)
-    assert f"{coat_fit.values['base.albedo']:.4g}" in words
-    assert "HenyeyGreenstein: g 0" in words

@@ -222,7 +222,6 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     shown = np.asarray(points.get_ydata())
     drawn = np.interp(angle, *curves["model with discrepancy"].get_data())
     np.testing.assert_allclose(shown, (values - drawn) / (0.02 * values), atol=0.15)
-    assert "discrepancy" in lower.get_ylabel()
 
 
 def test_an_assumed_noise_is_stated_and_repeats_offer_another() -> None:
