@@ -48,6 +48,5 @@ def report(
         page.report(fit, path, force)
         return
     fit.require_one("report")
-    predicted = None if held_out is None else html.predict_held_out(fit, posterior, held_out)
-    images = html.draw(fit, posterior, others, name, predicted)
-    write_text(path, html.page(fit, posterior, images, others, name, predicted, options), force=force)
+    whole = html.FitReport(fit, posterior, others or {}, name, held_out, options)
+    write_text(path, whole.page(), force=force)

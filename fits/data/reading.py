@@ -108,7 +108,8 @@ class ReadOptions:
         held = np.any([select(data, words) for words in self.hold_out], axis=0) if self.hold_out else ~keep & False
         fitted = data.where(keep & ~held)
         if data.mask.any() and not fitted.mask.any():
-            raise ValueError(f"{path}: --select and --hold-out leave nothing to fit")
+            what = "--select and --hold-out leave nothing to fit" if self.hold_out else "--select leaves nothing"
+            raise ValueError(f"{path}: {what}")
         for name, given in (("selected", self.select), ("held out", self.hold_out)):
             fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
         if not self.hold_out:

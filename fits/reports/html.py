@@ -6,6 +6,8 @@ posterior and comparison.
 
 import html
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,18 +41,6 @@ class HeldOut(NamedTuple):
     prediction: "Prediction"
 
 
-def write_report(
-    folder: Path, name: str, fit: "Fit", posterior: "Posterior | None" = None, others: Results | None = None
-) -> HeldOut | None:
-    """Writes the report of a result directory, its pictures beside it; returns the prediction of its held-out data."""
-    held_out = load_held_out(folder)
-    predicted = None if held_out is None else predict_held_out(fit, posterior, held_out)
-    images = draw(fit, posterior, others, name, predicted)
-    text = page(fit, posterior, images, others, name, predicted)
-    write_together(folder, {**{f"{key}.png": image for key, image in images.items()}, REPORT: text.encode()})
-    return predicted
-
-
 def predict_held_out(fit: "Fit", posterior: "Posterior | None", data: Measurements) -> HeldOut:
     """The prediction of held-out data by the posterior, or by the fit where there is none to report from."""
     from fits.prediction.predict import predict
@@ -58,98 +48,107 @@ def predict_held_out(fit: "Fit", posterior: "Posterior | None", data: Measuremen
     return HeldOut(data, predict(posterior if posterior is not None and reportable(posterior) else fit, data))
 
 
-def draw(
-    fit: "Fit",
-    posterior: "Posterior | None" = None,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: HeldOut | None = None,
-) -> dict[str, bytes]:
-    """Every picture that applies, as PNG by name."""
-    data = fit.problem.data
-    estimates = posterior if posterior is not None and reportable(posterior) else None
-    figures: dict[str, Figure | None] = {
-        "correlation": parameter_pictures.correlation_picture(fit),
-    }
-    if isinstance(data, Totals):
-        figures["totals"] = pictures.totals_picture(data, fit)
-    else:
-        figures |= {
-            "model": model_pictures.curves_picture({name: fit}, estimates),
-            "maps": model_pictures.maps_picture(fit),
-            "residuals": pictures.residual_picture(data, standardised(fit), residual_label(fit)),
-        }
-    if estimates is not None:
-        figures["corner"] = parameter_pictures.corner_picture(estimates)
-    if posterior is not None:
-        figures["trace"] = parameter_pictures.trace_picture(posterior)
-    if held_out is not None:
-        figures["held_out"] = model_pictures.prediction_picture(held_out.prediction, held_out.data)
-    if others:
-        figures["comparison"] = model_pictures.curves_picture({name: fit, **_fits(others)})
-    return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
+def write_report(
+    folder: Path, name: str, fit: "Fit", posterior: "Posterior | None" = None, others: Results | None = None
+) -> HeldOut | None:
+    """Writes the report of a result directory, its pictures beside it; returns the prediction of its held-out data."""
+    held_out = load_held_out(folder)
+    report = FitReport(fit, posterior, others or {}, name, held_out)
+    pictures = {f"{key}.png": image for key, image in report.images.items()}
+    write_together(folder, pictures | {REPORT: report.page().encode()})
+    return report.predicted
 
 
-def page(
-    fit: "Fit",
-    posterior: "Posterior | None",
-    images: Pictures,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: HeldOut | None = None,
-    options: ReportOptions = verdicts.DEFAULT,
-) -> str:
-    """The HTML text of the report, with the pictures inside."""
-    facts = verdicts.assess(fit, options)
-    found = verdicts.verdict(fit, facts)
-    title = f"Fit of {source_name(fit.problem.data)}"
-    curves = "In the plane of incidence. Grey: one sigma of the noise model."
-    if fit.problem.noise.discrepancy:
-        curves += " Residuals are those of the curve with model discrepancy."
-    directions = verdicts.sentences(verdicts.identification(facts))
-    body = [
-        f"<h1>{html.escape(title)}</h1>",
-        verdict(found.sentences, found.sound),
-        sentences(found.remarks) if found.remarks else "",
-        section(
-            "Values",
-            tables.parameter_table(fit),
-            None if fit.without_discrepancy is None else tables.discrepancy_table(fit),
-            _stack_text(fit),
-        ),
-        section(
-            "Data and model",
-            tables.problem_table(fit),
-            image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
-            image(images, "model", curves),
-            image(
-                images, "maps", "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
+@dataclass(frozen=True, eq=False)
+class FitReport:
+    """What the report of a fit is made of; arguments as of `fits.report`."""
+
+    fit: "Fit"
+    posterior: "Posterior | None" = None
+    others: Results = field(default_factory=dict)
+    name: str = "this fit"
+    held_out: Measurements | None = None
+    options: ReportOptions = verdicts.DEFAULT
+
+    @cached_property
+    def predicted(self) -> HeldOut | None:
+        """The prediction of held-out data; None without any."""
+        return None if self.held_out is None else predict_held_out(self.fit, self.posterior, self.held_out)
+
+    @cached_property
+    def images(self) -> Pictures:
+        """Every picture that applies, as PNG by name."""
+        fit, posterior, data = self.fit, self.posterior, self.fit.problem.data
+        estimates = posterior if posterior is not None and reportable(posterior) else None
+        figures: dict[str, Figure | None] = {"correlation": parameter_pictures.correlation_picture(fit)}
+        if isinstance(data, Totals):
+            figures["totals"] = pictures.totals_picture(data, fit)
+        else:
+            figures["model"] = model_pictures.curves_picture({self.name: fit}, estimates)
+            figures["maps"] = model_pictures.maps_picture(fit)
+            figures["residuals"] = pictures.residual_picture(data, standardised(fit), residual_label(fit))
+        if estimates is not None:
+            figures["corner"] = parameter_pictures.corner_picture(estimates)
+        if posterior is not None:
+            figures["trace"] = parameter_pictures.trace_picture(posterior)
+        if self.predicted is not None:
+            figures["held_out"] = model_pictures.prediction_picture(self.predicted.prediction, self.predicted.data)
+        if self.others:
+            figures["comparison"] = model_pictures.curves_picture({self.name: fit, **_fits(self.others)})
+        return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
+
+    def page(self) -> str:
+        """The HTML text, with the pictures inside."""
+        fit, images, held_out = self.fit, self.images, self.predicted
+        facts = verdicts.assess(fit, self.options)
+        found = verdicts.verdict(fit, facts)
+        title = f"Fit of {source_name(fit.problem.data)}"
+        curves = "In the plane of incidence. Grey: one sigma of the noise model."
+        if fit.problem.noise.discrepancy:
+            curves += " Residuals are those of the curve with model discrepancy."
+        hemispheres = "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
+        directions = verdicts.sentences(verdicts.identification(facts))
+        body = [
+            f"<h1>{html.escape(title)}</h1>",
+            verdict(found.sentences, found.sound),
+            sentences(found.remarks) if found.remarks else "",
+            section(
+                "Values",
+                tables.parameter_table(fit),
+                None if fit.without_discrepancy is None else tables.discrepancy_table(fit),
+                _stack_text(fit),
             ),
-            None if held_out is None else tables.scores_table(held_out.prediction, held_out.data, "Held-out data"),
-            image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
-        ),
-        section(
-            "Diagnostics",
-            verdicts.sentences(verdicts.residuals(facts)),
-            tables.incidence_table(facts.structure),
-            image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
-            verdicts.minima(fit),
-            tables.minima_table(fit),
-        ),
-        section(
-            "Identifiability",
-            [f"The condition number of the scaled problem is {fit.condition_number:.3g}.", *directions],
-            tables.unidentified_table(fit) if fit.unidentified else None,
-            image(images, "correlation", "Correlation of the fitted parameters."),
-        ),
-        section("Posterior", *_posterior(fit, posterior, images, options)),
-    ]
-    if others:
-        from fits.prediction.compare import compare
+            section(
+                "Data and model",
+                tables.problem_table(fit),
+                image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
+                image(images, "model", curves),
+                image(images, "maps", hemispheres),
+                None if held_out is None else tables.scores_table(held_out.prediction, held_out.data, "Held-out data"),
+                image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
+            ),
+            section(
+                "Diagnostics",
+                verdicts.sentences(verdicts.residuals(facts)),
+                tables.incidence_table(facts.structure),
+                image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
+                verdicts.minima(fit),
+                tables.minima_table(fit),
+            ),
+            section(
+                "Identifiability",
+                [f"The condition number of the scaled problem is {fit.condition_number:.3g}.", *directions],
+                tables.unidentified_table(fit) if fit.unidentified else None,
+                image(images, "correlation", "Correlation of the fitted parameters."),
+            ),
+            section("Posterior", *_posterior(fit, self.posterior, images, self.options)),
+        ]
+        if self.others:
+            from fits.prediction.compare import compare
 
-        own = fit if posterior is None or not reportable(posterior) else posterior
-        body.append(_comparison(compare({name: own, **others}), images))
-    return document(title, [*body, made_with()])
+            own = fit if self.posterior is None or not reportable(self.posterior) else self.posterior
+            body.append(_comparison(compare({self.name: own, **self.others}), images))
+        return document(title, [*body, made_with()])
 
 
 def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, options: ReportOptions) -> tuple[str, ...]:
@@ -184,10 +183,8 @@ def comparison_page(candidates: Results, compared: "Comparison") -> str:
     figure = model_pictures.curves_picture(fits)
     images = {} if figure is None else {"comparison": pictures.as_png(figure)}
     title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
-    body = [f"<h1>{html.escape(title)}</h1>", _comparison(compared, images)]
-    return document(
-        title, [*body, *(section(name, _stack_text(fit), tables.parameter_table(fit)) for name, fit in fits.items())]
-    )
+    each = [section(name, _stack_text(fit), tables.parameter_table(fit)) for name, fit in fits.items()]
+    return document(title, [f"<h1>{html.escape(title)}</h1>", _comparison(compared, images), *each])
 
 
 def _comparison(compared: "Comparison", images: Pictures) -> str:

@@ -28,7 +28,7 @@ INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
-DISC = 15_000.0  # square points that all points of a map have together
+DISC = 24_000.0  # square points that all points of a map have together
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 MOST_NAMES = 12  # of channels along an axis; of more, some
 MOST_CHANNELS = 6  # in one picture, evenly spaced among all
@@ -88,7 +88,7 @@ def _curves(panels: Sequence[Axes], data: "Measurements", shown: list[Incidence]
             draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
         value_axis(axes, data.values[flat], value_label(data, channel))
     if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(loc="upper right", ncols=2 if len(shown) > 4 else 1)
+        panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
 
 
 def value_label(data: "Measurements", channel: int) -> str:

@@ -227,7 +227,7 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
                 axes.plot(angle[rows], used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
                 value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
                 axes.set_title(incidence.label if channel == 0 else "")
-            grid[-1, column].set_xlabel(ANGLE_LABEL)
+        figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure

@@ -22,7 +22,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reports import results, verdicts
-from fits.reports.html import page
+from fits.reports.html import FitReport
 from fits.reports.plots.model import curves_picture
 from tests.helpers.models import LINE, TRUTH, line, line_data
 
@@ -119,7 +119,7 @@ def test_a_result_keeps_its_resolution(refined, tmp_path):
 
 def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
     found, _ = refined
-    text = page(found, None, {})
+    text = FitReport(found).page()
     assert f"AddingDoubling, {found.resolution}" in text
     assert verdicts.numerical_error(found.numerical_error) in text
     figure = curves_picture({"fit": found})

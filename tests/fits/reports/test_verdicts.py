@@ -224,14 +224,33 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     np.testing.assert_allclose(shown, (values - drawn) / (0.02 * values), atol=0.15)
 
 
-def test_an_assumed_noise_is_stated_and_repeats_offer_another() -> None:
-    once = problem_of(np.ones((len(GEOMETRY), 1)))
-    (words,) = verdicts.noise_statements(replace(once, noise=Noise()))
-    assert words.startswith("No noise is stated: 5 % of the model's value is assumed.")
-    assert "(assumed)" in tables.noise_in_words(replace(once, noise=Noise()))
-    for stated in (Noise(relative=0.05), Noise(floor=0.01)):
-        assert verdicts.noise_statements(replace(once, noise=stated)) == []
-        assert "(assumed)" not in tables.noise_in_words(replace(once, noise=stated))
+@pytest.mark.parametrize(
+    ("noise", "sigma", "words"),
+    [
+        (Noise(), None, "No noise is stated: 5 % of the model's value is assumed."),
+        (Noise(relative=0.05), None, None),
+        (Noise(floor=0.01), None, None),
+        (
+            Noise(relative=0.03),
+            0.04,
+            "Noise: the data's own sigma, 4 % in the median, and relative = 0.03, added in quadrature.",
+        ),
+        (Noise(), 0.04, None),
+        (Noise(relative=0.03, use_sigma=False), 0.04, None),
+        (Noise(relative=0.0), 0.04, None),
+    ],
+)
+def test_noise_that_is_assumed_or_added_is_announced(noise: Noise, sigma: float | None, words: str | None) -> None:
+    values = np.ones((len(GEOMETRY), 1))
+    data = replace(problem_of(values).data, sigma=None if sigma is None else sigma * values)
+    problem = Problem(STACK, data, line, noise)
+    assert [sentence.startswith(words or "?") for sentence in verdicts.noise_statements(problem)] == [True] * bool(
+        words
+    )
+    assert ("(assumed)" in tables.noise_in_words(problem)) == (words is not None and "assumed" in words)
+
+
+def test_repeated_measurements_offer_a_noise() -> None:
     scattered = 1.0 + 0.0017 * np.random.default_rng(0).standard_normal((2 * len(GEOMETRY), 1))
     wi, wo = (np.tile(w, (2, 1)) for w in (GEOMETRY.wi, GEOMETRY.wo))
     twice = Measurements(wi, wo, scattered, None, np.ones(len(wi), bool), ("value",))
@@ -241,15 +260,6 @@ def test_an_assumed_noise_is_stated_and_repeats_offer_another() -> None:
     # the median of 164 differences: 8 % of itself
     assert float(match[1]) == pytest.approx(0.17, rel=0.3)
     assert float(match[2]) == pytest.approx(0.0017, rel=0.3)
-
-
-def test_relative_noise_beside_the_own_sigma_of_the_data_is_announced() -> None:
-    values = np.ones((len(GEOMETRY), 1))
-    data = replace(problem_of(values).data, sigma=0.04 * values)
-    (words,) = verdicts.noise_statements(Problem(STACK, data, line, Noise(relative=0.03)))
-    assert words.startswith("Noise: the data's own sigma, 4 % in the median, and relative = 0.03, added in quadrature.")
-    for noise in (Noise(), Noise(relative=0.03, use_sigma=False), Noise(relative=0.0)):
-        assert verdicts.noise_statements(Problem(STACK, data, line, noise)) == []
 
 
 def altered(fit: Fit, correlation: np.ndarray | None = None, **fields: object) -> Fit:
