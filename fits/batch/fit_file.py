@@ -50,7 +50,7 @@ def fit_into(
         ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
     """
     require_score(problem, held_out is not None)
-    target = Path(directory).resolve()
+    target, progress = Path(directory).resolve(), progress or silent
     kept = target.with_name(f".{target.name}.starts")
     with results.writing(directory, force) as folder:
         fit = run_fit(
@@ -67,41 +67,21 @@ def fit_into(
             progress=progress,
             checkpoint=kept,
         )
-        predicted = _write(folder, target.name, fit, held_out, problem.text, report, progress or silent)
+        progress(DRAWING, 0, 1)
+        results.write_fit(fit, folder, problem.text)
+        if held_out is not None:
+            write_csv(held_out, folder / results.HELD_OUT)
+        if report:
+            predicted = write_report(folder, target.name, fit)
+        else:
+            predicted = None if held_out is None else predict_held_out(fit, None, held_out)
+        progress(DRAWING, 1, 1)
     for one in (kept, discrepancy_checkpoint(kept)):
         one.unlink(missing_ok=True)
     return Fitted(fit, predicted)
-
-
-def write_into(directory: str | Path, fit: Fit, *, report: bool = True) -> Fitted:
-    """Write the result directory of a fit with its report, in place of an earlier one."""
-    with results.writing(directory, force=True) as folder:
-        return Fitted(fit, _write(folder, Path(directory).resolve().name, fit, None, None, report, silent))
 
 
 def require_score(problem: ProblemFile, held_out: bool) -> None:
     """ValueError if data are held out of an objective that has no predictive score."""
     if held_out and problem.objective != "likelihood":
         raise ValueError(f"--hold-out needs the objective 'likelihood': {problem.objective!r} has no predictive score")
-
-
-def _write(
-    folder: Path,
-    name: str,
-    fit: Fit,
-    held_out: Measurements | None,
-    text: str | None,
-    report: bool,
-    progress: Progress,
-) -> HeldOut | None:
-    """The files of a result; text: of the stack file, None for one that the fit makes."""
-    progress(DRAWING, 0, 1)
-    results.write_fit(fit, folder, text)
-    if held_out is not None:
-        write_csv(held_out, folder / results.HELD_OUT)
-    if report:
-        predicted = write_report(folder, name, fit)
-    else:
-        predicted = None if held_out is None else predict_held_out(fit, None, held_out)
-    progress(DRAWING, 1, 1)
-    return predicted

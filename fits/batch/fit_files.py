@@ -21,7 +21,7 @@ from urllib.parse import quote
 import numpy as np
 
 from fits._files import named, read_json, require_there, text_checksum, write_text
-from fits.batch.fit_file import fit_into, require_score, write_into
+from fits.batch.fit_file import fit_into, require_score
 from fits.data.formats import sniff
 from fits.data.reading import ReadOptions
 from fits.data.totals import Totals
@@ -32,8 +32,9 @@ from fits.problem.compilation import make_room
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
 from fits.reports import tables
+from fits.reports.html import write_report
 from fits.reports.pages import document, section, sentences
-from fits.reports.results import FIT, REPORT
+from fits.reports.results import FIT, REPORT, save_fit
 from fits.reports.verdicts import listed
 from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search.report import write_report as write_search
@@ -338,7 +339,10 @@ def _fitted(job: Job, task: Task) -> Row:
         found = run_search(data, **(job.searching or {}), directory=stacks)
         write_search(found, stacks)
         structure = found.best.name
-        fit, predicted = write_into(directory, found.best.fit, report=job.reports)
+        fit, predicted = found.best.fit, None
+        save_fit(fit, directory, force=True)
+        if job.reports:
+            write_report(directory, SEARCH, fit)
     else:
         given = job.stacks[task.stack]
         fit, predicted = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)

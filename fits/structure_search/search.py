@@ -166,7 +166,7 @@ def search(
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit and every held-out incidence as it is finished: a search that was killed, or whose
+        directory: keeps every fit and cross-validation as it is finished: a search that was killed, or whose
             budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
