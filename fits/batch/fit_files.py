@@ -208,14 +208,14 @@ def _has_known_content(path: Path) -> bool:
 
 def _by_name(names: Sequence[tuple[Path, str]], taken: Sequence[str]) -> dict[str, Path]:
     """The paths by name. ValueError for a name that is there twice, or taken."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for path, name in names:
-        if name in found:
-            raise ValueError(f"{found[name]} and {path}: results go by this name, which must differ")
+        if name in paths:
+            raise ValueError(f"{paths[name]} and {path}: results go by this name, which must differ")
         if name in taken:
             raise ValueError(f"{path}: its name must be another: fit-many writes a {name} of its own")
-        found[name] = path
-    return found
+        paths[name] = path
+    return paths
 
 
 @dataclass(frozen=True)

@@ -166,7 +166,7 @@ def report(arguments: Namespace) -> int:
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
     if arguments.out is None and not os.access(directory, os.W_OK):
         raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
-    others = _candidates([Path(other) for other in arguments.compare], own=directory)
+    others = _candidates([Path(other) for other in arguments.compare], reference=directory)
     with show_progress() as progress:
         progress("pictures and report", 0, 1)
         if arguments.out is None:
@@ -199,12 +199,12 @@ def compare(arguments: Namespace) -> int:
     return DONE
 
 
-def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":
+def _candidates(directories: list[Path], reference: Path | None = None) -> "dict[str, Fit | Posterior]":
     """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
 
-    own: the result that they are compared with, whose name is taken.
+    reference: the result that they are compared with, whose name is taken.
     """
-    places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
+    places = [directory.resolve() for directory in (*directories, *([] if reference is None else [reference]))]
     names = [place.name for place in places]
     candidates: dict[str, Fit | Posterior] = {}
     for directory, place in zip(directories, places, strict=False):

@@ -248,7 +248,9 @@ class _Work(NamedTuple):
 
     def fit_coarsely(self, structure: Structure) -> Fit:
         """The fit with independent noise at a coarse resolution."""
-        return self._kept(structure, "", lambda: self._fit(self._problem(structure, independent=True), screen=True))
+        return self._load_or_fit(
+            structure, "", lambda: self._fit(self._problem(structure, independent=True), screen=True)
+        )
 
     def cross_validate(self, coarse: Mapping[Structure, Fit], structure: Structure) -> _CrossValidated:
         """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
@@ -263,7 +265,7 @@ class _Work(NamedTuple):
                 )
             return self._fit(self._problem(structure, independent=True))
 
-        fit = self._kept(structure, "+full", fitted)
+        fit = self._load_or_fit(structure, "+full", fitted)
         kept = None if self.store is None else self.store.get(named(structure))
         if kept is not None:
             checked = kept["cross-validation"]
@@ -283,7 +285,7 @@ class _Work(NamedTuple):
         options = self.options
         return fit_problem(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
 
-    def _kept(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
+    def _load_or_fit(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
         """The fit of a structure, from its result directory if it is there."""
         if self.store is None:
             return fitted()
@@ -308,21 +310,21 @@ class _Work(NamedTuple):
                     break
                 make_room()
                 some = structures[first : first + several]
-                for structure, found in zip(some, pool.map(call, some), strict=True):
-                    results[structure] = found
+                for structure, result in zip(some, pool.map(call, some), strict=True):
+                    results[structure] = result
                     self.progress(stage, len(results), len(structures), named(structure))
         return results
 
 
 def _neighbours(library: Library, structures: Iterable[Structure], most: int) -> list[Structure]:
     """Structures with a layer more or less than one of these, and at most so many; none twice in a row."""
-    found: list[Structure] = []
+    neighbours: list[Structure] = []
     for *above, base in structures:
-        found += [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
+        neighbours += [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
         if len(above) < most:
             places = range(len(above) + 1)
-            found += [(*above[:at], layer, *above[at:], base) for at in places for layer in library.layers]
-    return list(dict.fromkeys(one for one in found if all(a != b for a, b in pairwise(one))))
+            neighbours += [(*above[:at], layer, *above[at:], base) for at in places for layer in library.layers]
+    return list(dict.fromkeys(one for one in neighbours if all(a != b for a, b in pairwise(one))))
 
 
 def _bic(fit: Fit) -> float:
