@@ -1,5 +1,10 @@
-"""A fit in four steps: multi-start, polish with uncertainties, resolution, result."""
+"""A fit in four steps: multi-start, polish with uncertainties, resolution, result; and again with model discrepancy.
 
+Where nothing is said of a discrepancy, the rule is: the stack is fitted with independent noise; where residuals of
+neighbours along the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
+"""
+
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,20 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
+from fits.data.scans import correlation, neighbours
+from fits.data.totals import Totals
 from fits.names import Objective
-from fits.optimise import apertures
-from fits.optimise.descent import COST_TOLERANCE, ROUGH_TOLERANCE
-from fits.optimise.discrepancy import (
-    datasets_with_discrepancy,
-    start_points_with_discrepancy,
-    with_discrepancy,
-    without_discrepancy,
-)
-from fits.optimise.identifiability import UNCONSTRAINED_BEYOND
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE
 from fits.optimise.multi_start import (
+    Optimum,
     Solver,
-    StartOutcome,
     multi_start,
+    polish,
     rough_descent,
     screened_starts,
     start_points,
@@ -33,16 +33,14 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.polish import Optimum, polish
-from fits.optimise.refinement import Accuracy, refined
-from fits.optimise.resolution import resolutions
+from fits.optimise.resolution import Accuracy, has_rays, leaves_rays_open, refined, resolutions, rings_for_starts
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
+from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
-from fits.problem.joint import Joint
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import FittingProblem, Problem
+from fits.problem.problem import FittingProblem, Joint, Problem
 from fits.progress import Progress, silent
 from layerjax._checks import require_kind
 
@@ -50,6 +48,9 @@ Floats = NDArray[np.float64]
 
 SAME_AT_MOST = 0.05
 """Share of its box up to which a standard error counts where minima are compared."""
+
+MOST_STARTS = 8
+"""Minima without model discrepancy that the fit with it starts from; of its other starts half as many."""
 
 
 def fit(
@@ -84,8 +85,8 @@ def fit(
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with model discrepancy (`again`); one of
-            another problem is replaced.
+            done. It stays, as does one beside it for what is fitted again with model discrepancy; one of another
+            problem is replaced.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
@@ -102,8 +103,15 @@ def fit(
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
         problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
-    run = _Run(starts, seed, solver, options, progress or silent, checkpoint)
-    return _fitted(problem, run)
+    return fit_problem(
+        problem,
+        starts=starts,
+        seed=seed,
+        solver=solver,
+        options=options,
+        progress=progress,
+        checkpoint=checkpoint,
+    )
 
 
 def fit_problem(
@@ -128,7 +136,19 @@ def fit_problem(
     Raises:
         ValueError: starts < 1; an unknown solver.
     """
-    return _fitted(problem, _Run(starts, seed, solver, options, progress or silent, checkpoint, screen))
+    if starts < 1:
+        raise ValueError(f"starts is {starts}; it must be at least 1")
+    if solver not in get_args(Solver):
+        raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
+    require_kind("options", options, FitOptions)
+    run = _Run(starts, seed, solver, options, progress or silent, checkpoint, screen)
+    independent = _fit_from(problem, start_points(problem, starts, seed), run)
+    before = {
+        name: found
+        for name, one in problem.problems.items()
+        if undecided(one) and needs_discrepancy(found := without_discrepancy(independent.part(name)), options)
+    }
+    return _with_discrepancy(problem, independent, before, run) if before else independent
 
 
 def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
@@ -161,30 +181,58 @@ class _Run(NamedTuple):
     screen: bool = False
 
 
-def _fitted(problem: FittingProblem, run: _Run) -> Fit:
-    """The fit with independent noise, and where its residuals ask for it that with model discrepancy."""
-    if run.starts < 1:
-        raise ValueError(f"starts is {run.starts}; it must be at least 1")
-    if run.solver not in get_args(Solver):
-        raise ValueError(f"solver is {run.solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    require_kind("options", run.options, FitOptions)
-    result = _fit_from(problem, start_points(problem, run.starts, run.seed), run)
-    before = datasets_with_discrepancy(result, run.options)
-    return _with_discrepancy(problem, result, before, run) if before else result
+def undecided(problem: Problem) -> bool:
+    """Whether it is left to the residuals, and could be counted."""
+    noise = problem.noise
+    if isinstance(problem.data, Totals):
+        return False  # they have no neighbours
+    return noise.discrepancy is None and noise.tails == "gaussian" and problem.objective == "likelihood"
+
+
+def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
+    """What is to be said of a fit without model discrepancy."""
+    pairs = neighbours(fit.problem.data.used(), fit.residuals)
+    return WithoutDiscrepancy(
+        values=fit.values,
+        errors=fit.standard_errors,
+        chi_square=fit.chi_square,
+        degrees_of_freedom=fit.degrees_of_freedom,
+        log_likelihood=fit.log_likelihood,
+        residual_autocorrelation=correlation(*pairs),
+        pairs=pairs[0].size,
+    )
+
+
+def needs_discrepancy(found: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
+    """Whether residuals of neighbours are correlated, by the rule above."""
+    correlation = found.residual_autocorrelation
+    clear = correlation * math.sqrt(found.pairs) > options.autocorrelation_errors
+    return clear and correlation > options.autocorrelation
 
 
 def _with_discrepancy(
     problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
 ) -> Fit:
-    """The fit with model discrepancy of these data sets, which were fitted with independent noise before."""
-    whole = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in before})
+    """The fit with model discrepancy of these data sets, which were fitted with independent noise before.
+
+    It starts from the minima of that fit, and from some of as many points as that had.
+    """
+    changed = {name: problem.problems[name] for name in before}
+    whole = problem.with_problems(
+        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in changed.items()}
+    )
+    points = []
+    for minimum in independent.minima[:MOST_STARTS]:
+        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
+        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
+    others = start_points(whole, min(run.starts, MOST_STARTS // 2), run.seed)
 
     def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         run.progress(f"{stage} with model discrepancy", done, total, info)
 
     checkpoint = None if run.checkpoint is None else discrepancy_checkpoint(run.checkpoint)
-    points = start_points_with_discrepancy(whole, independent, run.starts, run.seed)
-    return _fit_from(whole, points, run._replace(progress=progress, checkpoint=checkpoint), before)
+    again = run._replace(progress=progress, checkpoint=checkpoint)
+    return _fit_from(whole, np.concatenate([points, others]), again, before)
 
 
 def _fit_from(
@@ -196,17 +244,22 @@ def _fit_from(
     """The fit from these points (starts, P) of the unit box, in four steps."""
     # 1. all starts, at a coarse resolution where that is open
     known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
-    open_rays = {name for name, one in problem.problems.items() if apertures.leaves_open(one)}
+    open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
-    problem = problem.with_problems({name: apertures.for_starts(problem.problems[name]) for name in open_rays})
-    screen = run.screen and run.solver == "least_squares"
-    ends = screened_starts(problem, points) if screen else _ends(problem, points, run)
+    problem = problem.with_problems({name: rings_for_starts(problem.problems[name]) for name in open_rays})
+    if run.screen and run.solver == "least_squares":
+        ends = screened_starts(problem, points)
+    elif run.checkpoint is None:
+        ends = multi_start(problem, points, run.solver, run.progress)
+    else:  # each is kept as it ends
+        with starts_store(run.checkpoint, problem, points, run.solver) as store:
+            ends = multi_start(problem, points, run.solver, run.progress, store)
     # 2. the lowest of them, to its very minimum, with the uncertainties there
     at = polish(problem, ends, run.solver, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
     # 3. at the resolution that the noise of the data asks for
     accuracy = None
-    if not run.screen and (known or any(map(apertures.has_rays, problem.problems.values()))):
+    if not run.screen and (known or any(map(has_rays, problem.problems.values()))):
         at, accuracy = refined(at, known, open_rays, run.solver, run.options, run.progress)
     # 4. what follows from it
     return _result(at, accuracy, run, without)
@@ -246,14 +299,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
     if np.all(np.isfinite(at.predicted)):  # to compute it again, another program would be compiled
         vars(result)["predicted"] = at.predicted
     return result
-
-
-def _ends(problem: FittingProblem, points: Floats, run: _Run) -> list[StartOutcome]:
-    """Outcomes of the starts (starts, P) in the unit box, each kept in the checkpoint as it ends."""
-    if run.checkpoint is None:
-        return multi_start(problem, points, run.solver, run.progress)
-    with starts_store(run.checkpoint, problem, points, run.solver) as store:
-        return multi_start(problem, points, run.solver, run.progress, store)
 
 
 def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[tuple[Minimum, ...], dict[str, int]]:

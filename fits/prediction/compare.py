@@ -9,7 +9,7 @@ import numpy as np
 
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
-from fits.prediction.model_scores import ModelScore, model_scores
+from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits

@@ -196,7 +196,7 @@ def _scores(held_out: HeldOut) -> str:
 def _stack_text(fit: "Fit") -> str:
     import tomli_w
 
-    from fits.problem.toml import material_to_dict
+    from fits.problem.stack_file import material_to_dict
 
     return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
 

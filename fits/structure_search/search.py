@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
-from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
-from fits.optimise.fit import fit_problem, fit_with_discrepancy
+from fits.optimise.fit import fit_problem, fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import CrossValidation
-from fits.prediction.evidence import Evidence
-from fits.prediction.model_scores import ModelScore, out_of_sample, rank_models
+from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
+from fits.prediction.importance import Evidence
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
