@@ -25,7 +25,7 @@ from fits.maps.inputs import MapData
 from fits.maps.options import MapOptions
 from fits.maps.search import Results, Starts, predict_all, reduced_chi_square, search, starts_at
 from fits.maps.store import Store
-from fits.optimise.fit import fit_problem
+from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
 from fits.optimise.resolution import Resolutions, has_rays, leaves_rays_open, resolution_in_words, resolutions
 from fits.problem.model import Model
@@ -221,7 +221,7 @@ def _resolved(problem: Problem, options: MapOptions) -> tuple[Problem, Resolutio
     known = resolutions(problem)
     if not (leaves_rays_open(problem) or (known is not None and known.open)):
         return problem, known
-    found = fit_problem(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
+    found = fit(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
     return replace(problem, transport=found.transport, instrument=found.instrument), known
 
 

@@ -40,7 +40,7 @@ from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import FittingProblem, Joint, Problem
+from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, silent
 from layerjax._checks import require_kind
 
@@ -68,11 +68,12 @@ def fit(
     options: FitOptions = DEFAULT,
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
+    screen: bool = False,
 ) -> Fit:
     """Find the parameters of `stack` that explain `data` best, and how well the data determine them.
 
     Args:
-        stack: holds `Free` where a number is to be fitted; or a `Joint` of problems, in which all else is said.
+        stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
             that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
@@ -87,55 +88,24 @@ def fit(
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
             done. It stays, as does one beside it for what is fitted again with model discrepancy; one of another
             problem is replaced.
+        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
+            lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
-    if isinstance(stack, Joint):
+    if isinstance(stack, FittingProblem):
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
         for name, given in arguments.items():
             if given is not None:
-                raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
-        problem: FittingProblem = stack
+                raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
+        problem = stack
     elif data is None:
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
         problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
-    return fit_problem(
-        problem,
-        starts=starts,
-        seed=seed,
-        solver=solver,
-        options=options,
-        progress=progress,
-        checkpoint=checkpoint,
-    )
-
-
-def fit_problem(
-    problem: FittingProblem,
-    *,
-    starts: int = 32,
-    seed: int = 0,
-    solver: Solver = "least_squares",
-    options: FitOptions = DEFAULT,
-    progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-    screen: bool = False,
-) -> Fit:
-    """Find the best parameters of a problem that is already put together, as `fit` does.
-
-    Args:
-        problem: a `Problem`, or a `Joint` of several.
-        starts, seed, solver, options, progress, checkpoint: see `fit`.
-        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
-            lowest after a few steps, and stop near the minimum.
-
-    Raises:
-        ValueError: starts < 1; an unknown solver.
-    """
     if starts < 1:
         raise ValueError(f"starts is {starts}; it must be at least 1")
     if solver not in get_args(Solver):
@@ -152,16 +122,16 @@ def fit_problem(
 
 
 def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
-    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit_problem`."""
+    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit`."""
     before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
-    return _with_discrepancy(problem, independent, before, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
+    return _with_discrepancy(problem, independent, before, _Run(starts, seed))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
     ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
     best = polish(problem, ends, "least_squares", check=False, tolerance=ROUGH_TOLERANCE)
-    return _result(best, None, _Run(len(ends), 0, "least_squares", DEFAULT, silent, None), {})
+    return _result(best, None, _Run(len(ends)), {})
 
 
 def discrepancy_checkpoint(checkpoint: str | Path) -> Path:
@@ -170,14 +140,14 @@ def discrepancy_checkpoint(checkpoint: str | Path) -> Path:
 
 
 class _Run(NamedTuple):
-    """How a problem is fitted."""
+    """How a problem is fitted: see `fit`."""
 
     starts: int
-    seed: int
-    solver: Solver
-    options: FitOptions
-    progress: Progress
-    checkpoint: str | Path | None
+    seed: int = 0
+    solver: Solver = "least_squares"
+    options: FitOptions = DEFAULT
+    progress: Progress = silent
+    checkpoint: str | Path | None = None
     screen: bool = False
 
 

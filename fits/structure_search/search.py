@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
-from fits.optimise.fit import fit_problem, fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
+from fits.optimise.fit import fit, fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.result import Fit
 from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
 from fits.prediction.importance import Evidence
@@ -249,7 +249,7 @@ class _Run:
         def fitted() -> Fit:
             problem = self._problem(structure)
             problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed, screen=True)
+            return fit(problem, starts=self.options.starts, seed=self.seed, screen=True)
 
         return self._kept(structure, "", fitted)
 
@@ -262,21 +262,21 @@ class _Run:
                 return fit_with_discrepancy(problem, coarse, starts=self.options.starts, seed=self.seed)
             if undecided(problem):
                 problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed)
+            return fit(problem, starts=self.options.starts, seed=self.seed)
 
-        fit = self._kept(structure, "+full", fitted)
+        found = self._kept(structure, "+full", fitted)
         if self.store is None:
-            return fit, *out_of_sample(fit)
+            return found, *out_of_sample(found)
         name = named(structure)
         stored = self.store.get(name)
         if stored is None:
-            checked, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
+            checked, evidence = out_of_sample(found, done=_HeldOut(self.store, f"{name}: held out", found))
             self.store.put(name, {"cross-validation": vars(checked), "evidence": vars(evidence)})
         else:
             kept = stored["cross-validation"]
             checked = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
             evidence = Evidence(**stored["evidence"])
-        return fit, checked, evidence
+        return found, checked, evidence
 
     def _problem(self, structure: Structure) -> Problem:
         return Problem(self.library.stack(structure), self.data, **self.settings)
