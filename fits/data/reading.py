@@ -46,17 +46,17 @@ class ReadOptions:
         Raises:
             ValueError: an unknown option, one that is given twice, or a bad value.
         """
-        found: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         for word in words:
             name, equals, text = word.partition("=")
             if not equals or name not in READERS:
                 raise ValueError(
                     f"{word!r} is no option of reading; it must be {', '.join(f'{o}=...' for o in READERS)}"
                 )
-            if name in found:
+            if name in options:
                 raise ValueError(f"{name} is given twice")
-            found[name] = READERS[name](name, text)
-        return cls(**found, **more)
+            options[name] = READERS[name](name, text)
+        return cls(**options, **more)
 
     def read(self, path: str | Path) -> Measurements:
         """All that a file holds. ValueError as `fits.read`."""

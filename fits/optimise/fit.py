@@ -173,10 +173,10 @@ def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
     )
 
 
-def needs_discrepancy(found: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
+def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
     """Whether residuals of neighbours are correlated, by the rule above."""
-    correlation = found.residual_autocorrelation
-    clear = correlation * math.sqrt(found.pairs) > options.autocorrelation_errors
+    correlation = independent.residual_autocorrelation
+    clear = correlation * math.sqrt(independent.pairs) > options.autocorrelation_errors
     return clear and correlation > options.autocorrelation
 
 
@@ -237,7 +237,7 @@ def _fit_from(
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
     """The fit of an optimum: values, errors, minima, and its status in words."""
-    problem, lowest, found, options = at.problem, at.lowest, at.found, run.options
+    problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
     equivalent = options.equivalent_cost * at.excess
@@ -280,9 +280,9 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
     cost = np.array([end.cost for end in ends])
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(np.stack([end.vector for end in ends]))))
     width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
-    spread = np.nan_to_num(at.found.standard_errors / width, nan=0.0, posinf=np.inf)
+    spread = np.nan_to_num(at.uncertainty.standard_errors / width, nan=0.0, posinf=np.inf)
     same = options.same_values + options.same_errors * np.minimum(spread, SAME_AT_MOST)
-    free = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, at.found.insensitive)
+    free = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, at.uncertainty.insensitive)
     same_at_equal_cost = np.where(free, np.inf, same)
 
     def are_one(index: int, other: int) -> bool:

@@ -55,10 +55,10 @@ class StartOutcome(NamedTuple):
     max_steps_reached: bool
 
     @classmethod
-    def of(cls, found: Descent, steps_before: int = 0) -> "StartOutcome":
+    def of(cls, end: Descent, steps_before: int = 0) -> "StartOutcome":
         """The outcome of a descent, after so many steps before it."""
-        steps = steps_before + int(found.steps)
-        return cls(found.vector, float(found.cost), steps, bool(found.converged), bool(found.max_steps_reached))
+        steps = steps_before + int(end.steps)
+        return cls(end.vector, float(end.cost), steps, bool(end.converged), bool(end.max_steps_reached))
 
 
 def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
@@ -232,7 +232,7 @@ class Optimum(NamedTuple):
     problem: FittingProblem
     ends: list[StartOutcome]
     best: int
-    found: Uncertainty
+    uncertainty: Uncertainty
     improved: bool
     predicted: Floats
     excess: float

@@ -326,7 +326,7 @@ def refined(
     open how many rays stand for its cones.
     """
     while True:
-        found: dict[str, Accuracy] = {}
+        accuracies: dict[str, Accuracy] = {}
         changed: dict[str, Problem] = {}
         for name, predicted in at.problem.shares(at.predicted).items():
             problem, parts = at.problem.problems[name], []
@@ -349,14 +349,14 @@ def refined(
             if parts:  # of one measurement errors add up
                 resolution, words = (", ".join(getattr(part, of) for part in parts) for of in ("resolution", "words"))
                 error = float(np.sum([part.error for part in parts]))
-                found[name] = Accuracy(resolution, error, f"numerical error of the model: {words}")
+                accuracies[name] = Accuracy(resolution, error, f"numerical error of the model: {words}")
         if not changed:
             resolution, words = (
-                _by_name({name: getattr(one, of) for name, one in found.items()}) for of in ("resolution", "words")
+                _by_name({name: getattr(one, of) for name, one in accuracies.items()}) for of in ("resolution", "words")
             )
-            return at, Accuracy(resolution, float(np.max([one.error for one in found.values()])), words)
+            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
         whole = at.problem.with_problems(changed)
-        words = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in found})
+        words = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
         ends = _fitted_again(at, whole, solver, words, options.equivalent_cost, progress)
         again = polish(whole, ends, solver, check=at.improved)
         at = again._replace(improved=again.improved or at.improved)
@@ -398,12 +398,12 @@ def _fitted_again(
             if (group := next(near, None)) is None:
                 groups.append(group := [])
             group.append(index)
-    # 2. those matter that are no farther behind the best than its cost may move
+    # 2. those matter whose cost is no farther above the lowest than that may move
     before = [at.ends[group[0]] for group in groups]
     ends = [end._replace(cost=cost(end)) for end in before]
     moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
-    behind = np.array([end.cost - before[0].cost for end in before])
-    matter = np.flatnonzero(~(behind > equivalent * at.excess + np.fmax(moved, moved[0])))
+    above = np.array([end.cost - before[0].cost for end in before])
+    matter = np.flatnonzero(~(above > equivalent * at.excess + np.fmax(moved, moved[0])))
     # 3. they are fitted again, and then what is lowest until it was
     wanted, fitted, done = [int(index) for index in matter[:MOST_MINIMA]], set[int](), 0
     while wanted:

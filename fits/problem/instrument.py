@@ -153,16 +153,16 @@ def optics_of(
             if forward is not None:
                 forward = forward[row]  # the sample is tilted one way, whichever ray of a cone it meets
 
-    def given(part: Any) -> Array | None:
+    def array(part: Any) -> Array | None:
         return None if part is None else jnp.asarray(part)
 
     return Optics(
         wi=jnp.asarray(pairs[0]),
         wo=jnp.asarray(pairs[1]),
-        row=given(row),
-        share=given(share),
-        forward=given(forward),
-        incidence=given(incidence),
+        row=array(row),
+        share=array(share),
+        forward=array(forward),
+        incidence=array(incidence),
         known=known_directions(*pairs) if follow and forward is None else None,
     )
 

@@ -381,12 +381,12 @@ class JointModel(Density):
 
     Attributes:
         parts: the densities of the data sets.
-        own: for each of them, the places of its parameters in the vector.
+        places: for each of them, the places of its parameters in the vector.
     """
 
     parts: tuple[Model, ...]
     box: Box
-    own: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     varying: bool = eqx.field(static=True)
 
     @property
@@ -446,14 +446,14 @@ class JointModel(Density):
         predicted, rows = _column([values for _, (values, _) in found]), [rows for _, (_, rows) in found]
         return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
 
-    def _together(self, vector: Array, found: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
+    def _together(self, vector: Array, each: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
         """Residuals of the data sets as those of all: data, prior, levels of noise."""
-        levels = [level.reshape(-1) for _, _, *levels in found for level in levels]
-        data = jnp.concatenate([residuals[0].reshape(-1) for residuals in found])
+        levels = [level.reshape(-1) for _, _, *levels in each for level in levels]
+        data = jnp.concatenate([residuals[0].reshape(-1) for residuals in each])
         return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))
 
     def _with_vectors(self, vector: Array) -> list[tuple[Model, Array]]:
-        return [(part, vector[np.array(own)]) for part, own in zip(self.parts, self.own, strict=True)]
+        return [(part, vector[np.array(places)]) for part, places in zip(self.parts, self.places, strict=True)]
 
     def _split(self, column: Array) -> list[Array]:
         """What of a column (N, 1) belongs to each data set, in the shape of its values."""

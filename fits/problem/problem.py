@@ -337,7 +337,7 @@ class Joint(FittingProblem):
         model = JointModel(
             parts=models,
             box=Box(**each, between=jnp.asarray(np.array(between).reshape(-1, len(names)))),
-            own=tuple(places.values()),
+            places=tuple(places.values()),
             varying=any(one.varying for one in models),
         )
         start, low, high = map(gathered, ("start", "low", "high"))
@@ -380,9 +380,9 @@ class Joint(FittingProblem):
         return Joint({**self.parts, **changed}, self._common()) if changed else self
 
 
-def _begins(given: str) -> Callable[[str], bool]:
+def _begins(prefix: str) -> Callable[[str], bool]:
     """Whether a parameter's name is this, or that of a part of it."""
-    return lambda name: name == given or name.startswith((f"{given}.", f"{given}["))
+    return lambda name: name == prefix or name.startswith((f"{prefix}.", f"{prefix}["))
 
 
 def _same(one: Problem, other: Problem, name: str) -> bool:
