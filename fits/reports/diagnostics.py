@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.data.neighbours import correlation, neighbours
-from fits.data.scans import incidences
-from fits.problem.model import Density
+from fits.data.scans import correlation, incidences, neighbours
+from fits.problem.model import Model
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -85,7 +84,7 @@ def misfit(fit: "Fit") -> np.ndarray:
 
     With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
     """
-    independent = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+    independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, independent / _unit(fit))
 
 

@@ -167,7 +167,7 @@ def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, opti
 def _stack_text(fit: "Fit") -> str:
     import tomli_w
 
-    from fits.problem.toml import material_to_dict
+    from fits.problem.stack_file import material_to_dict
 
     return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
 

@@ -89,8 +89,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
     """
     from fits.problem.parameters import Free
-    from fits.problem.stack_file import write_problem
-    from fits.problem.toml import transport_to_dict
+    from fits.problem.stack_file import transport_to_dict, write_problem
     from layerjax import Transport
 
     problem, transport = fit.problem, fit.problem.transport
@@ -152,8 +151,8 @@ def load_fit(directory: str | Path) -> "Fit":
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
-    from fits.optimise.identifiability import Direction
     from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
+    from fits.optimise.uncertainty import Direction
 
     directory = Path(directory)
     content = _content(directory)
@@ -194,8 +193,7 @@ def load_fit(directory: str | Path) -> "Fit":
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
     """The fitting problem: the stack file and the data, with what the fit chose beside them."""
     from fits.problem.problem import Problem
-    from fits.problem.stack_file import read_problem
-    from fits.problem.toml import transport_from_dict
+    from fits.problem.stack_file import read_problem, transport_from_dict
 
     given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
     source = Source(**content["source"] | {"notes": tuple(content["source"]["notes"])})

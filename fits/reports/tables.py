@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from fits.optimise.result import Fit
     from fits.prediction.compare import ComparedFit, Comparison
-    from fits.prediction.model_scores import ModelScore
+    from fits.prediction.cross_validation import ModelScore
     from fits.prediction.predict import Prediction
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior

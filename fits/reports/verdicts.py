@@ -15,10 +15,10 @@ import numpy as np
 
 from fits.data.checks import repeats
 from fits.data.totals import Totals
-from fits.optimise.identifiability import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
 from fits.optimise.options import FitOptions
-from fits.problem.model import Density
+from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
+from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.problem.parameters import is_free
 from fits.reports.diagnostics import ResidualStructure, residual_structure, standardised
@@ -166,15 +166,15 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
     positive = used.values > 0.0
     described, noise, discrepancy = True, math.nan, None
     if likelihood:
-        offsets = np.abs(np.asarray(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted), float))
+        offsets = np.abs(np.asarray(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted), float))
         significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > options.significance
         described = not (significant and float(np.median(offsets)) > options.misfit)
         if positive.any():
-            sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, used.values))
+            sigma = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, used.values))
             noise = float(np.median(sigma[positive] / used.values[positive]))
     fitted = fit.problem.build(fit.vector).correlation
     if likelihood and fitted is not None:
-        remaining = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+        remaining = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
         whole = float(np.sum(offsets**2))
         discrepancy = fitted, 1.0 - float(np.sum(remaining**2)) / whole if whole > 0.0 else 0.0
     return Assessment(
@@ -496,7 +496,7 @@ def ratio_without_discrepancy(fit: "Fit") -> float:
     if fit.without_discrepancy is not None:
         square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
     else:
-        square = float(np.sum(np.square(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted))))
+        square = float(np.sum(np.square(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted))))
         freedom = fit.degrees_of_freedom
     return square / freedom if freedom > 0 else math.nan
 

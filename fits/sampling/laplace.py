@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import expit, gammaln, logit
 
-from fits.optimise.descent import evaluate_at
+from fits.optimise.levenberg_marquardt import evaluate_at
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 

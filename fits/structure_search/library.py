@@ -7,8 +7,7 @@ from typing import Any
 
 import layerjax as lj
 from fits.problem.parameters import Free, LogUniform
-from fits.problem.toml import stack_from_dict
-from fits.problem.values import check_keys, read_tables, require_table
+from fits.problem.stack_file import check_keys, read_tables, require_table, stack_from_dict
 
 Structure = tuple[str, ...]
 """Names of layers from top to bottom, and of the base."""

@@ -22,13 +22,12 @@ import numpy as np
 
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
-from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
-from fits.optimise.fit import fit_problem, fit_with_discrepancy
+from fits.optimise.fit import fit as run_fit
+from fits.optimise.fit import fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import CrossValidation
-from fits.prediction.evidence import Evidence
-from fits.prediction.model_scores import ModelScore, out_of_sample, rank_models
+from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
+from fits.prediction.importance import Evidence
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -283,7 +282,7 @@ class _Work(NamedTuple):
 
     def _fit(self, problem: Problem, screen: bool = False) -> Fit:
         options = self.options
-        return fit_problem(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
+        return run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
 
     def _load_or_fit(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
         """The fit of a structure, from its result directory if it is there."""

@@ -217,7 +217,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
     """
     from scipy import stats
 
-    from fits.data.neighbours import autocorrelation
+    from fits.data.scans import autocorrelation
     from fits.reports.diagnostics import residual_structure
 
     structure = residual_structure(data, residuals)

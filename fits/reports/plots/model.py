@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, incidences, signed_angle
 from fits.prediction.predict import with_discrepancy
-from fits.problem.model import Density
+from fits.problem.model import Model
 from fits.reports.diagnostics import bsdf, misfit, misfit_label, over_all_rows
 from fits.reports.plots.data import (
     ANGLE_LABEL,
@@ -171,7 +171,7 @@ def assumed_sigma(fit: "Fit") -> Floats:
     """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call(Density.sigma_at, fit.vector, fit.predicted))
+    return np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:

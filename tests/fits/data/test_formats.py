@@ -1,6 +1,7 @@
 """Choosing a reader, and FRED tables."""
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,10 @@ from fits.data.formats._text import read_lines
 from fits.data.geometry import direction, slices
 from fits.data.reading import ReadOptions, read
 from fits.names import FORMATS
+from tests.helpers import data_files
 from tests.helpers.places import COATINGS as DATA
 
-
-def _file(tmp_path: Path, text: str | bytes, name: str = "table.txt") -> Path:
-    path = tmp_path / name
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return path
+_file = partial(data_files.written, name="table.txt")
 
 
 @pytest.mark.parametrize(
@@ -28,7 +26,7 @@ def _file(tmp_path: Path, text: str | bytes, name: str = "table.txt") -> Path:
     ],
 )
 def test_content_decides_and_not_the_name(tmp_path, name, format):
-    disguised = _file(tmp_path, (DATA / name).read_bytes(), "data.xyz")
+    disguised = _file(tmp_path, (DATA / name).read_bytes(), name="data.xyz")
     assert read(disguised).source.format == read(DATA / name).source.format == format
 
 
@@ -42,7 +40,7 @@ def test_content_decides_and_not_the_name(tmp_path, name, format):
 )
 def test_unknown_bsdf_files_say_what_was_seen(tmp_path, head, message):
     with pytest.raises(ValueError, match=message):
-        read(_file(tmp_path, head, "sample.bsdf"))
+        read(_file(tmp_path, head, name="sample.bsdf"))
 
 
 def test_bad_arguments(tmp_path):

@@ -11,7 +11,6 @@ from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
 from fits.data.scans import incidences, signed_angle
 from fits.optimise import multi_start as starts_module
-from fits.optimise import refinement
 from fits.optimise import resolution as resolution_module
 from fits.optimise.fit import fit
 from fits.optimise.options import DEFAULT
@@ -165,7 +164,7 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert known.in_words(only) == "12 nodes, 24 modes"
     assert known.partly_finer(here, only) == []
 
-    class Alike(refinement.Values):
+    class Alike(resolution_module.Values):
         """A model that nodes change nothing of: its error falls with the modes."""
 
         def __init__(self):
@@ -175,7 +174,9 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
             return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
 
     monkeypatch.undo()
-    needed, error, finest = refinement._needed(known, here, Alike(), DEFAULT.numerical_error, lambda *_: None)
+    needed, error, finest = resolution_module.needed_resolution(
+        known, here, Alike(), DEFAULT.numerical_error, lambda *_: None
+    )
     assert (needed.nodes, finest) == (12, False)
     assert needed.modes > 30
     assert error <= DEFAULT.numerical_error

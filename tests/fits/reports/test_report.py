@@ -12,8 +12,7 @@ import layerjax as lj
 from fits.any_report import report
 from fits.data.geometry import direction, slices
 from fits.data.measurements import Measurements, Source
-from fits.data.neighbours import autocorrelation
-from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
+from fits.data.scans import autocorrelation, in_plane, incidences, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit, Minimum
+from fits.optimise.uncertainty import Direction
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem

@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.data.neighbours import correlation, neighbours
-from fits.data.scans import signed_angle
+from fits.data.scans import correlation, neighbours, signed_angle
 from fits.optimise.fit import fit
-from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit
-from fits.problem.model import Density
+from fits.optimise.uncertainty import Direction
+from fits.problem.model import Model
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -186,9 +185,7 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert match is not None
     assert float(match[1]) == pytest.approx(100.0 * np.median(off.predicted / values - 1.0), abs=1.0)
     assert float(match[2]) == pytest.approx(2.0)
-    without = (
-        np.sum(np.square(off.problem.call(Density.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
-    )
+    without = np.sum(np.square(off.problem.call(Model.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
     assert f"with the discrepancy term, {without:.4g} without" in verdicts.summary(off)[-1]
     assert not assess(replace(fitted, problem=simulated(0), vector=TRUTH)).described  # 10 % beside a noise of 2 %
     right = replace(fitted, problem=replace(fitted.problem, noise=WIDE), unidentified=())
