@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from fits.any_report import report as report
     from fits.batch.fit_files import FittedFiles as FittedFiles
     from fits.batch.fit_files import fit_files as fit_files
-    from fits.data.formats import read as read
     from fits.data.formats.csv import write_csv as write_csv
     from fits.data.formats.rxt import Slab as Slab
     from fits.data.formats.rxt import read_slab as read_slab
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from fits.data.geometry import slices as slices
     from fits.data.measurements import Measurements as Measurements
     from fits.data.reading import ReadOptions as ReadOptions
+    from fits.data.reading import read as read
     from fits.data.spheres import Sphere as Sphere
     from fits.data.spheres import Spheres as Spheres
     from fits.data.totals import Totals as Totals
@@ -30,34 +30,34 @@ if TYPE_CHECKING:
     from fits.maps.options import MapOptions as MapOptions
     from fits.maps.options import SpatialPrior as SpatialPrior
     from fits.optimise.fit import fit as fit
-    from fits.optimise.identifiability import Direction as Direction
     from fits.optimise.options import FitOptions as FitOptions
     from fits.optimise.result import Fit as Fit
+    from fits.optimise.uncertainty import Direction as Direction
     from fits.prediction.average import Average as Average
     from fits.prediction.average import average as average
     from fits.prediction.compare import Comparison as Comparison
     from fits.prediction.compare import compare as compare
+    from fits.prediction.cross_validation import ModelScore as ModelScore
     from fits.prediction.cross_validation import cross_validate as cross_validate
-    from fits.prediction.evidence import Evidence as Evidence
-    from fits.prediction.evidence import evidence as evidence
-    from fits.prediction.model_scores import ModelScore as ModelScore
+    from fits.prediction.importance import Evidence as Evidence
+    from fits.prediction.importance import evidence as evidence
     from fits.prediction.options import ComparisonOptions as ComparisonOptions
     from fits.prediction.predict import Prediction as Prediction
     from fits.prediction.predict import Scores as Scores
     from fits.prediction.predict import predict as predict
     from fits.prediction.predict import scores as scores
-    from fits.problem.discrepancy.parameters import Discrepancy as Discrepancy
+    from fits.problem.discrepancy import Discrepancy as Discrepancy
     from fits.problem.instrument import Instrument as Instrument
-    from fits.problem.joint import Joint as Joint
     from fits.problem.noise import Noise as Noise
     from fits.problem.parameters import Free as Free
     from fits.problem.parameters import LogNormal as LogNormal
     from fits.problem.parameters import LogUniform as LogUniform
     from fits.problem.parameters import Normal as Normal
+    from fits.problem.parameters import PowerLaw as PowerLaw
     from fits.problem.parameters import Uniform as Uniform
+    from fits.problem.problem import Joint as Joint
     from fits.problem.problem import Problem as Problem
     from fits.problem.simulate import simulate as simulate
-    from fits.problem.spectra import PowerLaw as PowerLaw
     from fits.problem.stack_file import read_problem as read_problem
     from fits.problem.stack_file import write_problem as write_problem
     from fits.reports.render import render as render
@@ -83,8 +83,8 @@ _HOMES = {
     "Comparison": "prediction.compare",
     "compare": "prediction.compare",
     "ComparisonOptions": "prediction.options",
-    "Evidence": "prediction.evidence",
-    "evidence": "prediction.evidence",
+    "Evidence": "prediction.importance",
+    "evidence": "prediction.importance",
     "ExportReport": "exports.export",
     "export": "exports.export",
     "Fit": "optimise.result",
@@ -94,20 +94,20 @@ _HOMES = {
     "open_map": "maps.fitted_map",
     "MapOptions": "maps.options",
     "SpatialPrior": "maps.options",
-    "ModelScore": "prediction.model_scores",
-    "read": "data.formats",
+    "ModelScore": "prediction.cross_validation",
+    "read": "data.reading",
     "ReadOptions": "data.reading",
     "write_csv": "data.formats.csv",
     "read_slab": "data.formats.rxt",
     "Slab": "data.formats.rxt",
     "Geometry": "data.geometry",
     "slices": "data.geometry",
-    "Direction": "optimise.identifiability",
-    "Discrepancy": "problem.discrepancy.parameters",
+    "Direction": "optimise.uncertainty",
+    "Discrepancy": "problem.discrepancy",
     "Instrument": "problem.instrument",
-    "Joint": "problem.joint",
+    "Joint": "problem.problem",
     "Noise": "problem.noise",
-    "PowerLaw": "problem.spectra",
+    "PowerLaw": "problem.parameters",
     "Measurements": "data.measurements",
     "Sphere": "data.spheres",
     "Spheres": "data.spheres",

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.maps.fitted_map import FittedMap
 from fits.maps.report import page
@@ -41,9 +42,11 @@ def report(
             several measurements (see `Fit.part`); or a part of a map is damaged.
     """
     require_kind("fit", fit, Fit, FittedMap)
-    if isinstance(fit, Fit):
-        html.report(fit, posterior, path, others=others, name=name, held_out=held_out, options=options, force=force)
+    if isinstance(fit, FittedMap):
+        if posterior is not None or others or held_out is not None:
+            raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")
+        page.report(fit, path, force)
         return
-    if posterior is not None or others or held_out is not None:
-        raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")
-    page.report(fit, path, force)
+    fit.require_one("report")
+    whole = html.FitReport(fit, posterior, others or {}, name, held_out, options)
+    write_text(path, whole.page(), force=force)

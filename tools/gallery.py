@@ -8,7 +8,7 @@ from typing import Any
 import jax
 from PIL import Image
 
-from fits.problem.toml import material_to_dict
+from fits.problem.stack_file import material_to_dict
 from fits.reports.plots.data import as_png
 from fits.reports.render import render
 from layerjax import gallery

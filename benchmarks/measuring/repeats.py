@@ -10,7 +10,7 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
-from fits.optimise.descent import COST_TOLERANCE, descend
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.optimise.multi_start import MOST_STEPS, start_points
 from fits.optimise.resolution import at_start
 from fits.problem.compilation import cores, in_shares

@@ -18,7 +18,6 @@ import layerjax as lj
 from benchmarks.measuring import environment
 from benchmarks.measuring.repeats import Repeats, fit_many
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, figure, table, write
-from fits.optimise.fit import fit_problem
 
 Floats = NDArray[np.float64]
 
@@ -109,7 +108,7 @@ def study(
     for index, values in enumerate(noisy):
         if index % 10 == 0:
             report(f"repeat {index} of {size.repeats}")
-        fit = fit_problem(problem_of(geometry, values), starts=STARTS, seed=index)
+        fit = fits.fit(problem_of(geometry, values), starts=STARTS, seed=index)
         results.append((fit, fits.sample(fit, walkers=WALKERS, seed=index, allow_unconverged=True)))
     rows = _rows(results, many, size)
     limits = stats.binom.interval(0.95, size.repeats, LEVEL)

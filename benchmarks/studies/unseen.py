@@ -13,8 +13,8 @@ import jax
 import fits
 from benchmarks.measuring import environment
 from benchmarks.measuring.writing import DIRECTORY, environment_lines, rounded, table, write
-from fits.data.formats import read
 from fits.data.measurements import Measurements
+from fits.data.reading import read
 from fits.data.selection import Rows, select
 from fits.problem.stack_file import read_problem
 

@@ -5,17 +5,14 @@ from typing import NamedTuple
 
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
-from fits.names import Objective
 from fits.optimise.fit import discrepancy_checkpoint
 from fits.optimise.fit import fit as run_fit
-from fits.optimise.multi_start import Solver
 from fits.optimise.options import options_from
 from fits.optimise.result import Fit
 from fits.problem.stack_file import ProblemFile
 from fits.progress import Progress, silent
 from fits.reports import results
 from fits.reports.html import HeldOut, predict_held_out, write_report
-from fits.reports.results import HELD_OUT, replacing, reserved
 
 DRAWING = "pictures and report"
 
@@ -29,14 +26,12 @@ class Fitted(NamedTuple):
 
 def fit_into(
     directory: str | Path,
-    given: ProblemFile,
+    problem: ProblemFile,
     data: Measurements,
     held_out: Measurements | None = None,
     *,
-    objective: Objective | None = None,
     starts: int = 32,
     seed: int = 0,
-    solver: Solver = "least_squares",
     force: bool = False,
     report: bool = True,
     progress: Progress | None = None,
@@ -45,74 +40,48 @@ def fit_into(
 
     Args:
         directory: as of `save_fit`.
-        given: the stack file.
+        problem: the stack file.
         data, held_out: what is fitted, and what its prediction is scored by.
-        objective: in place of that of the stack file.
-        starts, seed, solver, progress: see `fit`; starts are kept beside the directory until it is there.
+        starts, seed, progress: see `fit`; starts are kept beside the directory until it is there.
         force: replace an earlier result.
         report: with it and its pictures, which take longer than a fit of a transport in closed form.
 
     Raises:
         ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
     """
-    directory = Path(directory)
-    objective = require_posterior(objective or given.objective, "--hold-out" if held_out is not None else None)
-    options = options_from(given.options)
-    kept = directory.resolve().with_name(f".{directory.resolve().name}.starts")
-    with reserved(directory, force):
-        found = run_fit(
-            given.stack,
+    require_score(problem, held_out is not None)
+    target, progress = Path(directory).resolve(), progress or silent
+    kept = target.with_name(f".{target.name}.starts")
+    with results.writing(directory, force) as folder:
+        fit = run_fit(
+            problem.stack,
             data,
-            transport=given.transport,
-            noise=given.noise,
-            scale=given.scale,
-            objective=objective,
-            instrument=given.instrument,
+            transport=problem.transport,
+            noise=problem.noise,
+            scale=problem.scale,
+            objective=problem.objective,
+            instrument=problem.instrument,
             starts=starts,
             seed=seed,
-            solver=solver,
-            options=options,
+            options=options_from(problem.options),
             progress=progress,
             checkpoint=kept,
         )
-        text = given.text if objective == given.objective else None
-        fitted = _written(directory, found, held_out, text, force, report, progress or silent)
-        for one in (kept, discrepancy_checkpoint(kept)):
-            one.unlink(missing_ok=True)
-    return fitted
-
-
-def write_into(directory: str | Path, found: Fit, *, force: bool = False, report: bool = True) -> Fitted:
-    """Write the result directory of a fit with its report; arguments as of `fit_into`."""
-    with reserved(directory, force):
-        return _written(Path(directory), found, None, None, force, report, silent)
-
-
-def require_posterior(objective: Objective, option: str | None) -> Objective:
-    """The objective. ValueError where an option of the command line needs a likelihood, and it is none."""
-    if option is not None and objective != "likelihood":
-        what = "has no posterior" if option == "--sample" else "has no predictive score"
-        raise ValueError(f"{option} needs the objective 'likelihood': {objective!r} {what}")
-    return objective
-
-
-def _written(
-    directory: Path,
-    found: Fit,
-    held_out: Measurements | None,
-    text: str | None,
-    force: bool,
-    report: bool,
-    progress: Progress,
-) -> Fitted:
-    progress(DRAWING, 0, 1)
-    with replacing(directory, force) as folder:
-        results.write_fit(found, folder, text)
+        progress(DRAWING, 0, 1)
+        results.write_fit(fit, folder, problem.text)
         if held_out is not None:
-            write_csv(held_out, folder / HELD_OUT)
+            write_csv(held_out, folder / results.HELD_OUT)
         if report:
-            predicted = write_report(folder, directory.resolve().name, found)
+            predicted = write_report(folder, target.name, fit)
         else:
-            predicted = None if held_out is None else predict_held_out(found, None, held_out)
-    progress(DRAWING, 1, 1)
-    return Fitted(found, predicted)
+            predicted = None if held_out is None else predict_held_out(fit, None, held_out)
+        progress(DRAWING, 1, 1)
+    for one in (kept, discrepancy_checkpoint(kept)):
+        one.unlink(missing_ok=True)
+    return Fitted(fit, predicted)
+
+
+def require_score(problem: ProblemFile, held_out: bool) -> None:
+    """ValueError if data are held out of an objective that has no predictive score."""
+    if held_out and problem.objective != "likelihood":
+        raise ValueError(f"--hold-out needs the objective 'likelihood': {problem.objective!r} has no predictive score")

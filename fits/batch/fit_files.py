@@ -11,7 +11,6 @@ import html
 import io
 import math
 import shutil
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,22 +20,21 @@ from urllib.parse import quote
 
 import numpy as np
 
-from fits._files import named, read_json, require_there, write_text
-from fits.batch.fit_file import fit_into, require_posterior, write_into
+from fits._files import named, read_json, require_there, text_checksum, write_text
+from fits.batch.fit_file import fit_into, require_score
 from fits.data.formats import sniff
 from fits.data.reading import ReadOptions
 from fits.data.totals import Totals
 from fits.engines import Failure, run
 from fits.engines.failures import one_line
-from fits.names import Objective
-from fits.optimise.multi_start import Solver
 from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import make_room
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
 from fits.reports import tables
+from fits.reports.html import write_report
 from fits.reports.pages import document, section, sentences
-from fits.reports.results import FIT, REPORT
+from fits.reports.results import FIT, REPORT, save_fit
 from fits.reports.verdicts import listed
 from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search.report import write_report as write_search
@@ -45,8 +43,6 @@ from fits.structure_search.search import search as run_search
 TABLE, PAGE, STORE = "table.csv", "report.html", "batch.store"
 SEARCH, STACKS = "search", "search-stacks"
 """Directories of a search below that of a file."""
-MEASURED = (".csv", ".tsv", ".binary", ".bsdf", ".brdf", ".anisotropicbsdf", ".astm", ".rxt", ".ssdd")
-"""Endings that say of a file in a folder that it should hold measurements; others do if their content says so."""
 NOT_YET = "not done yet"
 SHOWN = 40
 """Rows on a terminal."""
@@ -96,11 +92,9 @@ def fit_files(
     processes: int = 1,
     client: Any = None,
     search: bool | Mapping[str, Any] = False,
-    reading: ReadOptions | None = None,
-    objective: Objective | None = None,
+    read_options: ReadOptions | None = None,
     starts: int = 32,
     seed: int = 0,
-    solver: Solver = "least_squares",
     reports: bool = True,
     force: bool = False,
     progress: Progress | None = None,
@@ -117,8 +111,8 @@ def fit_files(
         processes, client: see `fits.engines.run`; with 1, fits come one after the other, each on all cores. Workers of
             a cluster see files and `out` by these paths.
         search: look for the stack behind each file as well; a mapping has the arguments of `fits.search`.
-        reading: how all files are read, see `fits.ReadOptions`.
-        objective, starts, seed, solver: of each fit of `stacks`, see `fits.fit`; objective: instead of the file's.
+        read_options: how all files are read, see `fits.ReadOptions`.
+        starts, seed: of each fit of `stacks`, see `fits.fit`.
         reports: with a report of each, whose pictures take longer than a fit by a transport in closed form.
         force: fit again what is there of another stack, of other settings or of what a file held before.
         progress: called with ("fits", done, all, file and stack).
@@ -128,42 +122,38 @@ def fit_files(
         ValueError: no file can be read; names that are there twice; a result of another stack or settings, unless
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
-    reading, out, progress = reading or ReadOptions(), Path(out), progress or silent
-    found, skipped = measurement_files(_several(files), reading.format)
+    # what is fitted by what
+    read_options, out, progress = read_options or ReadOptions(), Path(out), progress or silent
+    found, skipped = measurement_files(_several(files), read_options.format)
     named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in named_stacks.items()}
     if not given and search is False:
         raise ValueError("neither a stack nor a search is given; there must be one of them")
-    if not given and (objective, solver) != (None, "least_squares"):
-        raise ValueError(
-            f"objective {objective} and solver {solver} are of no stack; a search fits likelihoods, by least squares"
-        )
     for problem in given.values():
-        require_posterior(objective or problem.objective, "--hold-out" if reading.hold_out else None)
+        require_score(problem, bool(read_options.hold_out))
     searching = None if search is False else {"seed": seed} | ({} if search is True else dict(search))
-    fitting = {"objective": objective, "starts": starts, "seed": seed, "solver": solver}
-    job = Job(out.absolute(), given, searching, reading, fitting, reports, force)
+    job = Job(out.absolute(), given, searching, read_options, {"starts": starts, "seed": seed}, reports, force)
     if not out.resolve().parent.is_dir():
         raise ValueError(f"{out}: there is no directory {out.parent}")
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file, must be a directory")
     if holds_other_files(out, STORE):
         raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
+    # what is done, and what is left: stack by stack, whose fits share programs
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
     paths = [path if client is None else path.absolute() for path in found.values()]
-    rows, tasks = _planned(job, paths, out, done)
+    rows, tasks = _planned(job, paths, done)
     if not tasks and all(row["result"] == "failed" for row in rows.values()):
         reasons = list(dict.fromkeys(row["status"] for row in rows.values()))
         raise ValueError(f"no file can be fitted: {'; '.join(reasons[:3])}")
+    # fits, each row kept as it is there; table and page also of what is there when they are interrupted
     with named(out):
         out.mkdir(exist_ok=True)
     with Store.open(out / STORE, fingerprint(of="fit-many")) as store:
-        # where one of these has a directory and no row, that is what a killed run left
-        store.put("begun", sorted({*(store.get("begun") or ()), *(task.key for task in tasks)}))
         total, count = len(rows), len(rows) - len(tasks)
+        progress("fits", count, total)
         try:
-            progress("fits", count, total)
             # by a single thread: a fit takes all cores, and another that waits for it could not be interrupted
             for index, outcome in run(fit_one, job, tasks, processes=processes, client=client, threads=1):
                 task, count = tasks[index], count + 1
@@ -174,9 +164,6 @@ def fit_files(
                 rows[task.key] = outcome
                 progress("fits", count, total, f"{task.path.name} by {task.stack}")
         finally:
-            for key, row in rows.items():
-                if row["result"] != "failed" and not (out / key / FIT).is_file():
-                    row |= {"result": "failed", "status": f"{key}: was removed while others were fitted"}
             result = FittedFiles(out, ranked(list(rows.values())), skipped)
             write_text(out / TABLE, table_csv(result.rows), force=True)
             write_text(out / PAGE, page(result), force=True)
@@ -186,29 +173,29 @@ def fit_files(
 # ---- what is fitted by what ----
 
 
-def measurement_files(given: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Files by name, those of folders among them; and what folders hold beside measurements.
+def measurement_files(places: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Files by name, those of folders among them; and what folders hold that are no measurements.
 
     Raises:
         FileNotFoundError: no such file or folder.
         ValueError: a folder without measurements, or a name that is there twice.
     """
     files: list[Path] = []
-    beside: list[str] = []
-    for place in map(Path, given):
+    skipped: list[str] = []
+    for place in map(Path, places):
         require_there(place, "no such file or folder")
         if not place.is_dir():
             files.append(place)
             continue
         every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))
-        some = [one for one in every if format or one.suffix.lower() in MEASURED or _has_known_content(one)]
+        some = [one for one in every if format or _has_known_content(one)]
         if not some:
             raise ValueError(f"{place}: holds no measurement file")
         files += some
-        beside += [str(one) for one in every if one not in some]
+        skipped += [str(one) for one in every if one not in some]
     if not files:
         raise ValueError("no file is given; there must be at least one")
-    return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(beside)
+    return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(skipped)
 
 
 def _has_known_content(path: Path) -> bool:
@@ -221,14 +208,14 @@ def _has_known_content(path: Path) -> bool:
 
 def _by_name(names: Sequence[tuple[Path, str]], taken: Sequence[str]) -> dict[str, Path]:
     """The paths by name. ValueError for a name that is there twice, or taken."""
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for path, name in names:
-        if name in found:
-            raise ValueError(f"{found[name]} and {path}: results go by this name, which must differ")
+        if name in paths:
+            raise ValueError(f"{paths[name]} and {path}: results go by this name, which must differ")
         if name in taken:
             raise ValueError(f"{path}: its name must be another: fit-many writes a {name} of its own")
-        found[name] = path
-    return found
+        paths[name] = path
+    return paths
 
 
 @dataclass(frozen=True)
@@ -238,7 +225,7 @@ class Job:
     out: Path
     stacks: Mapping[str, ProblemFile]
     searching: Mapping[str, Any] | None
-    reading: ReadOptions
+    read_options: ReadOptions
     fitting: Mapping[str, Any]
     reports: bool
     force: bool
@@ -251,7 +238,10 @@ class Job:
     def fingerprint(self, task: "Task") -> dict[str, str]:
         """Key of a result."""
         how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
-        return fingerprint(file=task.content, **vars(self.reading), **(how or {}))
+        how_read = {f"read {name}": value for name, value in vars(self.read_options).items()}
+        at = self.read_options.geometry
+        how_read["read geometry"] = None if at is None else [at.wi, at.wo]
+        return fingerprint(file=task.content, **how_read, **(how or {}))
 
 
 class Task(NamedTuple):
@@ -271,73 +261,53 @@ class Task(NamedTuple):
         return {"file": self.path.name, "stack": self.stack, "result": "failed", "status": why}
 
 
-def _lines(path: Path) -> str:
-    """What tells the content of a file from others, whatever its line ends."""
-    content = path.read_bytes().replace(b"\r\n", b"\n")
-    return fingerprint(content=np.frombuffer(content, np.uint8))["content"]
-
-
-def _planned(job: Job, files: list[Path], out: Path, done: Store | None) -> tuple[dict[str, Row], list[Task]]:
-    """A row for each file and stack, in order; and the tasks that are left, stack by stack: they share programs.
-
-    done: what an earlier run has kept.
-
-    Raises:
-        ValueError: a result of something else is there.
-    """
+def _planned(job: Job, files: list[Path], done: Store | None) -> tuple[dict[str, Row], list[Task]]:
+    """A row for each file and stack, in order, and the tasks that are left; done: what an earlier run has kept."""
     rows: dict[str, Row] = {}
     tasks: list[Task] = []
     for path in files:
         why, content = NOT_YET, ""
         try:
-            content = _lines(path)
+            content = text_checksum(path)
         except OSError as error:
             why = one_line(error)
         every = [Task(path, content, stack) for stack in job.names]
-        known = {task.key: _done_before(job, task, out, done) if content else None for task in every}
-        left = [task for task in every if known[task.key] is None]
+        known = {task.key: _done_before(job, task, done) for task in every if content and done is not None}
+        left = [task for task in every if known.get(task.key) is None]
         try:
             if left and content:
-                job.reading.split(path)  # before any is fitted
+                job.read_options.split(path)  # before any is fitted
                 tasks += left
         except (ValueError, OSError) as error:
             why = one_line(error)
-        rows |= {task.key: known[task.key] or task.failed(why) for task in every}
+        rows |= {task.key: known.get(task.key) or task.failed(why) for task in every}
     return rows, sorted(tasks, key=lambda task: job.names.index(task.stack))
 
 
-def _done_before(job: Job, task: Task, out: Path, done: Store | None) -> Row | None:
-    """The row of a result that is there, or of one that is damaged; None: it is to be fitted.
+def _done_before(job: Job, task: Task, done: Store) -> Row | None:
+    """The row of a result that is there; None: it is to be fitted, or again where it is damaged.
 
     Raises:
-        ValueError: another result, or something else altogether, is in its place.
+        ValueError: a result of another file, stack or settings is in its place.
     """
-    directory = out / task.key
-    if not directory.exists() or not any(directory.iterdir()):
-        return None
-    kept = None if done is None else done.get(task.key)
+    kept = done.get(task.key)
     if kept is None:
-        if done is None or task.key not in done.get("begun"):
-            raise ValueError(f"{directory}: holds something that fit-many did not make")
         return None
     words = differences(kept["of"], job.fingerprint(task))
     if words and not job.force:
-        raise ValueError(f"{another(directory, words)}; --force, or force=True, fits it again")
+        raise ValueError(f"{another(job.out / task.key, words)}; --force, or force=True, fits it again")
     try:
-        read_json(directory / FIT)
-    except (ValueError, OSError) as error:
-        return None if job.force else task.failed(f"{one_line(error)} (--force fits it again)")
+        read_json(job.out / task.key / FIT)
+    except (ValueError, OSError):
+        return None
     return None if words else kept["row"]
 
 
-def _several(given: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    return [given] if isinstance(given, str | Path) else list(given)
+def _several(items: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    return [items] if isinstance(items, str | Path) else list(items)
 
 
 # ---- a worker's task ----
-
-_one_at_a_time = threading.Lock()
-"""In a process: a fit takes all cores for its starts, pictures cannot be drawn side by side, and programs may go."""
 
 
 def fit_one(job: Job, task: Task) -> Row:
@@ -346,21 +316,18 @@ def fit_one(job: Job, task: Task) -> Row:
     Raises:
         ValueError, OSError: it cannot be fitted. What is wrong with one of many ends none of the others.
     """
-    with _one_at_a_time:
-        make_room()
-        try:
-            return _fitted(job, task)
-        except (ValueError, OSError):
-            raise
-        except Exception as error:
-            raise ValueError(f"{type(error).__name__}: {error}") from error
+    make_room()
+    try:
+        return _fitted(job, task)
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
 def _fitted(job: Job, task: Task) -> Row:
     began, directory, structure = time.monotonic(), job.out / task.key, ""
-    if _lines(task.path) != task.content:
-        raise ValueError(f"{task.path}: was changed while others were fitted")
-    data, held_out = job.reading.split(task.path)
+    data, held_out = job.read_options.split(task.path)
     with named(directory.parent):
         directory.parent.mkdir(exist_ok=True)
     if task.stack == SEARCH:
@@ -372,7 +339,10 @@ def _fitted(job: Job, task: Task) -> Row:
         found = run_search(data, **(job.searching or {}), directory=stacks)
         write_search(found, stacks)
         structure = found.best.name
-        fit, predicted = write_into(directory, found.best.fit, force=True, report=job.reports)
+        fit, predicted = found.best.fit, None
+        save_fit(fit, directory, force=True)
+        if job.reports:
+            write_report(directory, SEARCH, fit)
     else:
         given = job.stacks[task.stack]
         fit, predicted = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
@@ -386,7 +356,7 @@ def _fitted(job: Job, task: Task) -> Row:
         "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
     }
     if predicted is not None and (scores := predicted.prediction.scores) is not None:
-        row |= {"criterion": "-2 log score", "loss": -2.0 * scores.elpd * scores.count}
+        row |= {"criterion": "-2 elpd", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
     row |= {"at_bound": " ".join(fit.at_bound), "measurements": int(fit.problem.data.mask.sum())}
@@ -403,20 +373,19 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
     A best fit that misses the data by more than their noise says that the noise is larger than stated: differences in
     AIC are divided by its reduced chi-square, as in `fits.compare`.
     """
-    words = [""] * len(rows)
-    for file in dict.fromkeys(row["file"] for row in rows):
-        own = [k for k, row in enumerate(rows) if row["file"] == file and math.isfinite(row.get("loss", math.nan))]
-        if len(own) < 2 or len({rows[k]["criterion"] for k in own}) > 1:
+    standing: dict[int, str] = {}
+    for file in {row["file"] for row in rows}:
+        own = [row for row in rows if row["file"] == file and math.isfinite(row.get("loss", math.nan))]
+        if len(own) < 2 or len({row["criterion"] for row in own}) > 1:
             continue
-        first = min(own, key=lambda k: (rows[k]["result"] != "converged", rows[k]["loss"]))
-        best = rows[first]
+        best = min(own, key=lambda row: (row["result"] != "converged", row["loss"]))
+        likelihood = best["criterion"] in ("AIC", "-2 elpd")
         excess = max(1.0, np.nan_to_num(best["reduced_chi_square"])) if best["criterion"] == "AIC" else 1.0
-        for k in own:
-            behind = (rows[k]["loss"] - best["loss"]) / excess
-            close = best["criterion"] in ("AIC", "-2 log score") and rows[k]["result"] == "converged"
-            close &= behind < ComparisonOptions().slight_difference
-            words[k] = "best" if k == first else "as good" if close else f"{behind:+.1f}"
-    return tuple(row | {"standing": word} for row, word in zip(rows, words, strict=True))
+        for row in own:
+            difference = (row["loss"] - best["loss"]) / excess
+            close = likelihood and row["result"] == "converged" and difference < ComparisonOptions().slight_difference
+            standing[id(row)] = "best" if row is best else "as good" if close else f"{difference:+.1f}"
+    return tuple(row | {"standing": standing.get(id(row), "")} for row in rows)
 
 
 def table_csv(rows: Sequence[Row]) -> str:
@@ -445,16 +414,16 @@ def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
     shown = [tuple("; ".join(_cell(row.get(name, ""), 4).split("; ")[:2]) for name in columns) for row in rows]
     note = (
         "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC: as good as "
-        "the best, or by how much behind; where the best misses the data, the scatter that it leaves counts as noise."
+        "the best, or the difference; where the best misses the data, the scatter that it leaves counts as noise."
     )
     return tables.Table(
         "Fits", tuple(columns), tuple(shown if most is None else tables.shortened(shown, most)), note, keys=2
     )
 
 
-def statements(found: FittedFiles) -> list[str]:
+def statements(result: FittedFiles) -> list[str]:
     """What became of them, in sentences."""
-    rows = found.rows
+    rows = result.rows
     files, stacks = ({row[name]: None for row in rows} for name in ("file", "stack"))
     results = [row["result"] for row in rows]
     best = [row["stack"] for row in rows if row["standing"] == "best"]
@@ -462,7 +431,7 @@ def statements(found: FittedFiles) -> list[str]:
         "No result of": list(dict.fromkeys(row["file"] for row in rows if row["result"] == "failed")),
         "Not converged:": [f"{row['file']} by {row['stack']}" for row in rows if row["result"] == "not converged"],
         "Best of a file:": [f"{name} {_count(best.count(name), 'time')}" for name in stacks if len(stacks) > 1],
-        "Not taken for measurements:": list(found.skipped),
+        "Not taken for measurements:": list(result.skipped),
     }
     return [
         f"{_count(len(files), 'file')} by {_count(len(stacks), 'stack')}: {len(rows) - results.count('failed')} of "
@@ -471,18 +440,18 @@ def statements(found: FittedFiles) -> list[str]:
     ]
 
 
-def page(found: FittedFiles) -> str:
+def page(result: FittedFiles) -> str:
     """The table with a link to each report, as one HTML file that stands beside the results."""
-    title = f"Fits of {_count(len({row['file'] for row in found.rows}), 'file')}"
-    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in found.rows if row["result"] != "failed"]
+    title = f"Fits of {_count(len({row['file'] for row in result.rows}), 'file')}"
+    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in result.rows if row["result"] != "failed"]
     links = [
         f'<li><a href="{quote(place)}">{html.escape(place)}</a></li>'
         for place in places
-        if (found.directory / place).is_file()
+        if (result.directory / place).is_file()
     ]
     reports = [section("Reports", f"<ul>{''.join(links)}</ul>")] if links else []
-    body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(found))]
-    return document(title, [*body, section("All fits", tables.html_table(overview(found.rows))), *reports])
+    body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(result))]
+    return document(title, [*body, section("All fits", overview(result.rows)), *reports])
 
 
 def _count(number: int, what: str) -> str:

@@ -4,7 +4,6 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 """
 
 import os
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import write_bytes, write_text
+from fits.cli.input_output import read_options, refuse_alone, refuse_existing, require_free_place, show
 from fits.cli.interrupts import hint
 from fits.cli.many import fit_many as fit_many
 from fits.cli.many import search as search
@@ -21,19 +21,14 @@ from fits.cli.materials import export as export
 from fits.cli.materials import render as render
 from fits.cli.materials import simulate as simulate
 from fits.cli.materials import write_measurements
-from fits.cli.options import read_options, refuse_alone
-from fits.cli.places import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.geometry import Geometry, slices
 from fits.data.measurements import Measurements
-from fits.data.reading import select_channels
-from fits.data.selection import select
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
 DONE, DOUBTFUL = 0, 1
@@ -62,11 +57,9 @@ def fit(arguments: Namespace) -> int:
             force=arguments.force,
             progress=progress,
         )
-    tables.print_table(tables.parameter_table(result), sys.stdout)
-    for sentence in (*verdicts.summary(result), f"Report: {directory / results.REPORT}"):
-        print(sentence)
+    show(tables.parameter_table(result), *verdicts.summary(result), f"Report: {directory / results.REPORT}")
     if predicted is not None:
-        tables.print_table(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"), sys.stdout)
+        show(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"))
     return DONE if result.converged else DOUBTFUL
 
 
@@ -101,9 +94,8 @@ def sample(arguments: Namespace) -> int:
         write_report(directory, directory.resolve().name, result, posterior)
         progress("pictures and report", 1, 1)
     if verdicts.reportable(posterior):
-        tables.print_table(tables.posterior_table(posterior), sys.stdout)
-    for sentence in (*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}"):
-        print(sentence)
+        show(tables.posterior_table(posterior))
+    show(*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}")
     reached = float(np.min(posterior.effective_samples))
     enough = posterior.converged and reached >= posterior.options.ess
     if not enough:
@@ -149,29 +141,18 @@ def predict(arguments: Namespace) -> int:
     if arguments.score is None:
         at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,))
     else:
-        at, selections = select_channels(read_options(arguments).read(arguments.score), arguments.select)
-        for words in selections:
-            at = at.where(select(at, words))
-        if not at.mask.any():
-            raise ValueError(f"{arguments.score}: --select leaves nothing to predict")
+        at = read_options(arguments).read(arguments.score)
     found = run_prediction(source, at)
     if isinstance(at, Measurements):
-        tables.print_table(tables.scores_table(found, at, f"Prediction of {arguments.score}"), sys.stdout)
+        show(tables.scores_table(found, at, f"Prediction of {arguments.score}"))
     if arguments.out is not None:
-        _write_prediction(found, arguments)
+        write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
+        show(
+            f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack "
+            "without model discrepancy (latent_*)",
+            *([] if found.reliable else [tables.UNRELIABLE]),
+        )
     return DONE
-
-
-def _write_prediction(found: "Prediction", arguments: Namespace) -> None:
-    from fits.reports import tables
-
-    write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
-    print(
-        f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack without "
-        "model discrepancy (latent_*)"
-    )
-    if not found.reliable:
-        print(tables.UNRELIABLE)
 
 
 def report(arguments: Namespace) -> int:
@@ -179,6 +160,7 @@ def report(arguments: Namespace) -> int:
     if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
+    from fits.any_report import report as write_elsewhere
     from fits.reports import html, results
 
     refuse_existing(arguments.out, arguments.force)
@@ -187,14 +169,14 @@ def report(arguments: Namespace) -> int:
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
     if arguments.out is None and not os.access(directory, os.W_OK):
         raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
-    others = _candidates([Path(other) for other in arguments.compare], own=directory)
+    others = _candidates([Path(other) for other in arguments.compare], reference=directory)
     with show_progress() as progress:
         progress("pictures and report", 0, 1)
         if arguments.out is None:
             html.write_report(directory, name, result, posterior, others)
         else:
             held_out = results.load_held_out(directory)
-            html.report(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
+            write_elsewhere(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
         progress("pictures and report", 1, 1)
     print(f"Report: {out}")
     return DONE
@@ -213,21 +195,19 @@ def compare(arguments: Namespace) -> int:
     candidates = _candidates([Path(directory) for directory in arguments.directories])
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
-    tables.print_table(tables.comparison_table(compared), sys.stdout)
-    for sentence in compared.verdict:
-        print(sentence)
+    show(tables.comparison_table(compared), *compared.verdict)
     if arguments.out:
         write_text(arguments.out, comparison_page(candidates, compared), force=arguments.force)
         print(f"Comparison: {arguments.out}")
     return DONE
 
 
-def _candidates(directories: list[Path], own: Path | None = None) -> "dict[str, Fit | Posterior]":
+def _candidates(directories: list[Path], reference: Path | None = None) -> "dict[str, Fit | Posterior]":
     """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
 
-    own: the result that they are compared with, whose name is taken.
+    reference: the result that they are compared with, whose name is taken.
     """
-    places = [directory.resolve() for directory in (*directories, *([] if own is None else [own]))]
+    places = [directory.resolve() for directory in (*directories, *([] if reference is None else [reference]))]
     names = [place.name for place in places]
     candidates: dict[str, Fit | Posterior] = {}
     for directory, place in zip(directories, places, strict=False):
@@ -249,16 +229,12 @@ def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
     from fits.reports.data_summary import data_statements, data_table, source_table
     from fits.reports.plots.data import as_png, data_picture, totals_picture
-    from fits.reports.tables import print_table
 
     out = arguments.out or f"{Path(arguments.data).stem}.png"
     if arguments.out is not None:
         refuse_existing(out, arguments.force)
     data = read_options(arguments).read(arguments.data)
-    for table in (source_table(data), data_table(data)):
-        print_table(table, sys.stdout)
-    for sentence in data_statements(data):
-        print(sentence)
+    show(source_table(data), data_table(data), *data_statements(data))
     if Path(out).exists() and not arguments.force:
         print(f"Picture: {out} exists already (--force draws it again)")
         return DONE

@@ -1,14 +1,13 @@
 """The search for the stack behind data, and the fits of many files, on the command line."""
 
-import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fits.cli.input_output import read_options, refuse_alone, show
 from fits.cli.interrupts import hint
-from fits.cli.options import read_options, refuse_alone
 from fits.cli.setting import use_jax
 from fits.data.totals import Totals
 from fits.progress import show_progress
@@ -18,27 +17,24 @@ DONE, DOUBTFUL = 0, 1
 
 def search(arguments: Namespace) -> int:
     """Search for the stack behind the data among those of a library, and write the report."""
-    data = read_options(arguments).masked(arguments.data)
+    data = read_options(arguments).read(arguments.data)
     if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
         raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
     use_jax()
-    from fits.reports import tables
     from fits.structure_search import report
     from fits.structure_search.search import search as run_search
 
     directory = Path(arguments.out)
+    settings = search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
     with show_progress() as progress, hint(_resume(directory)):
-        settings = search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
         found = run_search(data, **settings, directory=directory, progress=progress)
         report.write_report(found, directory)
-    tables.print_table(report.search_table(found), sys.stdout)
-    for sentence in (*report.search_sentences(found), f"Report: {directory / report.PAGE}"):
-        print(sentence)
+    show(report.search_table(found), *report.search_sentences(found), f"Report: {directory / report.PAGE}")
     return DONE
 
 
-def search_settings(arguments: Namespace, **given: Any) -> dict[str, Any]:
-    """Arguments of `fits.search` from the options of a search; given: further ones of `SearchOptions`."""
+def search_settings(arguments: Namespace, **options: Any) -> dict[str, Any]:
+    """Arguments of `fits.search` from the options of a search; options: further ones of `SearchOptions`."""
     from fits.problem.noise import Noise
     from fits.problem.parameters import Free, LogNormal
     from fits.problem.stack_file import read_instrument
@@ -52,7 +48,7 @@ def search_settings(arguments: Namespace, **given: Any) -> dict[str, Any]:
         "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
         "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
         "instrument": None if instrument is None else read_instrument(instrument),
-        "options": SearchOptions(**given),
+        "options": SearchOptions(**options),
     }
 
 
@@ -61,7 +57,6 @@ def fit_many(arguments: Namespace) -> int:
     use_jax()
     from fits.batch.fit_files import PAGE, SHOWN, TABLE, fit_files, overview, statements
     from fits.problem.compilation import cores
-    from fits.reports.tables import print_table
 
     if not arguments.search:
         refuse_alone(arguments, ("library", "noise", "scale_sd"), "search: a stack file states it")
@@ -74,14 +69,12 @@ def fit_many(arguments: Namespace) -> int:
             processes=cores() if arguments.processes is None else arguments.processes,
             client=arguments.scheduler,
             search=search_settings(arguments) if arguments.search else False,
-            reading=read_options(arguments),
+            read_options=read_options(arguments),
             starts=arguments.starts,
             force=arguments.force,
             progress=progress,
         )
-    print_table(overview(found.rows, SHOWN), sys.stdout)
-    for sentence in (*statements(found), f"Table: {out / TABLE}", f"Report: {out / PAGE}"):
-        print(sentence)
+    show(overview(found.rows, SHOWN), *statements(found), f"Table: {out / TABLE}", f"Report: {out / PAGE}")
     return DONE if found.complete else DOUBTFUL
 
 

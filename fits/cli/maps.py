@@ -1,12 +1,11 @@
 """Whole maps on the command line: fitted texel by texel into a store, and reported."""
 
-import sys
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+from fits.cli.input_output import refuse_alone, refuse_existing, show
 from fits.cli.interrupts import hint
-from fits.cli.places import refuse_existing
 from fits.cli.setting import use_jax
 from fits.progress import show_progress
 
@@ -24,9 +23,9 @@ def fit_map(arguments: Namespace) -> int:
     # before anything slow: what is wrong with the files is refused
     map_data(arguments.data, arguments.geometry, arguments.sigma, arguments.mask)
     prior = None
-    if arguments.spatial_prior is None and arguments.spatial_scale is not None:
-        raise ValueError("--spatial-scale is given without --spatial-prior")
-    if arguments.spatial_prior is not None:
+    if arguments.spatial_prior is None:
+        refuse_alone(arguments, ("spatial_scale",), "spatial-prior")
+    else:
         if not arguments.spatial_scale:
             raise ValueError(
                 f"--spatial-prior {arguments.spatial_prior} needs --spatial-scale, such as 0.05 of the bounds"
@@ -40,7 +39,6 @@ def fit_map(arguments: Namespace) -> int:
     from fits.maps.fitted_map import summarise
     from fits.maps.report import tables
     from fits.problem.stack_file import read_problem
-    from fits.reports.tables import print_table
 
     given = read_problem(arguments.stack)
     noise = given.noise if arguments.noise is None else replace(given.noise, relative=arguments.noise)
@@ -72,11 +70,10 @@ def fit_map(arguments: Namespace) -> int:
             ),
         )
     found, common = summarise(map), replace(tables.common_table(map), title="Common to all texels")
-    for table in (tables.count_table(found), tables.quartile_table(found, map), *([common] if common.rows else [])):
-        print_table(table, sys.stdout)
+    show(tables.count_table(found), tables.quartile_table(found, map), *([common] if common.rows else []))
     if prior is not None:
-        print(tables.smoothing_words(map))
-    print(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
+        show(tables.smoothing_words(map))
+    show(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     whole = found.there == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 
@@ -87,22 +84,16 @@ def report_map(arguments: Namespace) -> int:
         raise ValueError(f"--compare: {arguments.directory} is a map, which is not compared with others")
     path = Path(arguments.directory)
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
-    refuse_existing(str(out), arguments.force)
+    refuse_existing(out, arguments.force)
     from fits.maps.fitted_map import open_map
-
-    map = open_map(arguments.directory)
     from fits.maps.report import page, tables
     from fits.maps.report.verdicts import verdict
-    from fits.reports.tables import print_table
 
+    map = open_map(arguments.directory)
     with show_progress() as progress:
         found = page.report(map, out, arguments.force, progress)
-    print_table(tables.count_table(found), sys.stdout)
-    if found.fitted:
-        print_table(tables.quartile_table(found, map), sys.stdout)
-    for sentence in verdict(found, map)[0]:
-        print(sentence)
-    print(f"Report: {out}")
+    quartiles = [tables.quartile_table(found, map)] if found.fitted else []
+    show(tables.count_table(found), *quartiles, *verdict(found, map)[0], f"Report: {out}")
     return DONE
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fits._files import write_bytes
-from fits.cli.places import refuse_existing, require_free_place
+from fits.cli.input_output import refuse_existing, require_free_place
 from fits.cli.setting import use_jax
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
@@ -126,7 +126,6 @@ def _at_start(stack: "Stack | Mixture") -> "Stack | Mixture":
     """The stack with every free parameter at its start value."""
     import jax
 
-    from fits.problem.parameters import is_free
-    from fits.problem.spectra import with_values
+    from fits.problem.parameters import is_free, with_values
 
     return with_values(jax.tree.map(lambda leaf: leaf.arrays()[0] if is_free(leaf) else leaf, stack, is_leaf=is_free))

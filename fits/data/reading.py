@@ -1,13 +1,14 @@
 """How measurement files are read, which of their data are used, and which are held out of a fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 
-from fits.data.formats import read
+from fits.data.formats import read_file
+from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.data.selection import select
 from fits.data.totals import Totals
@@ -16,12 +17,42 @@ from fits.names import FORMATS, QUANTITIES, STRATA, Strata
 CHANNEL = "channel="
 
 
-@dataclass(frozen=True)
-class ReadOptions:
-    """How a file is read; options of the command line have these names, and errors name those.
+def read(path: str | Path, format: str | None = None, quantity: str | None = None, **options: Any) -> Measurements:
+    """Read a measurement file: CSV, MERL, RGL, Zemax, LightTools, Speos, WINDOW XML, FRED, ASTM, pab, ALTA, SSDD, iad.
 
     Args:
-        format, quantity, bins, strata, wavelengths, corrected: see `fits.read`; `parse` reads them from words.
+        path: the file.
+        format, quantity: what it is, and what its numbers are; None finds out from the content.
+        options: further fields of `fits.ReadOptions`, such as ``bins=5000`` or ``max_polar_angle=80``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
+        TypeError: an option that is none.
+    """
+    return ReadOptions(format, quantity, **options).read(path)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadOptions:
+    """How files are read, of `fits.read`, `fits.fit_files` and the command line, whose options have these names.
+
+    Args:
+        format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
+            `read_slab`), "merl", "rgl", "zemax", "lighttools", "klems" and "tensortree" (both are XML of WINDOW and
+            Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
+        quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
+            "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
+            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
+            hold need it; all others say it themselves.
+        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
+            directions at which the file has values.
+        lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
+        bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
+        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
+            the projected solid angle of light and viewer.
+        seed: of their choice.
+        wavelengths, corrected: for iad's files only: see `read_slab`.
         min_retro_angle: mask measurements closer than so many degrees to retro-reflection.
         max_polar_angle: mask measurements more than so many degrees from the normal.
         select: use only these data (see `fits.data.selection.select`, and ``channel=red,green``).
@@ -30,14 +61,17 @@ class ReadOptions:
 
     format: str | None = None
     quantity: str | None = None
+    geometry: Geometry | None = None
+    lookup: str = "centre"
     bins: int | Literal["all"] | None = None
-    strata: Strata | None = None
+    strata: Strata = "bins"
+    seed: int = 0
     wavelengths: tuple[float, float] | None = None
     corrected: bool | None = None
     min_retro_angle: float | None = None
     max_polar_angle: float | None = None
-    select: tuple[str, ...] = ()
-    hold_out: tuple[str, ...] = ()
+    select: Sequence[str] = ()
+    hold_out: Sequence[str] = ()
 
     @classmethod
     def parse(cls, words: Sequence[str], **more: Any) -> Self:
@@ -46,28 +80,48 @@ class ReadOptions:
         Raises:
             ValueError: an unknown option, one that is given twice, or a bad value.
         """
-        found: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         for word in words:
             name, equals, text = word.partition("=")
             if not equals or name not in READERS:
                 raise ValueError(
-                    f"{word!r} is no option of reading; it must be {', '.join(f'{o}=...' for o in READERS)}"
+                    f"{word!r} is no option of a reader; it must be {', '.join(f'{o}=...' for o in READERS)}"
                 )
-            if name in found:
+            if name in options:
                 raise ValueError(f"{name} is given twice")
-            found[name] = READERS[name](name, text)
-        return cls(**found, **more)
+            options[name] = READERS[name](name, text)
+        return cls(**options, **more)
 
     def read(self, path: str | Path) -> Measurements:
-        """All that a file holds. ValueError as `fits.read`."""
-        if self.strata is not None and self.bins in (None, "all"):
-            raise ValueError("strata is given without a number of bins")
-        named = {one.name: getattr(self, one.name) for one in fields(self)[:6]} | {"strata": self.strata or "bins"}
-        return read(path, **named)
+        """What a file holds, masked and selected. ValueError as `fits.read`, and for data that are to be held out."""
+        if self.hold_out:
+            raise ValueError("hold_out: it is for a fit and a score; `fits.Measurements.drop` omits data")
+        return self.split(path)[0]
 
-    def masked(self, path: str | Path) -> Measurements:
-        """What a file holds, masked near retro-reflection and at grazing angles."""
-        data = self.read(path)
+    def split(self, path: str | Path) -> tuple[Measurements, Measurements | None]:
+        """What of a file is fitted, and what is held out; None if nothing is. ValueError as `fits.read`."""
+        data = self._masked(Path(path))
+        if isinstance(data, Totals):
+            return data, None
+        kept = [select(data, words) for words in self.select if not words.startswith(CHANNEL)]
+        keep = np.all(kept, axis=0) if kept else np.ones(len(data), bool)
+        held = np.any([select(data, words) for words in self.hold_out], axis=0) if self.hold_out else ~keep & False
+        fitted = data.where(keep & ~held)
+        if data.mask.any() and not fitted.mask.any():
+            what = "--select and --hold-out leave nothing to fit" if self.hold_out else "--select leaves nothing"
+            raise ValueError(f"{path}: {what}")
+        for name, given in (("selected", self.select), ("held out", self.hold_out)):
+            fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
+        if not self.hold_out:
+            return fitted, None
+        held_out = data.where(keep & held)
+        if not held_out.mask.any():
+            raise ValueError("--hold-out leaves nothing to score: what it holds out is masked or not selected")
+        return fitted, held_out
+
+    def _masked(self, path: Path) -> Measurements:
+        """The channels that are used, masked near retro-reflection and at grazing angles."""
+        data = read_file(path, self)
         if isinstance(data, Totals):
             for name in ("min_retro_angle", "max_polar_angle", "select", "hold_out"):
                 if getattr(self, name):
@@ -80,40 +134,16 @@ class ReadOptions:
             data = data.without_retro(self.min_retro_angle)
         if self.max_polar_angle is not None:
             data = data.without_grazing(self.max_polar_angle)
-        return data
-
-    def split(self, path: str | Path) -> tuple[Measurements, Measurements | None]:
-        """What of a file is fitted, and what is held out; None if nothing is."""
-        data, selections = select_channels(self.masked(path), self.select)
-        keep, held = np.ones(len(data), bool), np.zeros(len(data), bool)
-        for words in selections:
-            keep &= select(data, words)
         for words in self.hold_out:
             if words.startswith(CHANNEL):
                 raise ValueError(
                     f"--hold-out {words}: the parameters of a channel cannot be predicted from others; "
                     "--select channel=... fits some of the channels"
                 )
-            held |= select(data, words)
-        fitted = data.where(keep & ~held)
-        if data.mask.any() and not fitted.mask.any():
-            raise ValueError("--select and --hold-out leave nothing to fit")
-        for name, given in (("selected", self.select), ("held out", self.hold_out)):
-            fitted = fitted.noted(f"{name}: {' '.join(given)}") if given else fitted
-        if not self.hold_out:
-            return fitted, None
-        held_out = data.where(keep & held)
-        if not held_out.mask.any():
-            raise ValueError("--hold-out leaves nothing to score: what it holds out is masked or not selected")
-        return fitted, held_out
-
-
-def select_channels(data: Measurements, selections: Sequence[str]) -> tuple[Measurements, list[str]]:
-    """The channels that selections name, and the other selections."""
-    for words in selections:
-        if words.startswith(CHANNEL):
-            data = data.of_channels([name.strip() for name in words.removeprefix(CHANNEL).split(",")])
-    return data, [words for words in selections if not words.startswith(CHANNEL)]
+        for words in self.select:
+            if words.startswith(CHANNEL):
+                data = data.of_channels([name.strip() for name in words.removeprefix(CHANNEL).split(",")])
+        return data
 
 
 def _choice(name: str, text: str) -> str:

@@ -1,4 +1,4 @@
-"""Incidences, planes and scans of measurements: how they lie in angle."""
+"""Incidences, planes and scans of measurements: how they lie in angle, and how neighbours along scans correlate."""
 
 from dataclasses import dataclass
 
@@ -101,6 +101,30 @@ def scans(data: Pairs) -> list[np.ndarray]:
             if len(rows) >= SHORTEST_SCAN:
                 ordered.append(rows[np.argsort(angle[rows], kind="stable")])
     return ordered
+
+
+def neighbours(data: Pairs, residuals: np.ndarray, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (N, C) of pairs that lie `lag` measurements apart in a scan, two arrays; rows with NaN are skipped."""
+    # The mean is not subtracted: a bias over a stretch of angle is structure too.
+    pairs = []
+    for rows in scans(data):
+        scan = residuals[rows][np.isfinite(residuals[rows]).all(axis=-1)]
+        if len(scan) > lag:
+            pairs.append((scan[:-lag].ravel(), scan[lag:].ravel()))
+    if not pairs:
+        return np.empty(0), np.empty(0)
+    return np.concatenate([first for first, _ in pairs]), np.concatenate([second for _, second in pairs])
+
+
+def correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Correlation of pairs about zero; NaN for no pairs."""
+    norm = np.sqrt(np.sum(first**2) * np.sum(second**2))
+    return float(np.sum(first * second) / norm) if norm > 0.0 else float("nan")
+
+
+def autocorrelation(data: Pairs, residuals: np.ndarray, longest: int = 20) -> np.ndarray:
+    """Correlation of residuals (N, C) at lags of 1, 2, ... `longest` measurements along scans; NaN without pairs."""
+    return np.array([correlation(*neighbours(data, residuals, lag)) for lag in range(1, longest + 1)])
 
 
 def _mean(angles: np.ndarray, turn: float | None = None) -> float:

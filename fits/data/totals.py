@@ -87,7 +87,7 @@ class Totals(Measurements):
         if len(count) > 1:
             raise ValueError(f"totals: {sorted(count)} channels are given, must be as many for every kind")
         names = tuple(channels) if channels is not None else channel_names(*count)
-        spmeasured = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in measured}
+        spreads = {kind: _columns("sigma", _sigma_of(sigma, kind), len(angles), *count) for kind in measured}
         wi = direction(angles, LIGHT_AZIMUTH)
         kinds = [kind for kind in KINDS if kind in measured for _ in angles]
         totals = cls(
@@ -96,7 +96,7 @@ class Totals(Measurements):
                 [wi * (-1, -1, 1 if kind == "reflectance" else -1) for kind in KINDS if kind in measured]
             ),
             values=np.concatenate([measured[kind] for kind in KINDS if kind in measured]),
-            sigma=np.concatenate([spmeasured[kind] for kind in KINDS if kind in measured]),
+            sigma=np.concatenate([spreads[kind] for kind in KINDS if kind in measured]),
             mask=np.ones(len(kinds), bool),
             channels=names,
             source=Source("", "memory"),

@@ -4,14 +4,12 @@ import os
 import pickle
 import signal
 import sys
-import tempfile
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import connection, current_process, get_context, resource_tracker
-from pathlib import Path
 from typing import Any
 
 from fits.engines.failures import MOST_DEATHS, Failure
@@ -22,9 +20,6 @@ AGAIN = 78
 
 MOST_FALSE_STARTS = 10
 """Worker processes in a row that may die before they are ready: no task has caused that."""
-
-SHORT = 1 << 14
-"""Bytes that fit into the pipe that starts a process; more go by a file."""
 
 PATIENCE = 5.0
 """Seconds that a worker has to end when no task remains."""
@@ -64,10 +59,10 @@ def _pickled(what: Any, called: str) -> bytes:
 class _Worker:
     """A process on a core, this end of the pipe to it, and the index of its current or first task."""
 
-    def __init__(self, payload: bytes | str, core: int | None, index: int):
+    def __init__(self, core: int | None, index: int):
         self.core, self.index, self.ready = core, index, False
         self.pipe, theirs = connection.Pipe()
-        self.process = get_context("spawn").Process(target=serve, args=(theirs, payload, core), daemon=True)
+        self.process = get_context("spawn").Process(target=serve, args=(theirs, core), daemon=True)
         try:
             with _worker_environment():
                 self.process.start()
@@ -96,7 +91,7 @@ class _Worker:
 class _Pool:
     """Workers, and the tasks that remain."""
 
-    def __init__(self, payload: bytes | str, tasks: list[bytes]):
+    def __init__(self, payload: bytes, tasks: list[bytes]):
         self.payload, self.tasks = payload, tasks
         self.remaining = iter(range(len(tasks)))
         self.deaths: Counter[int] = Counter()
@@ -105,7 +100,7 @@ class _Pool:
         self.finished: list[_Worker] = []
 
     def start(self, core: int | None, index: int) -> None:
-        self.workers.append(_Worker(self.payload, core, index))
+        self.workers.append(_Worker(core, index))
 
     def receive(self, worker: _Worker) -> tuple[int, Any] | None:
         """Receive a worker's message, or its death, and send its next task; returns a finished task."""
@@ -114,6 +109,7 @@ class _Pool:
             return self._replace(worker)
         if message == READY:
             worker.ready, self.false_starts = True, 0
+            worker.send(self.payload)
             worker.send(self.tasks[index])
             return None
         outcome = pickle.loads(message)
@@ -158,30 +154,17 @@ class _Pool:
 
 def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    with _passed(payload) as passed:
-        pool, patience = _Pool(passed, tasks), 0.0
-        try:
-            for number, index in zip(range(count), pool.remaining, strict=False):
-                pool.start(cores[number % len(cores)], index)
-            while pool.workers:
-                messages = connection.wait([worker.pipe for worker in pool.workers])
-                workers = [worker for worker in pool.workers if worker.pipe in messages]
-                yield from [done for worker in workers if (done := pool.receive(worker)) is not None]
-            patience = PATIENCE
-        finally:
-            pool.end(patience)
-
-
-@contextmanager
-def _passed(payload: bytes) -> Iterator[bytes | str]:
-    """The payload, or a file that holds a long one; if the parent is killed, workers delete the file."""
-    if len(payload) <= SHORT:
-        yield payload
-        return
-    with tempfile.TemporaryDirectory(prefix="layerjax-") as folder:
-        path = Path(folder) / "shared.pickle"
-        path.write_bytes(payload)
-        yield str(path)
+    pool, patience = _Pool(payload, tasks), 0.0
+    try:
+        for number, index in zip(range(count), pool.remaining, strict=False):
+            pool.start(cores[number % len(cores)], index)
+        while pool.workers:
+            messages = connection.wait([worker.pipe for worker in pool.workers])
+            workers = [worker for worker in pool.workers if worker.pipe in messages]
+            yield from [done for worker in workers if (done := pool.receive(worker)) is not None]
+        patience = PATIENCE
+    finally:
+        pool.end(patience)
 
 
 @contextmanager

@@ -7,7 +7,6 @@ imported JAX and is configured by a call.
 import ctypes
 import os
 import pickle
-import shutil
 import signal
 import sys
 import threading
@@ -15,7 +14,6 @@ import traceback
 import warnings
 from contextlib import suppress
 from multiprocessing import connection, parent_process
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fits.engines.compile_cache import FOLDER, LEAST, LEAST_COMPILE, compile_cache, keep_programs
@@ -92,22 +90,21 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
 
 
-def serve(pipe: "connection.Connection", payload: bytes | str, core: int | None) -> None:
-    """Main loop of a worker process: it receives tasks and sends results until the other end is closed.
-
-    payload: `work` and the shared data, pickled, or the file that holds them.
-    """
+def serve(pipe: "connection.Connection", core: int | None) -> None:
+    """Main loop of a worker process: it receives `work` with the shared data, then tasks, and sends their results,
+    until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
-    threading.Thread(target=_end_with_parent, args=(payload,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     quieten()
     call: tuple[Any, Any] | None = None
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):
         pipe.send_bytes(READY)
+        payload = pipe.recv_bytes()
         while True:
             task = pipe.recv_bytes()
             try:
                 if call is None:
-                    call = pickle.loads(payload if isinstance(payload, bytes) else Path(payload).read_bytes())
+                    call = pickle.loads(payload)
                     _pin(core)
                 work, shared = call
                 outcome = attempt(work, shared, pickle.loads(task))
@@ -132,20 +129,14 @@ def _packed(outcome: Any) -> bytes:
 
 
 def _pin(core: int | None) -> None:
-    """Pin the process to a core, after XLA has started its compilation threads, one a core that it may run on.
-
-    With a single one, half a gigabyte of programs would queue up behind it.
-    """
+    """Pin all threads, and those that they will start, to one core, after XLA has started its compilation threads, one
+    a core that it may run on: with a single one, half a gigabyte of programs would queue up behind it."""
     if "jax" in sys.modules:
         import jax
 
         jax.block_until_ready(jax.jit(jax.numpy.sin)(1.0))
-    if core is not None:
-        _pin_threads(core)
-
-
-def _pin_threads(core: int) -> None:
-    """Pin all threads, and those that they will start, to one core."""
+    if core is None:
+        return
     threads = [0]
     with suppress(OSError, ValueError):
         threads = [int(name) for name in os.listdir("/proc/self/task")]
@@ -154,11 +145,9 @@ def _pin_threads(core: int) -> None:
             os.sched_setaffinity(thread, {core})
 
 
-def _end_with_parent(payload: bytes | str) -> None:
-    """Wait for the end of the parent, delete the file that it can no longer delete, and end."""
+def _end_with_parent() -> None:
+    """Wait for the end of the parent, and end."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
-        if isinstance(payload, str):
-            shutil.rmtree(Path(payload).parent, ignore_errors=True)
         os._exit(1)

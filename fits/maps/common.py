@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 from fits.maps.descent import Texels, model_of
 from fits.maps.options import MapOptions
 from fits.maps.search import Fits, search, solve, starts_at, to_units
-from fits.optimise.descent import COST_TOLERANCE, descend
-from fits.optimise.identifiability import LARGEST_ERROR, UNKNOWN_BEYOND
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.optimise.multi_start import start_points
-from fits.optimise.uncertainty import ON_BOUND
-from fits.problem.discrepancy.parameters import Discrepancy
+from fits.optimise.uncertainty import LARGEST_ERROR, ON_BOUND, UNKNOWN_BEYOND
+from fits.problem.discrepancy import Discrepancy
 from fits.problem.model import Model
-from fits.problem.parameters import is_free, split
+from fits.problem.parameters import is_free, is_law, split
 from fits.problem.problem import Problem
-from fits.problem.spectra import is_law
 from layerjax._parameters import plain_name
 
 Floats = NDArray[np.float64]

@@ -20,8 +20,7 @@ from jax import Array
 from jax.flatten_util import ravel_pytree
 from numpy.typing import NDArray
 
-from fits.optimise.descent import COST_TOLERANCE, NEARBY
-from fits.optimise.levenberg_marquardt import FIRST_DAMPING, BoxLevenbergMarquardt
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, BoxLevenbergMarquardt
 from fits.optimise.multi_start import MOST_STEPS
 from fits.problem.model import Model
 from fits.problem.parameters import Box

@@ -25,16 +25,14 @@ from fits.maps.inputs import MapData
 from fits.maps.options import MapOptions
 from fits.maps.search import Results, Starts, predict_all, reduced_chi_square, search, starts_at
 from fits.maps.store import Store
-from fits.optimise import apertures
-from fits.optimise.fit import fit_problem
+from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
-from fits.optimise.refinement import resolution_in_words
-from fits.optimise.resolution import Resolutions, resolutions
+from fits.optimise.resolution import Resolutions, has_rays, leaves_rays_open, resolution_in_words, resolutions
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
 from fits.problem.problem import Problem
-from fits.problem.toml import transport_from_dict, transport_to_dict
+from fits.problem.stack_file import transport_from_dict, transport_to_dict
 
 Floats = NDArray[np.float64]
 
@@ -221,9 +219,9 @@ def require_smoothable(problem: Problem, options: MapOptions) -> None:
 def _resolved(problem: Problem, options: MapOptions) -> tuple[Problem, Resolutions | None]:
     """The problem at the resolution that a fit of its own data ends with, and the resolutions that there are."""
     known = resolutions(problem)
-    if not (apertures.leaves_open(problem) or (known is not None and known.open)):
+    if not (leaves_rays_open(problem) or (known is not None and known.open)):
         return problem, known
-    found = fit_problem(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
+    found = fit(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
     return replace(problem, transport=found.transport, instrument=found.instrument), known
 
 
@@ -239,13 +237,13 @@ def _fit_at_resolution(
     while True:
         ready = cheap(problem)
         starts, results = _fit_texels(ready, texels, options)
-        if (known is None and not apertures.has_rays(problem)) or texels.wi is not None:
+        if (known is None and not has_rays(problem)) or texels.wi is not None:
             return ready, starts, results, None, ""
         finer = None if known is None else known.finer(problem.transport)  # type: ignore[arg-type]
         fine = None if finer is None else replace(problem, transport=finer)
         error = 0.0 if fine is None else _numerical_error(ready, fine, results, texels)
         rays = 0.0
-        if apertures.has_rays(problem):
+        if has_rays(problem):
             rays = _numerical_error(ready, problem.with_other_rays(), results, texels)
         if not (known is not None and known.open and fine is not None and error > options.numerical_error):
             return ready, starts, results, error + rays, resolution_in_words(problem, known)

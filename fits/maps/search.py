@@ -28,9 +28,8 @@ from fits.maps.descent import (
     model_of,
 )
 from fits.maps.options import MapOptions
-from fits.optimise.descent import COST_TOLERANCE
-from fits.optimise.identifiability import LARGEST_ERROR, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
-from fits.optimise.uncertainty import LEAST_GRADIENT, ON_BOUND
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE
+from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 

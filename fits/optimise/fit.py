@@ -1,5 +1,10 @@
-"""A fit in four steps: multi-start, polish with uncertainties, resolution, result."""
+"""A fit in four steps: multi-start, polish with uncertainties, resolution, result; and again with model discrepancy.
 
+Where nothing is said of a discrepancy, the rule is: the stack is fitted with independent noise; where residuals of
+neighbours along the scans are correlated by more than `FitOptions` allow, it is fitted again with a discrepancy.
+"""
+
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -12,20 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
+from fits.data.scans import correlation, neighbours
+from fits.data.totals import Totals
 from fits.names import Objective
-from fits.optimise import apertures
-from fits.optimise.descent import COST_TOLERANCE, ROUGH_TOLERANCE
-from fits.optimise.discrepancy import (
-    datasets_with_discrepancy,
-    start_points_with_discrepancy,
-    with_discrepancy,
-    without_discrepancy,
-)
-from fits.optimise.identifiability import UNCONSTRAINED_BEYOND
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE
 from fits.optimise.multi_start import (
+    Optimum,
     Solver,
-    StartOutcome,
     multi_start,
+    polish,
     rough_descent,
     screened_starts,
     start_points,
@@ -33,12 +33,10 @@ from fits.optimise.multi_start import (
     unit_of,
 )
 from fits.optimise.options import DEFAULT, FitOptions
-from fits.optimise.polish import Optimum, polish
-from fits.optimise.refinement import Accuracy, refined
-from fits.optimise.resolution import resolutions
+from fits.optimise.resolution import Accuracy, has_rays, leaves_rays_open, refined, resolutions, rings_for_starts
 from fits.optimise.result import OUTCOMES, Fit, Minimum, WithoutDiscrepancy
+from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND
 from fits.problem.instrument import Instrument
-from fits.problem.joint import Joint
 from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
@@ -50,6 +48,9 @@ Floats = NDArray[np.float64]
 
 SAME_AT_MOST = 0.05
 """Share of its box up to which a standard error counts where minima are compared."""
+
+MOST_STARTS = 8
+"""Minima without model discrepancy that the fit with it starts from; of its other starts half as many."""
 
 
 def fit(
@@ -67,11 +68,12 @@ def fit(
     options: FitOptions = DEFAULT,
     progress: Progress | None = None,
     checkpoint: str | Path | None = None,
+    screen: bool = False,
 ) -> Fit:
     """Find the parameters of `stack` that explain `data` best, and how well the data determine them.
 
     Args:
-        stack: holds `Free` where a number is to be fitted; or a `Joint` of problems, in which all else is said.
+        stack: holds `Free` where a number is to be fitted; or a `Problem` or `Joint`, in which all else is said.
         data: only the samples that its mask leaves in are used.
         transport: see `Problem`. A resolution that is not given is chosen: coarse for the starts, at the end so fine
             that the numerical error of the model stays below a tenth of the data's standard deviation, where that is
@@ -84,64 +86,54 @@ def fit(
         options: tolerances and thresholds.
         progress: called with ("fit", starts done, starts, note).
         checkpoint: a file that each start is kept in as it ends: a fit that was killed takes those that are there for
-            done. It stays, as does one beside it for what is fitted again with model discrepancy (`again`); one of
-            another problem is replaced.
+            done. It stays, as does one beside it for what is fitted again with model discrepancy; one of another
+            problem is replaced.
+        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
+            lowest after a few steps, and stop near the minimum: enough to rank stacks.
 
     Raises:
         ValueError: as `Problem`; starts < 1; an unknown solver.
     """
-    if isinstance(stack, Joint):
+    if isinstance(stack, FittingProblem):
         arguments: dict[str, Any] = {"data": data, "noise": noise, "scale": scale, "instrument": instrument}
         arguments |= {"transport": None if transport == "auto" else transport}
         arguments |= {"objective": None if objective == "likelihood" else objective}
         for name, given in arguments.items():
             if given is not None:
-                raise ValueError(f"{name} is given beside a Joint; each of its problems has its own")
-        problem: FittingProblem = stack
+                raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
+        problem = stack
     elif data is None:
         raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
         problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
-    run = _Run(starts, seed, solver, options, progress or silent, checkpoint)
-    return _fitted(problem, run)
+    if starts < 1:
+        raise ValueError(f"starts is {starts}; it must be at least 1")
+    if solver not in get_args(Solver):
+        raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
+    require_kind("options", options, FitOptions)
+    run = _Run(starts, seed, solver, options, progress or silent, checkpoint, screen)
+    independent = _fit_from(problem, start_points(problem, starts, seed), run)
+    before = {
+        name: found
+        for name, one in problem.problems.items()
+        if undecided(one) and needs_discrepancy(found := without_discrepancy(independent.part(name)), options)
+    }
+    return _with_discrepancy(problem, independent, before, run) if before else independent
 
 
-def fit_problem(
-    problem: FittingProblem,
-    *,
-    starts: int = 32,
-    seed: int = 0,
-    solver: Solver = "least_squares",
-    options: FitOptions = DEFAULT,
-    progress: Progress | None = None,
-    checkpoint: str | Path | None = None,
-    screen: bool = False,
+def fit_with_discrepancy(
+    problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0, options: FitOptions = DEFAULT
 ) -> Fit:
-    """Find the best parameters of a problem that is already put together, as `fit` does.
-
-    Args:
-        problem: a `Problem`, or a `Joint` of several.
-        starts, seed, solver, options, progress, checkpoint: see `fit`.
-        screen: stay at the resolution of the starts, do not estimate its error, continue only the starts that are
-            lowest after a few steps, and stop near the minimum.
-
-    Raises:
-        ValueError: starts < 1; an unknown solver.
-    """
-    return _fitted(problem, _Run(starts, seed, solver, options, progress or silent, checkpoint, screen))
-
-
-def fit_with_discrepancy(problem: FittingProblem, independent: Fit, *, starts: int = 32, seed: int = 0) -> Fit:
-    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit_problem`."""
+    """The fit of a problem with model discrepancy, after one with independent noise; arguments as of `fit`."""
     before = {name: without_discrepancy(independent.part(name)) for name in problem.problems}
-    return _with_discrepancy(problem, independent, before, _Run(starts, seed, "least_squares", DEFAULT, silent, None))
+    return _with_discrepancy(problem, independent, before, _Run(starts, seed, options=options))
 
 
 def refit(problem: Problem, *vectors: Floats) -> Fit:
     """The fit of a problem with minima near these vectors (P,), roughly, at the resolution that the problem has."""
     ends = [rough_descent(problem, unit_of(problem, vector), fresh=False) for vector in vectors]
     best = polish(problem, ends, "least_squares", check=False, tolerance=ROUGH_TOLERANCE)
-    return _result(best, None, _Run(len(ends), 0, "least_squares", DEFAULT, silent, None), {})
+    return _result(best, None, _Run(len(ends)), {})
 
 
 def discrepancy_checkpoint(checkpoint: str | Path) -> Path:
@@ -150,41 +142,69 @@ def discrepancy_checkpoint(checkpoint: str | Path) -> Path:
 
 
 class _Run(NamedTuple):
-    """How a problem is fitted."""
+    """How a problem is fitted: see `fit`."""
 
     starts: int
-    seed: int
-    solver: Solver
-    options: FitOptions
-    progress: Progress
-    checkpoint: str | Path | None
+    seed: int = 0
+    solver: Solver = "least_squares"
+    options: FitOptions = DEFAULT
+    progress: Progress = silent
+    checkpoint: str | Path | None = None
     screen: bool = False
 
 
-def _fitted(problem: FittingProblem, run: _Run) -> Fit:
-    """The fit with independent noise, and where its residuals ask for it that with model discrepancy."""
-    if run.starts < 1:
-        raise ValueError(f"starts is {run.starts}; it must be at least 1")
-    if run.solver not in get_args(Solver):
-        raise ValueError(f"solver is {run.solver!r}; it must be one of {', '.join(get_args(Solver))}")
-    require_kind("options", run.options, FitOptions)
-    result = _fit_from(problem, start_points(problem, run.starts, run.seed), run)
-    before = datasets_with_discrepancy(result, run.options)
-    return _with_discrepancy(problem, result, before, run) if before else result
+def undecided(problem: Problem) -> bool:
+    """Whether it is left to the residuals, and could be counted."""
+    noise = problem.noise
+    if isinstance(problem.data, Totals):
+        return False  # they have no neighbours
+    return noise.discrepancy is None and noise.tails == "gaussian" and problem.objective == "likelihood"
+
+
+def without_discrepancy(fit: Fit) -> WithoutDiscrepancy:
+    """What is to be said of a fit without model discrepancy."""
+    pairs = neighbours(fit.problem.data.used(), fit.residuals)
+    return WithoutDiscrepancy(
+        values=fit.values,
+        errors=fit.standard_errors,
+        chi_square=fit.chi_square,
+        degrees_of_freedom=fit.degrees_of_freedom,
+        log_likelihood=fit.log_likelihood,
+        residual_autocorrelation=correlation(*pairs),
+        pairs=pairs[0].size,
+    )
+
+
+def needs_discrepancy(independent: WithoutDiscrepancy, options: FitOptions = DEFAULT) -> bool:
+    """Whether residuals of neighbours are correlated, by the rule above."""
+    correlation = independent.residual_autocorrelation
+    clear = correlation * math.sqrt(independent.pairs) > options.autocorrelation_errors
+    return clear and correlation > options.autocorrelation
 
 
 def _with_discrepancy(
     problem: FittingProblem, independent: Fit, before: Mapping[str, WithoutDiscrepancy], run: _Run
 ) -> Fit:
-    """The fit with model discrepancy of these data sets, which were fitted with independent noise before."""
-    whole = problem.with_problems({name: with_discrepancy(problem.problems[name]) for name in before})
+    """The fit with model discrepancy of these data sets, which were fitted with independent noise before.
+
+    It starts from the minima of that fit, and from some of as many points as that had.
+    """
+    changed = {name: problem.problems[name] for name in before}
+    whole = problem.with_problems(
+        {name: replace(one, noise=replace(one.noise, discrepancy=True)) for name, one in changed.items()}
+    )
+    points = []
+    for minimum in independent.minima[:MOST_STARTS]:
+        values = dict(zip(whole.names, whole.start, strict=True)) | minimum.values
+        points.append(unit_of(whole, np.array([values[name] for name in whole.names])))
+    others = start_points(whole, min(run.starts, MOST_STARTS // 2), run.seed)
 
     def progress(stage: str, done: int, total: int | None = None, info: str = "") -> None:
         run.progress(f"{stage} with model discrepancy", done, total, info)
 
     checkpoint = None if run.checkpoint is None else discrepancy_checkpoint(run.checkpoint)
-    points = start_points_with_discrepancy(whole, independent, run.starts, run.seed)
-    return _fit_from(whole, points, run._replace(progress=progress, checkpoint=checkpoint), before)
+    again = run._replace(progress=progress, checkpoint=checkpoint)
+    return _fit_from(whole, np.concatenate([points, others]), again, before)
 
 
 def _fit_from(
@@ -196,17 +216,22 @@ def _fit_from(
     """The fit from these points (starts, P) of the unit box, in four steps."""
     # 1. all starts, at a coarse resolution where that is open
     known = {name: found for name, one in problem.problems.items() if (found := resolutions(one)) is not None}
-    open_rays = {name for name, one in problem.problems.items() if apertures.leaves_open(one)}
+    open_rays = {name for name, one in problem.problems.items() if leaves_rays_open(one)}
     coarse = {name: replace(problem.problems[name], transport=one.far) for name, one in known.items() if one.open}
     problem = problem.with_problems(coarse)
-    problem = problem.with_problems({name: apertures.for_starts(problem.problems[name]) for name in open_rays})
-    screen = run.screen and run.solver == "least_squares"
-    ends = screened_starts(problem, points) if screen else _ends(problem, points, run)
+    problem = problem.with_problems({name: rings_for_starts(problem.problems[name]) for name in open_rays})
+    if run.screen and run.solver == "least_squares":
+        ends = screened_starts(problem, points)
+    elif run.checkpoint is None:
+        ends = multi_start(problem, points, run.solver, run.progress)
+    else:  # each is kept as it ends
+        with starts_store(run.checkpoint, problem, points, run.solver) as store:
+            ends = multi_start(problem, points, run.solver, run.progress, store)
     # 2. the lowest of them, to its very minimum, with the uncertainties there
     at = polish(problem, ends, run.solver, tolerance=ROUGH_TOLERANCE if run.screen else COST_TOLERANCE)
     # 3. at the resolution that the noise of the data asks for
     accuracy = None
-    if not run.screen and (known or any(map(apertures.has_rays, problem.problems.values()))):
+    if not run.screen and (known or any(map(has_rays, problem.problems.values()))):
         at, accuracy = refined(at, known, open_rays, run.solver, run.options, run.progress)
     # 4. what follows from it
     return _result(at, accuracy, run, without)
@@ -214,7 +239,7 @@ def _fit_from(
 
 def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[str, WithoutDiscrepancy]) -> Fit:
     """The fit of an optimum: values, errors, minima, and its status in words."""
-    problem, lowest, found, options = at.problem, at.lowest, at.found, run.options
+    problem, lowest, found, options = at.problem, at.lowest, at.uncertainty, run.options
     at_bound = tuple(name for name, held in zip(problem.names, found.at_bound, strict=True) if held)
     minima, outcomes = _minima(problem, at, options)
     equivalent = options.equivalent_cost * at.excess
@@ -248,14 +273,6 @@ def _result(at: Optimum, accuracy: Accuracy | None, run: _Run, without: Mapping[
     return result
 
 
-def _ends(problem: FittingProblem, points: Floats, run: _Run) -> list[StartOutcome]:
-    """Outcomes of the starts (starts, P) in the unit box, each kept in the checkpoint as it ends."""
-    if run.checkpoint is None:
-        return multi_start(problem, points, run.solver, run.progress)
-    with starts_store(run.checkpoint, problem, points, run.solver) as store:
-        return multi_start(problem, points, run.solver, run.progress, store)
-
-
 def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[tuple[Minimum, ...], dict[str, int]]:
     """The lowest end and the distinct ones that converged, best first; and how many starts had which outcome.
 
@@ -265,9 +282,9 @@ def _minima(problem: FittingProblem, at: Optimum, options: FitOptions) -> tuple[
     cost = np.array([end.cost for end in ends])
     units = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(np.stack([end.vector for end in ends]))))
     width = np.asarray(problem.model.box.slope(jnp.asarray(ends[best].vector)))
-    spread = np.nan_to_num(at.found.standard_errors / width, nan=0.0, posinf=np.inf)
+    spread = np.nan_to_num(at.uncertainty.standard_errors / width, nan=0.0, posinf=np.inf)
     same = options.same_values + options.same_errors * np.minimum(spread, SAME_AT_MOST)
-    free = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, at.found.insensitive)
+    free = (spread > UNCONSTRAINED_BEYOND) | np.isin(problem.names, at.uncertainty.insensitive)
     same_at_equal_cost = np.where(free, np.inf, same)
 
     def are_one(index: int, other: int) -> bool:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver.
+"""Levenberg-Marquardt within a box, on the normal equations, as an optimistix solver; and through a model.
 
 optimistix has no bounds, and a transform to an unconstrained space sends a parameter whose best value lies on its bound
 to infinity, where gradients vanish. Here the iterate stays in the box: parameters that push against a bound are held
@@ -7,16 +7,36 @@ Levenberg-Marquardt, Kanzow, Yamashita and Fukushima 2004). The few columns of t
 and only J'J and J'r are kept, which is several times faster than a QR decomposition of J when there are many more
 residuals than parameters. Columns are scaled to unit length first, so that units do not matter to the damping (after
 Marquardt 1963; its update after Nielsen 1999).
+
+To compile the Jacobian of a costly transport takes longer than most fits take to run. So whatever needs it, at one
+point or along many steps, calls `descend`: a descent of a single step says what is known where it begins.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jax import Array
+from numpy.typing import NDArray
+
+from fits.problem.model import Model
+from fits.problem.problem import FittingProblem
+
+Floats = NDArray[np.float64]
+
+COST_TOLERANCE = 1e-8
+"""A likelihood fit has converged when a full step is predicted to gain less than this in the log-posterior: 1e-4
+standard errors."""
+
+NEARBY = 1e-4
+"""Damping near a minimum: a step is all but a full one."""
+
+ROUGH_TOLERANCE = 1e-4
+"""A hundredth of a standard error: distinguishes minima, after about a third of the steps where these gain least."""
 
 FIRST_DAMPING = 1e-2
 FIRST_GROWTH = 4.0
@@ -213,3 +233,101 @@ def _damped_solve(matrix: Array, slope: Array, known: Array, fixed: Array, dampi
     reduced = reduced + jnp.diag(jnp.where(fixed, 1.0, damping + jnp.where(jnp.diagonal(matrix) > 0, 0.0, 1.0)))
     target = jnp.where(free, -(slope + matrix @ known), known)
     return jax.scipy.linalg.solve(reduced, target, assume_a="pos")
+
+
+# ---- through a model ----
+
+
+class Descent(NamedTuple):
+    """Where a descent ended, and what is known there of a model with P parameters: arrays of JAX or of numpy.
+
+    vector: physical, (P,). cost: infinite where the model has no finite value and Jacobian. steps: in all. converged,
+    max_steps_reached: whether it did, and whether it reached the maximum of steps. gradient: of the cost in the unit
+    box, (P,). root: (P, P), its root' root is the information in the data, in boxes^-2. predicted: (N, C), in 1/sr, NaN
+    with an infinite cost.
+    """
+
+    vector: Any
+    cost: Any
+    steps: Any
+    converged: Any
+    max_steps_reached: Any
+    gradient: Any
+    root: Any
+    predicted: Any
+
+
+def descend(model: Model, start: Array, fresh: Array, most_steps: Array, tolerance: Array) -> Descent:
+    """Levenberg-Marquardt from `start` (P,) in the unit box, until a full step is predicted to gain less than
+    `tolerance` in the log-posterior. Not `fresh`: near a minimum, all levels free."""
+    likelihood = model.objective == "likelihood"
+    varying = likelihood and bool(model.logarithmic)
+    solver, damping = BoxLevenbergMarquardt(), jnp.where(fresh, FIRST_DAMPING, NEARBY)
+    options = {
+        "watch": lambda auxiliary: auxiliary[1],
+        "damping": damping,
+        **({"tolerance": tolerance} if likelihood else {}),
+    }
+    options |= {"logarithmic": model.logarithmic} if varying else {}
+
+    def residuals(unit: Array, first_step: tuple[Array, Array]) -> Any:
+        return model.linear_parts(model.box.from_unit(unit), first_step if varying else None)
+
+    def stage(unit: Array, held: tuple[Array, Array, Array]) -> tuple[Array, Descent]:
+        *first_step, most = held
+        solution: Any = optx.least_squares(
+            residuals,
+            solver,
+            unit,
+            args=tuple(first_step),
+            has_aux=True,
+            options={**options, "most_steps": most},
+            max_steps=None,
+            throw=False,
+        )
+        found = Descent(
+            vector=model.box.from_unit(solution.value),
+            cost=solution.stats["cost"],
+            steps=solution.stats["num_steps"],
+            converged=jnp.asarray(solution.result == optx.RESULTS.successful),
+            max_steps_reached=jnp.asarray(solution.result == optx.RESULTS.nonlinear_max_steps_reached),
+            gradient=solution.stats["gradient"],
+            # R of the QR decomposition has A's singular values without squaring its condition number
+            root=jnp.linalg.qr(solution.stats["watched"].T, mode="r"),
+            predicted=solution.aux[0],
+        )
+        return solution.value, found
+
+    sigmas, most, shared = jnp.full((1, 1, 1), jnp.nan), most_steps[None], jnp.ones(1)
+    if varying:  # far from the data, a level grows until everything fits: go near it first, with sigma held
+        sigmas, most, shared = (
+            jnp.stack([sigmas[0]] * 2),
+            jnp.stack([jnp.where(fresh, most_steps, 0), most_steps]),
+            jnp.arange(2.0),
+        )
+    if likelihood and model.varying:
+        held = model.initial_sigma(model.box.from_unit(start))
+        sigmas = jnp.stack([held, jnp.full_like(held, jnp.nan)])
+    _, stages = jax.lax.scan(stage, start, (sigmas, shared, most))
+    last = jax.tree.map(lambda part: part[-1], stages)
+    finite = jnp.isfinite(last.cost)
+    return last._replace(
+        cost=jnp.where(finite, last.cost, jnp.inf),
+        steps=jnp.sum(stages.steps),
+        converged=last.converged & finite,
+        max_steps_reached=last.max_steps_reached & finite,
+        predicted=jnp.where(finite, last.predicted, jnp.nan),
+    )
+
+
+def descent(
+    problem: FittingProblem, start: Floats, fresh: bool, most_steps: int, tolerance: float = COST_TOLERANCE
+) -> Descent:
+    """`descend`, compiled once for all problems of this structure; numbers in double precision."""
+    found = problem.call(descend, start, np.asarray(fresh), np.asarray(most_steps), np.asarray(tolerance))
+    return Descent(*(np.asarray(part, float if jnp.issubdtype(part.dtype, jnp.floating) else None) for part in found))
+
+
+def evaluate_at(problem: FittingProblem, unit: Floats) -> Descent:
+    """What is known at a point (P,) of the unit box; its vector is this point."""
+    return descent(problem, unit, False, 1)

@@ -1,20 +1,17 @@
 """What an instrument does not resolve: lobes narrower than its aperture, or than the steps of its scans."""
 
 import math
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, scans, signed_angle
+from fits.optimise.result import Fit
 from fits.optimise.uncertainty import local_information
 from layerjax.mixture import stacks_by_name
-
-if TYPE_CHECKING:
-    from fits.data.measurements import Measurements
-    from fits.optimise.result import Fit
 
 HALF = {"ggx": math.sqrt(math.sqrt(2.0) - 1.0), "vmf": math.sqrt(math.log(2.0))}
 """Tangent of the half vector, over alpha, at which facets are half as many as along the normal."""
@@ -26,7 +23,7 @@ NEAR = 10.0
 """Degrees from the mirror direction within which steps of a scan count."""
 
 
-def instrument_limits(fit: "Fit") -> dict[str, float]:
+def instrument_limits(fit: Fit) -> dict[str, float]:
     """Fitted roughnesses whose lobe is narrower than what can be seen of it, and the least alpha that could be.
 
     A mirror lobe is as wide as its full width at half maximum, in the angle of the viewer. That has to be wider than
@@ -45,24 +42,24 @@ def instrument_limits(fit: "Fit") -> dict[str, float]:
     return found
 
 
-def limited_with(fit: "Fit") -> dict[str, tuple[str, float]]:
+def limited_with(fit: Fit) -> dict[str, tuple[str, float]]:
     """Other parameters that what is not resolved limits: the roughness that each moves with, and how far.
 
     A roughness that is limited may be anything up to the least that could be seen (`instrument_limits`). What moves by
     more than its standard error when that is put in its place, by the information in the data about both, is known no
     better: it counts in standard errors, by the roughness that moves it most.
     """
-    found: dict[str, tuple[str, float]] = {}
+    limited: dict[str, tuple[str, float]] = {}
     limits, names = instrument_limits(fit), list(fit.values)
     for roughness, least in limits.items():
         moves = np.abs(_slopes(fit, names.index(roughness)) * (least - fit.values[roughness]))
         for name, move, error in zip(names, moves, fit.errors, strict=True):
-            if name not in limits and 0.0 < error < move and move / error > found.get(name, ("", 0.0))[1]:
-                found[name] = (roughness, float(move / error))
-    return found
+            if name not in limits and 0.0 < error < move and move / error > limited.get(name, ("", 0.0))[1]:
+                limited[name] = (roughness, float(move / error))
+    return limited
 
 
-def _slopes(fit: "Fit", place: int) -> NDArray[np.float64]:
+def _slopes(fit: Fit, place: int) -> NDArray[np.float64]:
     """How the best values of all parameters, (P,), change with one that is held."""
     spread = fit.covariance[place, place]
     if spread > 0.0 and math.isfinite(spread):
@@ -77,7 +74,7 @@ def _slopes(fit: "Fit", place: int) -> NDArray[np.float64]:
     return slopes
 
 
-def finest_step(data: "Measurements") -> float:
+def finest_step(data: Measurements) -> float:
     """Degrees between neighbours about the mirror direction, of the scan that is finest there; 0 if none crosses it."""
     signed, plane = signed_angle(data), in_plane(data)
     steps = []
@@ -96,11 +93,11 @@ def finest_step(data: "Measurements") -> float:
 
 def _facets(material: lj.Stack | lj.Mixture) -> dict[str, str]:
     """Names of roughnesses, and the distribution of each."""
-    found: dict[str, str] = {}
+    facets: dict[str, str] = {}
     for prefix, stack in stacks_by_name(material).items():
         for place, layer in enumerate(stack.layers):
             if isinstance(layer, lj.Interface):
-                found[f"{prefix}layers[{place}].alpha"] = layer.distribution
+                facets[f"{prefix}layers[{place}].alpha"] = layer.distribution
         if isinstance(stack.base, lj.Conductor):
-            found[f"{prefix}base.alpha"] = stack.base.distribution
-    return found
+            facets[f"{prefix}base.alpha"] = stack.base.distribution
+    return facets

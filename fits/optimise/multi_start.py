@@ -1,13 +1,17 @@
-"""The starts of a fit: where they begin, and where each of them ends.
+"""The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
-A start that reaches the maximum of steps is continued while it gains something: the number of steps says nothing
-about how good its outcome is.
+Levenberg-Marquardt follows them. L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the
+objective: it checks a minimum that lies on a bound or has not converged, and can take all starts, where Gauss-Newton
+steps stall. A start that reaches the maximum of steps is continued while it gains something: the number of steps says
+nothing about how good its outcome is.
 """
 
+import warnings
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +20,10 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 import layerjax
-from fits.optimise.bounded import TOLERANCE, cost_and_gradient, minimise_in_box
-from fits.optimise.descent import COST_TOLERANCE, ROUGH_TOLERANCE, descent, evaluate_at
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, ROUGH_TOLERANCE, Descent, descent, evaluate_at
+from fits.optimise.uncertainty import Uncertainty, uncertainty
 from fits.problem.compilation import cores
+from fits.problem.model import Density, Model, half_squares
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
@@ -28,6 +33,7 @@ Floats = NDArray[np.float64]
 
 MOST_STEPS = 200
 MOST_ROUNDS = 20
+LBFGSB_STEPS, LBFGSB_TOLERANCE = 500, 1e-12
 EARLY, FRONT = 20, 3
 """Steps, with sigma held and with it free, after which starts are screened, and how many of them are continued."""
 LEAST_GAIN = 1e-3
@@ -47,6 +53,12 @@ class StartOutcome(NamedTuple):
     steps: int
     converged: bool
     max_steps_reached: bool
+
+    @classmethod
+    def of(cls, end: Descent, steps_before: int = 0) -> "StartOutcome":
+        """The outcome of a descent, after so many steps before it."""
+        steps = steps_before + int(end.steps)
+        return cls(end.vector, float(end.cost), steps, bool(end.converged), bool(end.max_steps_reached))
 
 
 def start_points(problem: FittingProblem, starts: int, seed: int) -> Floats:
@@ -107,10 +119,7 @@ def screened_starts(problem: FittingProblem, points: Floats) -> list[StartOutcom
     """Where the points (starts, P) in the unit box end if only those go on that are lowest after a few steps."""
 
     def early(point: Floats) -> StartOutcome:
-        found = descent(problem, point, True, EARLY, ROUGH_TOLERANCE)
-        return StartOutcome(
-            found.vector, float(found.cost), int(found.steps), bool(found.converged), bool(found.max_steps_reached)
-        )
+        return StartOutcome.of(descent(problem, point, True, EARLY, ROUGH_TOLERANCE))
 
     def onward(end: StartOutcome) -> StartOutcome:
         if not end.max_steps_reached:
@@ -131,13 +140,10 @@ def least_squares_descent(
     problem: FittingProblem, point: Floats, fresh: bool = True, tolerance: float = COST_TOLERANCE
 ) -> StartOutcome:
     """Levenberg-Marquardt from a point (P,) in the unit box. Not `fresh`: near a minimum, with sigma free at once."""
-    steps = 0
     end = StartOutcome(point, np.inf, 0, False, True)
     for _ in range(MOST_ROUNDS):
         before = end.cost
-        found = descent(problem, point, fresh, MOST_STEPS, tolerance)
-        steps += int(found.steps)
-        end = StartOutcome(found.vector, float(found.cost), steps, bool(found.converged), bool(found.max_steps_reached))
+        end = StartOutcome.of(descent(problem, point, fresh, MOST_STEPS, tolerance), end.steps)
         least_gain = LEAST_GAIN if problem.objective == "likelihood" else LEAST_RELATIVE_GAIN * end.cost
         if not end.max_steps_reached or not before - end.cost > least_gain:
             break
@@ -153,6 +159,38 @@ def rough_descent(problem: FittingProblem, point: Floats, fresh: bool = True) ->
 def unit_of(problem: FittingProblem, vector: Floats) -> Floats:
     """The point of the unit box, (P,), where a physical vector (P,) lies."""
     return np.asarray(problem.model.box.to_unit(jnp.asarray(vector)), float)
+
+
+def cost_and_gradient(model: Model, unit: Any) -> tuple[Any, Any]:
+    """Half the sum of squared residuals at a point (P,) of the unit box, and its gradient (P,) there."""
+    return jax.value_and_grad(lambda s: half_squares(model.residuals(model.box.from_unit(s))))(unit)
+
+
+def minimise_in_box(
+    value_and_gradient: Callable[[Any], tuple[Any, Any]],
+    start: NDArray[np.float64],
+    tolerance: float = LBFGSB_TOLERANCE,
+) -> tuple[NDArray[np.float64], float, int, bool]:
+    """Minimise from `start` (P,) in the unit box: the point, its cost, the iterations, and whether it converged.
+
+    tolerance: it ends where a step gains less than this share of the cost, or where the gradient is smaller.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import ScipyBoundedMinimize
+
+    solver = ScipyBoundedMinimize(
+        fun=value_and_gradient,
+        method="l-bfgs-b",
+        value_and_grad=True,
+        jit=False,  # the function is compiled already, and for all problems of this structure
+        tol=tolerance,
+        maxiter=LBFGSB_STEPS,
+    )
+    inside = jnp.clip(jnp.asarray(start), 0.0, 1.0)
+    point, info = solver.run(inside, bounds=(jnp.zeros_like(inside), jnp.ones_like(inside)))
+    lowest = float(info.fun_val)
+    return np.asarray(point, float), lowest, int(info.iter_num), bool(info.success) and bool(np.isfinite(lowest))
 
 
 def bounded_descent(problem: FittingProblem, point: Floats, fresh: bool = True) -> StartOutcome:
@@ -173,9 +211,83 @@ def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutc
         found = evaluate_at(problem, unit)
         return found.cost, found.gradient
 
-    enough = LEAST_STEP_GAIN / max(abs(end.cost), 1.0) if problem.objective == "likelihood" else TOLERANCE
+    enough = LEAST_STEP_GAIN / max(abs(end.cost), 1.0) if problem.objective == "likelihood" else LBFGSB_TOLERANCE
     point, _, _, settled = minimise_in_box(value_and_gradient, unit_of(problem, end.vector), enough)
     other = least_squares_descent(problem, point, fresh=False)
     if other.cost < end.cost - max(COST_TOLERANCE, 1e-9 * abs(end.cost)):
         return other._replace(converged=other.converged or settled, steps=end.steps + other.steps), True
     return end._replace(converged=end.converged or other.converged or settled), False
+
+
+# ---- the lowest end, at its very minimum ----
+
+
+class Optimum(NamedTuple):
+    """The outcomes of all starts, the place of the lowest among them, and what is known there.
+
+    improved: whether L-BFGS-B found what Levenberg-Marquardt had not. predicted: (N, C), in 1/sr. excess: what
+    differences in cost count in, see `FitOptions`.
+    """
+
+    problem: FittingProblem
+    ends: list[StartOutcome]
+    best: int
+    uncertainty: Uncertainty
+    improved: bool
+    predicted: Floats
+    excess: float
+
+    @property
+    def lowest(self) -> StartOutcome:
+        """The lowest end, exactly on the bounds that hold it."""
+        return self.ends[self.best]
+
+
+def polish(
+    problem: FittingProblem,
+    ends: list[StartOutcome],
+    solver: Solver,
+    *,
+    check: bool = True,
+    tolerance: float = COST_TOLERANCE,
+) -> Optimum:
+    """The lowest of the ends, followed to its very minimum, and checked by L-BFGS-B where it has not converged.
+
+    check: also where a parameter lies on a bound or has no influence. It takes a hundred steps: what begins at a
+    minimum that was checked goes without. tolerance: how far it is followed, see `descend`.
+    """
+    best, improved = int(np.argmin([end.cost for end in ends])), False
+    lowest, likelihood = ends[best], problem.objective == "likelihood"
+    least_squares = solver == "least_squares"
+    # 1. closer to its minimum
+    if least_squares and likelihood and lowest.converged and tolerance < ROUGH_TOLERANCE:
+        closer = least_squares_descent(problem, unit_of(problem, lowest.vector), False, tolerance)
+        if closer.cost <= lowest.cost:
+            lowest = closer._replace(steps=lowest.steps + closer.steps)
+    found = uncertainty(problem, lowest.vector, lowest.cost)
+    # 2. no step leads off a plateau, where every start may end though another minimum is far lower: insensitive
+    # parameters and those at a bound begin anew
+    if least_squares and check and found.insensitive:
+        stuck = np.isin(problem.names, found.insensitive) | found.at_bound
+        point = np.where(stuck, unit_of(problem, problem.start), unit_of(problem, lowest.vector))
+        other = least_squares_descent(problem, point, tolerance=tolerance)
+        if other.cost < lowest.cost - (ROUGH_TOLERANCE if likelihood else LEAST_RELATIVE_GAIN * lowest.cost):
+            lowest = other._replace(steps=lowest.steps + other.steps)
+            found = uncertainty(problem, lowest.vector, lowest.cost)
+    # 3. checked by the other solver
+    if least_squares and ((check and found.at_bound.any()) or not lowest.converged):
+        lowest, improved = lbfgsb_polish(problem, lowest)
+        found = uncertainty(problem, lowest.vector, lowest.cost) if improved else found
+    # 4. exactly on the bounds that hold it
+    low, high, held, vector = problem.low, problem.high, found.at_bound, lowest.vector
+    nearest = np.where(vector - low < high - vector, low, high)
+    lowest = lowest._replace(vector=np.where(held, nearest, np.clip(vector, low, high)))
+    predicted = evaluate_at(problem, unit_of(problem, lowest.vector)).predicted if held.any() else found.predicted
+    # 5. the reduced chi-square where it is above 1; of a named objective, the residual variance
+    freedom = max(problem.count - len(lowest.vector), 1)
+    if likelihood:
+        excess = max(1.0, float(problem.call(Density.chi_square_at, lowest.vector, predicted)) / freedom)
+        excess = excess if problem.count > len(lowest.vector) else 1.0
+    else:
+        excess = 2.0 * lowest.cost / freedom
+    return Optimum(problem, [*ends[:best], lowest, *ends[best + 1 :]], best, found, improved, predicted, excess)

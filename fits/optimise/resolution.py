@@ -1,13 +1,16 @@
-"""How finely the transport of a fit solves the stack: as finely as the noise of the data asks for.
+"""How finely a fit solves its stack and its instrument's cones: as finely as the noise of the data asks for.
 
-A resolution that is left open is that of the start values where starts run, but no finer than is useful far away
-from the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise.
-One that is given is compared with a finer one, and stays.
+A resolution that is left open is that of the start values where starts run, but no finer than is useful far away from
+the data. At the optimum it is compared with finer ones, by values alone, until they agree to a tenth of the noise: only
+then are the minima that may be the best, or as good as it, fitted again, as programs of a finer resolution take seconds
+to compile. A resolution that is given is compared with a finer one, and stays. The rays that stand for the cones of an
+instrument are chosen in the same way.
 """
 
 import warnings
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,23 +19,43 @@ from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
+from fits.optimise.multi_start import Optimum, Solver, StartOutcome, bounded_descent, polish, rough_descent, unit_of
+from fits.optimise.options import FitOptions
+from fits.problem.apertures import most_rings
+from fits.problem.instrument import rings_for
 from fits.problem.model import Density, Model
-from fits.problem.problem import Problem
+from fits.problem.problem import FittingProblem, Problem
+from fits.progress import Progress
 from layerjax.mixture import stacks_of
 from layerjax.preparation import transport_for
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
-FAR = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}
-"""The finest resolution of starts: what is finer costs more than it tells far away from the data."""
+FAR, FAR_RINGS = {"nodes": 12, "modes": 16, "ordinates": (8, 12)}, 2
+"""The finest resolution of starts, and their most rings of a cone: what is finer costs more than it tells far away from
+the data."""
 
 FINEST_NODES, FINEST_MODES, FINEST_COSINES = 48, 96, 16
 """What is chosen at most."""
+
+MINOR_SHARE = 0.5
+"""Of the numerical error that is allowed: left to nodes or modes where the other is what has to be finer."""
+
+ENOUGH_OF_PEAK, NO_BETTER = 1e-3, 0.3
+"""Error of the rays, in units of the largest measurement, that no fit needs to fall below; and the share of an error
+that a ring more may leave: more costs more than it gains, and of a lobe it leaves a fifth."""
 
 LEAST_SCATTER = 0.01
 """Of the data's root mean square: less scatter about a named objective counts as this, so that an error of a thousandth
 is enough, which `AddingDoubling` aims at."""
 
+SAME_OUTCOME, MOST_MINIMA = 0.01, 8
+"""Of the box: ends that are closer in every parameter are fitted again as one; and the most that are, other than those
+that turn out to be the best."""
+
 Floats = NDArray[np.float64]
+
+
+# ---- of the transport ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +79,7 @@ class Resolutions:
 
     @property
     def far(self) -> lj.AddingDoubling:
-        """The resolution that starts are fitted at: the chosen one, but no finer than a look needs."""
+        """The resolution that starts are fitted at: the chosen one, but no finer than is of use there."""
         least = {name: min(getattr(self.chosen, name), most) for name, most in FAR.items()}
         return self._as_given(replace(self.chosen, **least))
 
@@ -70,7 +93,7 @@ class Resolutions:
                 nodes=max(nodes, min(finer.nodes or 0, FINEST_NODES)),
                 modes=max(modes, min(finer.modes or 0, FINEST_MODES)),
             )
-        elif self._size(finer) > (FINEST_COSINES if self.tilted else FINEST_NODES):
+        elif ((finer.ordinates or (0, 0))[0] > FINEST_COSINES) if self.tilted else (finer.nodes or 0) > FINEST_NODES:
             return None
         return None if finer == transport else finer
 
@@ -91,10 +114,6 @@ class Resolutions:
             return "{} cosines, {} azimuths".format(*transport.ordinates or ("?", "?"))
         return f"{transport.nodes} nodes, {transport.modes} modes"
 
-    def _size(self, transport: lj.AddingDoubling) -> int:
-        size = (transport.ordinates or (0, 0))[0] if self.tilted else transport.nodes
-        return size or 0
-
     def _as_given(self, transport: lj.AddingDoubling) -> lj.AddingDoubling:
         """The transport with what the user gave put back in; unchanged where the user left nothing to choose."""
         if not self.open:
@@ -114,27 +133,22 @@ def resolutions(problem: Problem) -> Resolutions | None:
     if not isinstance(transport, lj.AddingDoubling | str):
         return None
 
+    def chosen(stack: Any, given: Any) -> Any:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", lj.ResolutionWarning)  # a fit tells the error that is left by itself
+            return transport_for(stack, given, directions)
+
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
         layers = [layer for part in stacks_of(stack) for layer in part.layers]
-        return _chosen(stack, transport, directions), any(map(is_tilted, layers))
+        return chosen(stack, transport), any(map(is_tilted, layers))
 
     start = jnp.asarray(problem.start)
     kind, tilted = eqx.filter_eval_shape(traced, start)
     if not isinstance(kind, lj.AddingDoubling) or kind.orders == "first":
         return None
     given = replace(kind, nodes=None, modes=None, ordinates=None) if isinstance(transport, str) else transport
-    chosen = _chosen(model.build(start).stack, given, directions)
-    assert isinstance(given, lj.AddingDoubling)
-    assert isinstance(chosen, lj.AddingDoubling)
-    return Resolutions(given, chosen, tilted)
-
-
-def _chosen(stack: Any, transport: Any, directions: Any) -> lj.Transport:
-    """A fit tells the error that is left by itself."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", lj.ResolutionWarning)
-        return transport_for(stack, transport, directions)
+    return Resolutions(given, chosen(model.build(start).stack, given), tilted)
 
 
 def at_start(problem: Problem) -> Problem:
@@ -172,13 +186,237 @@ class Values:
 
 
 def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
-    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy
-    with model discrepancy; for a named objective the scatter of its residuals, one number."""
+    """Standard deviations of the data, (N, C), with noise levels as they are in `vector` (P,), and model discrepancy;
+    for a named objective the scatter of its residuals, one number."""
     if problem.objective == "likelihood":
-        sigma = np.asarray(problem.call(Density.sigma_at, vector, predicted), float)
-        shared = problem.build(vector).correlation
-        return sigma if shared is None else np.hypot(sigma, float(shared.amplitude) * predicted)
+        sigma = np.asarray(problem.call(Model.sigma_at, vector, predicted), float)
+        correlation = problem.build(vector).correlation
+        return sigma if correlation is None else np.hypot(sigma, float(correlation.amplitude) * predicted)
     residuals = np.asarray(problem.call(Model.standardised_at, vector, predicted), float)
     data = np.asarray(problem.call(Model.standardised_at, vector, np.zeros_like(predicted)), float)
     scatter = np.sqrt(np.sum(residuals**2) / max(problem.count - len(vector), 1))
     return np.maximum(scatter, LEAST_SCATTER * np.sqrt(np.mean(data**2)))
+
+
+def needed_resolution(
+    known: Resolutions, own: lj.AddingDoubling, values: Values, allowed: float, progress: Progress
+) -> tuple[lj.AddingDoubling, float, bool]:
+    """The coarsest resolution from its own on that is fine enough, its error, and whether it is the finest there is."""
+
+    def error(one: lj.AddingDoubling, other: lj.AddingDoubling) -> float:
+        found = values.error(one, other)
+        progress("numerical error", values.count, None, f"{found:.2g} sigma at {known.in_words(own)}")
+        return found
+
+    finer = known.finer(own)
+    if finer is None:
+        return own, error(known.coarser(own), own), True
+    found = error(own, finer)
+    while known.open and found > allowed:
+        parts = known.partly_finer(own, finer)
+        own = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
+        finer = known.finer(own)
+        if finer is None:
+            return own, found, True
+        found = error(own, finer)
+    return own, found, False
+
+
+# ---- of an instrument's cones ----
+
+
+def has_rays(problem: Problem) -> bool:
+    """Whether measurements are means over cones."""
+    return problem.model.optics is not None and problem.model.optics.row is not None
+
+
+def leaves_rays_open(problem: Problem) -> bool:
+    """Whether a fit chooses how many rays there are."""
+    return has_rays(problem) and problem.instrument is not None and problem.instrument.rings is None
+
+
+def with_rings(problem: Problem, rings: int) -> Problem:
+    """The problem with so many rings of rays a cone."""
+    assert problem.instrument is not None
+    return replace(problem, instrument=replace(problem.instrument, rings=rings))
+
+
+def rings_for_starts(problem: Problem) -> Problem:
+    """The problem with the rings that its start values ask for, if it gives none."""
+    if not leaves_rays_open(problem):
+        return problem
+    return with_rings(problem, min(_rings_of_lobes(problem, problem.start), FAR_RINGS))
+
+
+def needed_rings(
+    problem: Problem, vector: Floats, predicted: Floats, is_open: bool, allowed: float, progress: Progress
+) -> tuple[int, float]:
+    """Rings from those on that the problem has: so many that more of them, with these parameters, change too little;
+    and the numerical error there, in standard deviations.
+
+    predicted: by the problem, (N, C). is_open: False: those that it has, with their error. allowed: that error.
+    """
+    assert problem.instrument is not None
+    rings, values = problem.instrument.rings or 1, predicted
+    most = most_rings(problem.instrument.source_aperture, problem.instrument.detector_aperture)
+    sigma, peak = spread(problem, vector, predicted), np.max(np.abs(predicted))
+    wanted = min(_rings_of_lobes(problem, vector), most)
+    if is_open and wanted > rings:
+        rings = wanted
+        values = np.asarray(with_rings(problem, rings).predict(vector), float)
+    before = np.inf
+    while True:
+        other = with_rings(problem, max(rings, wanted)).with_other_rays()
+        apart = np.abs(values - np.asarray(other.predict(vector), float))
+        error = float(np.max(apart / sigma))
+        progress("numerical error", rings, None, f"{error:.2g} sigma at {_rings_in_words(rings)}")
+        if error > NO_BETTER * before:  # not of the lobe, but of cones that the horizon cuts, say
+            return rings - 1, before
+        if not is_open or rings == most or (error <= allowed and np.max(apart) <= ENOUGH_OF_PEAK * peak):
+            return rings, error
+        rings, before = rings + 1, error
+        values = np.asarray(with_rings(problem, rings).predict(vector), float)
+
+
+def _rings_of_lobes(problem: Problem, vector: Floats) -> int:
+    """Rings that the lobes of the stack ask for with this vector (P,)."""
+    parts, data = problem.build(vector), problem.data.used()
+    assert problem.instrument is not None
+    assert parts.instrument is not None
+    return rings_for(problem.instrument, parts.instrument, parts.stack, data.wi, data.wo)
+
+
+def _rings_in_words(rings: int) -> str:
+    return f"{rings} ring{'s' if rings > 1 else ''} of rays a cone"
+
+
+# ---- refinement of an optimum ----
+
+
+class Accuracy(NamedTuple):
+    """The resolution of a fit in words, the numerical error there in standard deviations, and what is said of it."""
+
+    resolution: str
+    error: float
+    words: str
+
+    @classmethod
+    def of(cls, resolution: str, error: float, finest: bool, is_open: bool) -> "Accuracy":
+        """finest: the resolution is the finest tried, so that the error is that of a coarser one."""
+        if not np.isfinite(error):
+            words = f"not known at {resolution}"
+        elif finest:
+            words = f"up to {error:.2g} sigma at {resolution}{', the finest tried' if is_open else ''}"
+        else:
+            words = f"{error:.2g} sigma at most at {resolution}{'' if is_open else ', as given'}"
+        return cls(resolution, error, words)
+
+
+def refined(
+    at: Optimum,
+    known: Mapping[str, Resolutions],
+    open_rays: Set[str],
+    solver: Solver,
+    options: FitOptions,
+    progress: Progress,
+) -> tuple[Optimum, Accuracy]:
+    """The optimum at the resolution that the noise of each measurement asks for; at the given one where one is given.
+
+    known: of those measurements whose transport has one, by name. open_rays: names of those whose instrument leaves
+    open how many rays stand for its cones.
+    """
+    while True:
+        accuracies: dict[str, Accuracy] = {}
+        changed: dict[str, Problem] = {}
+        for name, predicted in at.problem.shares(at.predicted).items():
+            problem, parts = at.problem.problems[name], []
+            vector, needed = at.lowest.vector[list(at.problem.places(name))], problem
+            if (one := known.get(name)) is not None:
+                own = transport_of(problem, one)
+                values = Values(problem, own, vector, predicted)
+                transport, error, finest = needed_resolution(one, own, values, options.numerical_error, progress)
+                parts.append(Accuracy.of(one.in_words(own), error, finest, one.open))
+                if one.open and transport != own:
+                    needed = replace(needed, transport=transport)
+            if has_rays(problem):
+                is_open = name in open_rays
+                rings, error = needed_rings(problem, vector, predicted, is_open, options.numerical_error, progress)
+                parts.append(Accuracy.of(_rings_in_words(rings), error, False, is_open))
+                if rings != (cast(Any, problem.instrument).rings or 1):
+                    needed = with_rings(needed, rings)
+            if needed is not problem:
+                changed[name] = needed
+            if parts:  # of one measurement errors add up
+                resolution, words = (", ".join(getattr(part, of) for part in parts) for of in ("resolution", "words"))
+                error = float(np.sum([part.error for part in parts]))
+                accuracies[name] = Accuracy(resolution, error, f"numerical error of the model: {words}")
+        if not changed:
+            resolution, words = (
+                _by_name({name: getattr(one, of) for name, one in accuracies.items()}) for of in ("resolution", "words")
+            )
+            return at, Accuracy(resolution, float(np.max([one.error for one in accuracies.values()])), words)
+        whole = at.problem.with_problems(changed)
+        words = _by_name({name: resolution_in_words(whole.problems[name], known.get(name)) for name in accuracies})
+        ends = _fitted_again(at, whole, solver, words, options.equivalent_cost, progress)
+        again = polish(whole, ends, solver, check=at.improved)
+        at = again._replace(improved=again.improved or at.improved)
+
+
+def transport_of(problem: Problem, known: Resolutions) -> lj.AddingDoubling:
+    """The transport that a problem is solved by, with its resolution."""
+    return cast(lj.AddingDoubling, problem.transport) if known.open else known.chosen
+
+
+def resolution_in_words(problem: Problem, known: Resolutions | None) -> str:
+    """The resolution of a problem whose transport may have one."""
+    parts = [] if known is None else [known.in_words(transport_of(problem, known))]
+    if has_rays(problem):
+        parts.append(_rings_in_words(cast(Any, problem.instrument).rings or 1))
+    return ", ".join(parts)
+
+
+def _by_name(words: Mapping[str, str]) -> str:
+    return "; ".join(f"{name}: {one}" if name else one for name, one in words.items())
+
+
+def _fitted_again(
+    at: Optimum, problem: FittingProblem, solver: Solver, words: str, equivalent: float, progress: Progress
+) -> list[StartOutcome]:
+    """The ends at another resolution: those that matter fitted again, the cost of the others there."""
+    solve = rough_descent if solver == "least_squares" else bounded_descent
+
+    def cost(end: StartOutcome) -> float:
+        found = float(problem.call(Density.cost_at, end.vector, problem.predict(end.vector)))
+        return found if np.isfinite(found) else np.inf
+
+    # 1. ends that lie close together count as one, lowest first
+    groups: list[list[int]] = []
+    units = [unit_of(at.problem, end.vector) for end in at.ends]
+    for index in sorted(range(len(at.ends)), key=lambda index: (index != at.best, at.ends[index].cost)):
+        if np.isfinite(at.ends[index].cost):
+            near = (group for group in groups if np.max(np.abs(units[index] - units[group[0]])) < SAME_OUTCOME)
+            if (group := next(near, None)) is None:
+                groups.append(group := [])
+            group.append(index)
+    # 2. those matter whose cost is no farther above the lowest than that may move
+    before = [at.ends[group[0]] for group in groups]
+    ends = [end._replace(cost=cost(end)) for end in before]
+    moved = np.abs([new.cost - old.cost for new, old in zip(ends, before, strict=True)])
+    above = np.array([end.cost - before[0].cost for end in before])
+    matter = np.flatnonzero(~(above > equivalent * at.excess + np.fmax(moved, moved[0])))
+    # 3. they are fitted again, and then what is lowest until it was
+    wanted, fitted, done = [int(index) for index in matter[:MOST_MINIMA]], set[int](), 0
+    while wanted:
+        for index in wanted:
+            end = solve(problem, unit_of(problem, before[index].vector), False)
+            ends[index] = end._replace(steps=before[index].steps + end.steps)
+            fitted.add(index)
+            done += 1
+            progress(f"fit at {words}", done, len(fitted | set(wanted)), f"best cost {min(e.cost for e in ends):.6g}")
+        lowest = int(np.argmin([end.cost for end in ends]))
+        wanted = [] if lowest in fitted else [lowest]
+    result = list(at.ends)
+    for group, end in zip(groups, ends, strict=True):
+        for index in group:
+            result[index] = end
+    return result

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._lazy import shown_by
-from fits.optimise.identifiability import Direction
+from fits.optimise.uncertainty import Direction
 from fits.problem.model import Density
 from fits.problem.problem import Problem
 
@@ -82,8 +82,7 @@ class Fit:
         without_discrepancy: the fit without model discrepancy, where its residuals showed that one is needed (see
             `Noise`); else None.
         without_discrepancy_parts: of a `Joint`, the same by the names of measurements.
-        dataset: of one measurement of a `Joint`, its name there, kept where it is saved.
-        within: of the same, the fit of all of them, which is not.
+        dataset: of one measurement of a `Joint`, its name there.
     """
 
     problem: Problem
@@ -107,7 +106,6 @@ class Fit:
     without_discrepancy: WithoutDiscrepancy | None = None
     without_discrepancy_parts: Mapping[str, WithoutDiscrepancy] = field(default_factory=dict)
     dataset: str | None = None
-    within: "Fit | None" = None
 
     def __repr__(self) -> str:
         values = ", ".join(
@@ -120,6 +118,8 @@ class Fit:
 
     def part(self, name: str = "") -> "Fit":
         """What the fit of a `Joint` says of one measurement, with errors that all of them leave it; itself, if alone.
+
+        It predicts by the normal approximation of what all measurements say; `Posterior.part` by their draws.
 
         Raises:
             ValueError: a name that no measurement has.
@@ -149,7 +149,6 @@ class Fit:
             alternatives=tuple(map(minimum, self.alternatives)),
             without_discrepancy=self.without_discrepancy_parts.get(name),
             dataset=name,
-            within=self,
         )
         vars(found)["predicted"] = self.problem.shares(self.predicted)[name]
         return found

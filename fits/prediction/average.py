@@ -8,7 +8,7 @@ import numpy as np
 from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.optimise.result import Fit
-from fits.prediction.model_scores import model_scores
+from fits.prediction.cross_validation import model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import DRAWS, LEVELS, Prediction, predict
 from fits.progress import Progress

@@ -4,12 +4,13 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
-from fits.prediction.model_scores import ModelScore, model_scores
+from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
@@ -35,13 +36,13 @@ class ComparedFit:
     log_likelihood: float
     aic: float
     bic: float
-    loo: float
-    loo_error: float
-    loo_diff: float
-    loo_dse: float
-    unreliable: float
     converged: bool
     at_bound: tuple[str, ...]
+    loo: float = math.nan
+    loo_error: float = math.nan
+    loo_diff: float = math.nan
+    loo_dse: float = math.nan
+    unreliable: float = math.nan
     model_score: ModelScore | None = None
 
 
@@ -95,7 +96,7 @@ def compare(
     options = options or ComparisonOptions()
     posteriors = {name: entry for name, entry in candidates.items() if isinstance(entry, Posterior)}
     loo = _leave_one_out(posteriors, options) if len(posteriors) == len(candidates) else {}
-    rows = [_row(name, fit, loo.get(name, {})) for name, fit in fits.items()]
+    rows = [replace(_row(name, fit), **loo.get(name, {})) for name, fit in fits.items()]
     if refit:
         scores = model_scores(fits, progress, options)
         rows = sorted((replace(row, model_score=scores[row.name]) for row in rows), key=lambda row: -_score(row).elpd)
@@ -131,7 +132,7 @@ def _same_data(one: Fit, other: Fit) -> bool:
     return all(a.shape == b.shape and np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in pairs)
 
 
-def _leave_one_out(posteriors: Mapping[str, Posterior], options: ComparisonOptions) -> dict[str, dict[str, float]]:
+def _leave_one_out(posteriors: Mapping[str, Posterior], options: ComparisonOptions) -> dict[str, dict[str, Any]]:
     import arviz
 
     with warnings.catch_warnings():
@@ -144,15 +145,15 @@ def _leave_one_out(posteriors: Mapping[str, Posterior], options: ComparisonOptio
         difference = best - pointwise[name]
         result[name] = {
             "loo": float(estimate.elpd_loo),
-            "error": float(estimate.se),
-            "diff": float(difference.sum()),
-            "dse": float(math.sqrt(difference.size) * difference.std()),
+            "loo_error": float(estimate.se),
+            "loo_diff": float(difference.sum()),
+            "loo_dse": float(math.sqrt(difference.size) * difference.std()),
             "unreliable": float(np.sum(np.asarray(estimate.pareto_k) > options.max_pareto_k)),
         }
     return result
 
 
-def _row(name: str, fit: Fit, loo: dict[str, float]) -> ComparedFit:
+def _row(name: str, fit: Fit) -> ComparedFit:
     count, likelihood = len(fit.vector), fit.log_likelihood
     return ComparedFit(
         name=name,
@@ -163,11 +164,6 @@ def _row(name: str, fit: Fit, loo: dict[str, float]) -> ComparedFit:
         log_likelihood=likelihood,
         aic=2.0 * count - 2.0 * likelihood,
         bic=count * math.log(fit.problem.count) - 2.0 * likelihood,
-        loo=loo.get("loo", math.nan),
-        loo_error=loo.get("error", math.nan),
-        loo_diff=loo.get("diff", math.nan),
-        loo_dse=loo.get("dse", math.nan),
-        unreliable=loo.get("unreliable", math.nan),
         converged=fit.converged,
         at_bound=fit.at_bound,
     )

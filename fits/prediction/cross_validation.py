@@ -1,27 +1,31 @@
-"""Cross-validation: a fit is repeated without one group of measurements after the other, and predicts them.
+"""Cross-validation, and which of several stacks predicts held-out data best: elpd differences, stacking weights.
+
+A fit is repeated without one group of measurements after the other, and predicts them.
 
 Measurements at one incidence resemble each other, so a single one that is held out is predicted well by its neighbours,
 whatever the stack. Groups are therefore whole incidences; of fewer than three, parts of every scan.
 """
 
-from collections.abc import MutableMapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.special import log_softmax, logsumexp, softmax
 
 from fits.data.measurements import Measurements
 from fits.data.scans import incidences, scans
 from fits.optimise.fit import refit
 from fits.optimise.result import Fit
-from fits.prediction.importance import ImportanceDraws
+from fits.prediction.importance import Evidence, ImportanceDraws, evidence_of, posterior_draws
 from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import posterior_predictive
-from fits.problem.discrepancy.logarithm import size
+from fits.problem.discrepancy import size
 from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
-from fits.progress import Progress
+from fits.progress import Progress, named, silent
 from fits.sampling.initial import other_minima, vector_of
 from layerjax._checks import require_kind
 
@@ -29,6 +33,9 @@ DRAWS = 128
 
 INFINITE_NOISE = 1e8
 """Noise with which a measurement does not influence a fit, in units of the largest measurement."""
+
+LARGEST_LOG_RATIO = 30.0
+"""Bound of the logarithms of ratios of stacking weights."""
 
 Floats = NDArray[np.float64]
 
@@ -63,10 +70,6 @@ class CrossValidation:
         return np.array([self.log_density[rows].size for rows in self.rows])
 
 
-HeldOut = MutableMapping[str, tuple[Floats, bool]]
-"""By group: log predictive densities of its measurements, (rows, C), and whether the fit without them converged."""
-
-
 def cross_validate(
     fit: Fit,
     *,
@@ -75,7 +78,6 @@ def cross_validate(
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
     posterior: ImportanceDraws | None = None,
-    done: HeldOut | None = None,
 ) -> CrossValidation:
     """Fit again without each incidence, starting from the best values, and predict its measurements.
 
@@ -87,7 +89,6 @@ def cross_validate(
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
         posterior: draws of the fit's posterior; those without a group are sought about them.
-        done: groups in it are not computed again; each group is added to it once it is computed.
 
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
@@ -96,18 +97,15 @@ def cross_validate(
     proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
     density, converged = np.zeros(data.values.shape), True
     starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
-    done = {} if done is None else done
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
             progress("cross-validation", number, len(groups), name)
-        if name not in done:
-            held_out = np.zeros(len(data), bool)
-            held_out[rows] = True
-            rest = refit(without(fit.problem, held_out), *starts)
-            prediction = posterior_predictive(rest, data, draws=draws, seed=seed, proposal=proposal)
-            done[name] = prediction.log_density(data.values)[rows], rest.converged
-        density[rows], group_converged = done[name]
-        converged &= group_converged
+        held_out = np.zeros(len(data), bool)
+        held_out[rows] = True
+        rest = refit(without(fit.problem, held_out), *starts)
+        prediction = posterior_predictive(rest, data, draws=draws, seed=seed, proposal=proposal)
+        density[rows] = prediction.log_density(data.values)[rows]
+        converged &= rest.converged
     if progress is not None:
         progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged)
@@ -162,3 +160,110 @@ def without(problem: Problem, held_out: ArrayLike) -> Problem:
         gram = model.process.gram_of(size(model.values, model.softness) / sigma)
         model = replace(model, process=replace(model.process, gram=gram))
     return problem.with_model(model)
+
+
+# ---- of several stacks ----
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """How well one of several stacks predicts held-out data, and how probable it is.
+
+    elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
+    below the best; dse: standard error of the difference, by the incidences. least_diff: the difference a measurement,
+    of the incidence where that is least. clear_diff: the difference less its error (see `ComparisonOptions`). weight:
+    of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`.
+    model_probability: of this stack among those compared, equally probable a priori.
+    """
+
+    elpd: float
+    elpd_diff: float
+    dse: float
+    least_diff: float
+    clear_diff: float
+    weight: float
+    evidence: Evidence
+    model_probability: float
+
+    @property
+    def indistinguishable(self) -> bool:
+        """Whether this stack and the best are statistically indistinguishable."""
+        return self.clear_diff <= 0.0
+
+
+def model_scores(
+    candidates: Mapping[str, Fit], progress: Progress | None = None, options: ComparisonOptions | None = None
+) -> dict[str, ModelScore]:
+    """Score fits of the same data, by name; each is fitted again without each incidence (see `cross_validate`)."""
+    results = {
+        name: out_of_sample(fit, named(name, progress or silent), options=options) for name, fit in candidates.items()
+    }
+    return rank_models(
+        {name: held_out for name, (held_out, _) in results.items()},
+        {name: evidence for name, (_, evidence) in results.items()},
+        options,
+    )
+
+
+def out_of_sample(
+    fit: Fit, progress: Progress | None = None, options: ComparisonOptions | None = None
+) -> tuple[CrossValidation, Evidence]:
+    """Cross-validation and evidence of a fit, both by draws of its posterior."""
+    require_groups(fit, options)
+    draws = posterior_draws(fit)
+    return cross_validate(fit, options=options, progress=progress, posterior=draws), evidence_of(draws)
+
+
+def rank_models(
+    held_out: Mapping[str, CrossValidation],
+    evidences: Mapping[str, Evidence],
+    options: ComparisonOptions | None = None,
+) -> dict[str, ModelScore]:
+    """Score fits of the same data by their cross-validation and evidence, side by side."""
+    options = options or ComparisonOptions()
+    best = max(held_out.values(), key=lambda one: one.elpd)
+    weights = stacking(np.stack([one.log_density.ravel() for one in held_out.values()]))
+    probabilities = softmax(np.array([evidences[name].log_evidence for name in held_out]))
+    scores = {}
+    for (name, one), weight, probability in zip(held_out.items(), weights, probabilities, strict=True):
+        gaps = best.elpd_by_group - one.elpd_by_group
+        elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
+        least_diff = float(np.min(gaps / best.group_sizes))
+        decisive = least_diff > options.decisive_per_measurement
+        scores[name] = ModelScore(
+            elpd=one.elpd,
+            elpd_diff=elpd_diff,
+            dse=dse,
+            least_diff=least_diff,
+            clear_diff=elpd_diff if decisive else elpd_diff - options.standard_errors * dse,
+            weight=float(weight),
+            evidence=evidences[name],
+            model_probability=float(probability),
+        )
+    return scores
+
+
+def stacking(log_density: Floats) -> Floats:
+    """Weights (K,) of K predictions whose mixture has the highest log-density over N measurements, from (K, N)."""
+    count = len(log_density)
+    if count == 1:
+        return np.ones(1)
+
+    def cost(free: Floats) -> float:
+        logs = log_softmax(np.append(free, 0.0))
+        return -float(np.mean(logsumexp(log_density + logs[:, None], axis=0)))
+
+    def gradient(free: Floats) -> Floats:
+        weights = softmax(np.append(free, 0.0))
+        responsibility = softmax(log_density + np.log(weights)[:, None], axis=0).mean(axis=1)
+        return (weights - responsibility)[:-1]
+
+    optimum = minimize(
+        cost,
+        np.zeros(count - 1),
+        jac=gradient,
+        method="L-BFGS-B",
+        bounds=[(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)] * (count - 1),
+        options={"ftol": 1e-14, "gtol": 1e-9},
+    )
+    return softmax(np.append(optimum.x, 0.0))

@@ -1,11 +1,11 @@
-"""Importance sampling of the posterior of a fit: weighted draws, without a chain.
+"""Importance sampling of the posterior of a fit: weighted draws without a chain, and the evidence.
 
 Proposals are Laplace's approximations about the minima of the fit, and where these do not suffice, mixtures along its
 ridges. The Pareto k of the largest weights says how well the draws
 represent the posterior (Vehtari, Simpson, Gelman, Yao & Gabry 2024, JMLR 25, 72). While weights are too uneven, a
 mixture is fitted to the weighted draws, and drawn from as well (Cappe, Guillin, Marin & Robert 2004, J. Comput. Graph.
 Stat. 13, 907); the draws of all proposals are weighted as those of their mixture (Cornuet, Marin, Mira & Robert 2012,
-Scand. J. Stat. 39, 798).
+Scand. J. Stat. 39, 798). Their mean weight is the evidence, for any proposal.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import in_shares
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.proposals import Density, FittedProposal
+from layerjax._checks import require_kind
 
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 """Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
@@ -29,6 +30,9 @@ FINITE_VARIANCE, ROUNDS = 0.5, 3
 MIN_EFFECTIVE_DRAWS = 50
 """Effective sample size below which another proposal is tried, and to which weights are tempered before a mixture is
 fitted to them."""
+
+DRAWS = 1000
+"""Draws of each proposal for an evidence."""
 
 BATCH = 50
 """Draws that a core evaluates at a time: however many there are, one program serves."""
@@ -158,3 +162,56 @@ def _tempered(log_weights: Floats) -> Floats:
         if 1.0 / np.sum(normalised**2) >= least:
             break
     return scaled
+
+
+# ---- evidence ----
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """log_evidence: natural logarithm, with data in 1/sr. error: its standard error. pareto_k: Pareto k of the largest
+    importance weights: above 0.7 the approximation misses a part of the posterior, and the error is too small."""
+
+    log_evidence: float
+    error: float
+    pareto_k: float
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the error can be trusted."""
+        return self.pareto_k < MAX_PARETO_K
+
+
+def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
+    """The marginal likelihood of a fitted stack, under the priors of its parameters within their bounds.
+
+    For a posterior with several modes it is that of all modes which the starts of the fit found.
+
+    Args:
+        fit: a fit of a likelihood.
+        draws: draws of each approximation, of which there are up to four (see `importance_draws`).
+        seed: random seed of the draws.
+
+    Raises:
+        ValueError: a fit of a named objective, or a part of a joint fit.
+    """
+    require_kind("fit", fit, Fit)
+    if not fit.is_posterior:
+        raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
+    fit.require_alone("evidence")
+    return evidence_of(posterior_draws(fit, draws, seed))
+
+
+def posterior_draws(fit: Fit, draws: int = DRAWS, seed: int = 0) -> ImportanceDraws:
+    """Weighted draws of a fit's posterior, of which the evidence is the mean weight."""
+    return importance_draws(fit, draws, np.random.RandomState(seed), along_ridge=True)
+
+
+def evidence_of(draws: ImportanceDraws) -> Evidence:
+    """The evidence by weighted draws of the whole posterior."""
+    total = float(logsumexp(draws.log_weights))
+    if not np.isfinite(total):
+        return Evidence(-np.inf, np.inf, np.inf)
+    count = len(draws.log_weights)
+    relative = np.exp(draws.log_weights - total) * count
+    return Evidence(total - float(np.log(count)), float(np.std(relative) / np.sqrt(count)), draws.pareto_k)

@@ -25,12 +25,12 @@ from fits.data.measurements import Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
 from fits.prediction.importance import MAX_PARETO_K, importance_draws
-from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.logarithm import logarithm, size
-from fits.problem.discrepancy.logarithm import softness as softness_of
+from fits.problem.discrepancy import logarithm, places, size
+from fits.problem.discrepancy import softness as softness_of
 from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
+from fits.sampling.laplace import Approximation
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_kind
 from layerjax.mixture import stacks_of
@@ -277,7 +277,8 @@ def predict(
     """Predict the BSDF along other directions, and new measurements of it.
 
     Args:
-        fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`); or an average.
+        fitted: a posterior; or a fit, whose posterior is sampled by importance (see `fits.evidence`), of a part of a
+            joint fit by its normal approximation; or an average.
         at: pairs of directions in the upper hemisphere, or the lower one of a stack without a base; of `Measurements`
             their used samples, with their own sigma.
         levels: levels of the quantiles, in (0, 1).
@@ -313,6 +314,7 @@ def posterior_predictive(
 ) -> Prediction:
     """`predict` for one fit; proposal: an approximation of its posterior (see `importance_draws`), if there is one."""
     fit = fitted.fit if isinstance(fitted, Posterior) else fitted
+    fit.require_one("predict")
     if not fit.is_posterior:
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements")
     data, channels, noise = _measurements(fit, at), fit.problem.data.channels, fit.problem.noise
@@ -370,18 +372,19 @@ def _posterior_draws(
     fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Density | None" = None
 ) -> tuple[Floats, float]:
     """Draws (D, P) of the posterior, and the Pareto k of their weights."""
-    if isinstance(fitted, Fit) and fitted.within is not None and fitted.dataset is not None:
-        # the other data sets of a joint fit constrain the parameters as well
-        vectors, pareto_k = _posterior_draws(fitted.within, draws, generator)
-        return vectors[:, list(fitted.within.problem.places(fitted.dataset))], pareto_k
     if isinstance(fitted, Posterior):
         return generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws), math.nan
-    random = np.random.RandomState(generator.integers(2**31))
-    weighted = importance_draws(
-        fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
-    )
-    positions = jnp.asarray(weighted.resample(random, draws))
-    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(positions), float), weighted.pareto_k
+    random, pareto_k = np.random.RandomState(generator.integers(2**31)), math.nan
+    if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
+        normal = Approximation.of(fitted)
+        positions, free = normal.draw(random, draws), ~normal.held
+        positions[:, free] = normal.centre[free] + random.standard_normal((draws, free.sum())) @ normal.root.T
+    else:
+        weighted = importance_draws(
+            fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
+        )
+        positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
+    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k
 
 
 def _mixture(

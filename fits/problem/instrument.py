@@ -1,7 +1,7 @@
 """What stands between a BSDF and its measurements: apertures, a tilted sample, gains, a floor.
 
 A measurement is the mean of the BSDF over the cones of source and detector, weighted by the cosines of both. How many
-pairs of directions that takes follows from how wide the cones are beside the lobes of the stack: see `rays`.
+pairs of directions that takes follows from how wide the cones are beside the lobes of the stack: see `apertures`.
 """
 
 import math
@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
 from fits.data.scans import SAME_ANGLE
-from fits.problem.aperture_rays import MOST_RINGS, ray_counts, rays
-from fits.problem.lobe_width import Spread, spread_over_lobes
+from fits.problem.apertures import MOST_RINGS, Spread, ray_counts, rays, spread_over_lobes
 from fits.problem.parameters import Free, LogNormal
-from fits.problem.values import shown
+from layerjax._checks import in_short
 from layerjax.transport.known_directions import KnownDirections, known_directions
 
 Floats = NDArray[np.float64]
@@ -69,7 +68,7 @@ class Instrument:
         if self.gain_sd is not None:
             _require("gain_sd", self.gain_sd, *GAIN_SPREADS)
         if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
-            raise ValueError(f"Instrument.rings is {shown(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
+            raise ValueError(f"Instrument.rings is {in_short(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
 
     @property
     def has_cones(self) -> bool:
@@ -139,32 +138,32 @@ def optics_of(
     incidences: polar angles of the light, (K,), that have a gain. follow: known directions are of use. other: with
     other numbers of rays, see `ray_counts`.
     """
-    gain = None if instrument.gain_sd is None else _which(wi, incidences)
-    free, tilt = isinstance(instrument.tilt, Free), 0.0
-    forward = _forward(wi) if instrument.tilt else None
-    if isinstance(instrument.tilt, Free):
-        tilt = float(np.max(np.abs(instrument.tilt.arrays()[1:])))
-    elif forward is not None:
-        wi, wo = (np.asarray(_tilted(w, forward, instrument.tilt), float) for w in (wi, wo))
-        forward = None
-    row = share = None
-    pairs, widths = (wi, wo), (instrument.source_aperture, instrument.detector_aperture)
-    if (
-        instrument.has_cones
-        and (spread := spread_over_lobes(*widths, stack, wi, wo, tilt, instrument.rings)).matters.any()
-    ):
-        pairs, row, share = _cones(instrument, wi, wo, spread, other)
-        forward = (
-            None if forward is None else forward[row]
-        )  # the sample is tilted one way, whichever ray of a cone it meets
+    incidence = None if instrument.gain_sd is None else _which(wi, incidences)
+    tilt = instrument.tilt
+    forward = _forward(wi) if isinstance(tilt, Free) else None
+    if forward is None and tilt:  # it is known: directions are turned once
+        wi, wo = (np.asarray(_tilted(w, _forward(wi), tilt), float) for w in (wi, wo))
+    most = float(np.max(np.abs(tilt.arrays()[1:]))) if isinstance(tilt, Free) else 0.0
+    pairs, row, share = (wi, wo), None, None
+    if instrument.has_cones:
+        widths = instrument.source_aperture, instrument.detector_aperture
+        spread = spread_over_lobes(*widths, stack, wi, wo, most, instrument.rings)
+        if spread.matters.any():
+            pairs, row, share = _cones(instrument, wi, wo, spread, other)
+            if forward is not None:
+                forward = forward[row]  # the sample is tilted one way, whichever ray of a cone it meets
+
+    def array(part: Any) -> Array | None:
+        return None if part is None else jnp.asarray(part)
+
     return Optics(
         wi=jnp.asarray(pairs[0]),
         wo=jnp.asarray(pairs[1]),
-        row=None if row is None else jnp.asarray(row),
-        share=None if share is None else jnp.asarray(share),
-        forward=None if forward is None else jnp.asarray(forward),
-        incidence=None if gain is None else jnp.asarray(gain),
-        known=known_directions(*pairs) if follow and not free else None,
+        row=array(row),
+        share=array(share),
+        forward=array(forward),
+        incidence=array(incidence),
+        known=known_directions(*pairs) if follow and forward is None else None,
     )
 
 
@@ -262,4 +261,4 @@ def _tilted(w: Any, forward: Any, offset: Any) -> Array:
 def _require(name: str, value: Any, low: float, high: float) -> None:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and low <= value <= high):
-        raise ValueError(f"Instrument.{name} is {shown(value)}; it must be a number in [{low:g}, {high:g}]")
+        raise ValueError(f"Instrument.{name} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]")

@@ -1,13 +1,13 @@
 """What a vector of parameters predicts, and how far that is from the data: pure functions that compile once.
 
 A `Density` holds a problem as arrays and static choices, so that one compiled program serves every problem of the same
-structure and shape: new data, bounds or fixed numbers do not recompile. `Model` is that of one data set;
-`fits.problem.joint` has that of several.
+structure and shape: new data, bounds or fixed numbers do not recompile. `Model` is that of one data set, `JointModel`
+that of several.
 """
 
 import abc
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, cast
 
 import equinox as eqx
@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.names import Objective
-from fits.problem.discrepancy.logarithm import logarithm, size
-from fits.problem.discrepancy.process import Process, Whitened
-from fits.problem.discrepancy.whitening import Correlation
+from fits.problem.discrepancy import Correlation, Process, Whitened, logarithm, size
 from fits.problem.instrument import Optics, Setting
 from fits.problem.noise import (
     Tails,
@@ -33,8 +31,7 @@ from fits.problem.noise import (
     tail_residual,
     total_sigma,
 )
-from fits.problem.parameters import Box, Template
-from fits.problem.spectra import with_values
+from fits.problem.parameters import Box, Template, with_values
 from layerjax._shapes import require_single
 from layerjax.evaluate import evaluate_known
 from layerjax.transport.known_directions import KnownDirections
@@ -91,25 +88,12 @@ class Density(eqx.Module):
         """A scale of the noise, (N, C), in 1/sr, by which no measurement near 0 stands out: a fit begins with it."""
 
     @abc.abstractmethod
-    def sigma_at(self, vector: Array, predicted: Array) -> Array:
-        """Scale of the noise, (N, C), in 1/sr."""
-
-    @abc.abstractmethod
-    def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """(datum - model) / sigma, (N, C); with model discrepancy, of their `logarithm` in units of the datum's noise;
-        for a named objective, datum minus model in its own measure."""
-
-    @abc.abstractmethod
-    def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at`, less the model discrepancy that the data imply."""
-
-    @abc.abstractmethod
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """`offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
+        """`Model.offsets_at` by the root of their covariance: under the assumed model independent, with variance 1."""
 
     @abc.abstractmethod
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """z'S^-1 z of `offsets_at` z, with S their covariance: 1 without model discrepancy."""
+        """z'S^-1 z of `Model.offsets_at` z, with S their covariance: 1 without model discrepancy."""
 
     @abc.abstractmethod
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
@@ -226,7 +210,7 @@ class Model(Density):
         return found if found.shape[-1] > 1 else jnp.broadcast_to(found, (len(found), self.values.shape[-1]))
 
     def sigma_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """Scale of the noise, (N, C), in 1/sr."""
         parts = self.build(vector)
         return total_sigma(predicted, self.variance, parts.relative, parts.floor)
 
@@ -237,13 +221,13 @@ class Model(Density):
         return (self.values - predicted) / self.sigma_at(vector, predicted)
 
     def offsets_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """`standardised_at`; with model discrepancy, of the `logarithm` in units of the datum's noise."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self._logarithmic(predicted, self._noise_at(vector, predicted))[0]
 
     def offsets_after_discrepancy_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
+        """`offsets_at`, less the model discrepancy that the data imply."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
@@ -390,6 +374,101 @@ def _(primals: tuple[Array], tangents: tuple[Array], *, model: Model) -> tuple[A
     steps = jnp.eye(vector.size)[: model.moving]
     value, columns = jax.vmap(lambda step: jax.jvp(model.predict, primals, (step,)), out_axes=(None, -1))(steps)
     return value, columns @ moved[: model.moving]
+
+
+class JointModel(Density):
+    """The density of several data sets, one after the other, (N, 1): the product of theirs.
+
+    Attributes:
+        parts: the densities of the data sets.
+        places: for each of them, the places of its parameters in the vector.
+    """
+
+    parts: tuple[Model, ...]
+    box: Box
+    places: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    varying: bool = eqx.field(static=True)
+
+    @property
+    def objective(self) -> Objective:
+        """Data sets are weighed against each other by their noise."""
+        return "likelihood"
+
+    @property
+    def values(self) -> Array:
+        """BSDF of all measurements, (N, 1), in 1/sr."""
+        return _column([part.values for part in self.parts])
+
+    @property
+    def logarithmic(self) -> tuple[int, ...]:
+        """See `Density`."""
+        return (2,) if any(part.logarithmic for part in self.parts) else ()
+
+    def predict(self, vector: Array) -> Array:
+        """See `Density`."""
+        return _column([part.predict(own) for part, own in self._with_vectors(vector)])
+
+    def initial_sigma(self, vector: Array) -> Array:
+        """See `Density`."""
+        return _column([part.initial_sigma(own) for part, own in self._with_vectors(vector)])
+
+    def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return _column(self._each(Model.whitened_residuals_at, vector, predicted))
+
+    def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
+
+    def chi_square_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
+
+    def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
+        """See `Density`."""
+        return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))
+
+    def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
+        """See `Density`."""
+        return self._together(vector, self._each(Model.residuals_at, vector, predicted))
+
+    def linear_parts(
+        self, vector: Array, first_step: tuple[Array, Array] | None = None
+    ) -> tuple[tuple[Array, ...], tuple[Array, Array]]:
+        """See `Density`; each data set is differentiated by its own parameters alone."""
+        steps: list[tuple[Array, Array] | None] = [None] * len(self.parts)
+        if first_step is not None:
+            held, shared = first_step
+            sigmas = [held] * len(self.parts) if held.size == 1 else self._split(held)
+            steps = [(sigma, shared) for sigma in sigmas]
+        each = self._with_vectors(vector)
+        found = [part.linear_parts(own, step, others=True) for (part, own), step in zip(each, steps, strict=True)]
+        predicted, rows = _column([values for _, (values, _) in found]), [rows for _, (_, rows) in found]
+        return self._together(vector, [residuals for residuals, _ in found]), (predicted, jnp.concatenate(rows))
+
+    def _together(self, vector: Array, each: Sequence[tuple[Array, ...]]) -> tuple[Array, ...]:
+        """Residuals of the data sets as those of all: data, prior, levels of noise."""
+        levels = [level.reshape(-1) for _, _, *levels in each for level in levels]
+        data = jnp.concatenate([residuals[0].reshape(-1) for residuals in each])
+        return (data, self.box.prior_residuals(vector), *([jnp.concatenate(levels)] if levels else []))
+
+    def _with_vectors(self, vector: Array) -> list[tuple[Model, Array]]:
+        return [(part, vector[np.array(places)]) for part, places in zip(self.parts, self.places, strict=True)]
+
+    def _split(self, column: Array) -> list[Array]:
+        """What of a column (N, 1) belongs to each data set, in the shape of its values."""
+        shapes = [part.values.shape for part in self.parts]
+        split = jnp.split(column[:, 0], np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        return [share.reshape(shape) for share, shape in zip(split, shapes, strict=True)]
+
+    def _each(self, function: Callable[[Model, Array, Array], Any], vector: Array, predicted: Array) -> list[Any]:
+        """What a function says of each data set."""
+        each = zip(self._with_vectors(vector), self._split(predicted), strict=True)
+        return [function(part, own, share) for (part, own), share in each]
+
+
+def _column(parts: Sequence[Array]) -> Array:
+    return jnp.concatenate([part.reshape(-1) for part in parts])[:, None]
 
 
 def half_squares(residuals: tuple[Array, ...]) -> Array:

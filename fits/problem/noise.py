@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 
 from fits.data.measurements import Measurements
 from fits.names import Objective
-from fits.problem.discrepancy.logarithm import size, softness
-from fits.problem.discrepancy.parameters import Discrepancy
-from fits.problem.discrepancy.process import Process
+from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free
-from fits.problem.values import shown
+from layerjax._checks import in_short
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -75,14 +73,16 @@ class Noise:
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
-            raise ValueError(f"Noise.discrepancy is {shown(self.discrepancy)}; it must be true, false or Discrepancy")
+            raise ValueError(
+                f"Noise.discrepancy is {in_short(self.discrepancy)}; it must be true, false or Discrepancy"
+            )
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
 
 
 def _check_range(field: str, value: Any, low: float, high: float) -> None:
     if not (isinstance(value, int | float) and low <= value <= high):
-        raise ValueError(f"Noise.{field} is {shown(value)}; it must be a number in [{low:g}, {high:g}]")
+        raise ValueError(f"Noise.{field} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]")
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:
@@ -171,10 +171,10 @@ class Levels(NamedTuple):
     @property
     def varying(self) -> bool:
         """Whether sigma depends on the parameters, or on what they predict."""
-        return isinstance(self.relative, Free) or isinstance(self.floor, Free) or self.relative > 0
+        return self.fitted or self.relative != 0
 
     def softness(self, values: Floats) -> Floats:
-        """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy.logarithm`."""
+        """The softness of the logarithms of measurements (N, C), see `fits.problem.discrepancy`."""
         return softness(values, np.sqrt(self.variance + _start(self.floor) ** 2))
 
     def gram(self, process: Process, values: Floats) -> Array | None:

@@ -8,24 +8,171 @@ Three spaces, all of dimension P:
 - *unconstrained* `u = log(s / (1 - s))`: samplers work here, with the log-determinant of the map.
 """
 
+import dataclasses
+import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from numpy.typing import NDArray
+from scipy import stats
 
-from fits.problem.priors import LogNormal as LogNormal
-from fits.problem.priors import LogUniform as LogUniform
-from fits.problem.priors import Normal as Normal
-from fits.problem.priors import Prior as Prior
-from fits.problem.priors import Uniform as Uniform
-from fits.problem.priors import log_normaliser, require_computable, require_steps, shared_normaliser, steps
-from fits.problem.values import shown
+import layerjax as lj
+from layerjax._checks import in_short
+from layerjax._parameters import PER_CHANNEL
+from layerjax._shown import Shown
+from layerjax.mixture import stacks_by_name
+
+Floats = NDArray[np.float64]
+
+FARTHEST_MEAN = 37.0  # standard deviations from the bounds; farther out the density within them underflows in float64
+NARROWEST = 1e-15  # standard deviation, as a share of the distances in the box: below, float64 has no numbers for it
+SMALLEST = float(np.finfo(float).tiny)  # what is smaller is 0 in compiled programs
+_FLAT = 1e-6  # width of the bounds in standard deviations below which a difference of two masses loses its digits
+
+
+# ---- priors: densities within the bounds, flat or Gaussian in the value or in its logarithm ----
+
+
+class Prior:
+    """A density within bounds. logarithmic: whether it is flat or Gaussian in the logarithm of the value."""
+
+    logarithmic: ClassVar[bool] = False
+
+    def gaussian(self) -> tuple[float, float]:
+        """Centre and inverse standard deviation in the coordinate where the prior is Gaussian; 0: flat there."""
+        return 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class Uniform(Prior):
+    """Constant density within the bounds."""
+
+
+@dataclass(frozen=True)
+class LogUniform(Prior):
+    """Density proportional to 1 / value within the bounds, which must be positive."""
+
+    logarithmic: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class Normal(Prior):
+    """Gaussian with `mean` and standard deviation `sd` > 0, cut off at the bounds and normalised within them."""
+
+    mean: float
+    sd: float
+
+    def __post_init__(self) -> None:
+        _require_finite("Normal.mean", self.mean)
+        _require_finite("Normal.sd", self.sd, above=0.0)
+
+    def gaussian(self) -> tuple[float, float]:
+        """Centre and inverse standard deviation."""
+        return float(self.mean), 1.0 / float(self.sd)
+
+
+@dataclass(frozen=True)
+class LogNormal(Prior):
+    """The logarithm is Gaussian about log(`median`) with standard deviation `sd`; cut off at the positive bounds."""
+
+    median: float
+    sd: float
+    logarithmic: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        _require_finite("LogNormal.median", self.median, above=0.0)
+        _require_finite("LogNormal.sd", self.sd, above=0.0)
+
+    def gaussian(self) -> tuple[float, float]:
+        """Centre and inverse standard deviation of the logarithm."""
+        return math.log(self.median), 1.0 / float(self.sd)
+
+
+def _require_finite(field: str, value: Any, above: float = -math.inf) -> None:
+    try:
+        allowed = math.isfinite(value) and value > above
+    except (TypeError, OverflowError):  # no number, or several of them
+        allowed = False
+    if not allowed:
+        least = "" if math.isinf(above) else f" and above {above:g}"
+        raise ValueError(f"{field} is {in_short(value)}; it must be one number, finite{least}")
+
+
+def _require_computable(prior: Prior, low: Floats, high: Floats) -> None:
+    """ValueError for bounds, each () or (C,), and a prior whose density within them float64 cannot hold."""
+    bounds = f"[{in_short(low.tolist())}, {in_short(high.tolist())}]"
+    if prior.logarithmic:
+        if np.any(low < SMALLEST):
+            raise ValueError(
+                f"Free.low is {in_short(low.tolist())}; it must be above 0 for the prior {prior}, at least "
+                f"{SMALLEST:.2g}"
+            )
+        low, high = np.log(low), np.log(high)
+    with np.errstate(over="ignore", invalid="ignore"):
+        width = high - low
+        if not np.all(np.isfinite(width) & (width >= SMALLEST)):
+            raise ValueError(f"Free.low and Free.high are {bounds}; float64 must hold their difference")
+        centre, inverse_sd = prior.gaussian()
+        outside = np.maximum(np.maximum(low - centre, centre - high), 0.0)
+        if np.any(outside * inverse_sd > FARTHEST_MEAN):
+            raise ValueError(
+                f"Free.prior is {prior}; its centre must lie within {FARTHEST_MEAN:g} standard deviations of {bounds}"
+            )
+        if np.any(np.maximum(abs(low - centre), abs(high - centre)) * inverse_sd * NARROWEST >= 1.0):
+            raise ValueError(
+                f"Free.prior is {prior}; its sd must be above {NARROWEST:g} of the distance from its centre to {bounds}"
+            )
+
+
+def _log_normaliser(prior: Prior, low: float, high: float) -> float:
+    """Log of the integral of the prior between two bounds, in the coordinate where it is Gaussian or flat."""
+    centre, inverse_sd = prior.gaussian()
+    a, b = (math.log(low), math.log(high)) if prior.logarithmic else (low, high)
+    if inverse_sd == 0:
+        return math.log(b - a)
+    width = (b - a) * inverse_sd
+    a, b = (a - centre) * inverse_sd, (b - centre) * inverse_sd
+    if a > 0:  # both ends in the upper tail: mirror, so that the difference keeps its digits
+        a, b = -b, -a
+    if width < _FLAT:
+        log_mass = math.log(width) + stats.norm.logpdf(0.5 * (a + b))
+    else:
+        log_mass = stats.norm.logcdf(b) + math.log(-math.expm1(stats.norm.logcdf(a) - stats.norm.logcdf(b)))
+    return log_mass - math.log(inverse_sd) + 0.5 * math.log(2 * math.pi)
+
+
+def _steps(random_walk_sd: Any, channels: int) -> Floats:
+    """Differences between neighbouring channels over their standard deviations, (channels - 1, channels)."""
+    inverse = 1.0 / np.broadcast_to(np.asarray(random_walk_sd, float), (channels - 1,))
+    return inverse[:, None] * np.diff(np.eye(channels), axis=0)
+
+
+def _random_walk_normaliser(prior: Prior, steps: Floats, own: Floats) -> Floats:
+    """Of channels (C,) with these normalisers of their own, and steps between them: of all together, in the first.
+
+    Flat priors count once, for the walk starts anywhere; Gaussian ones by their joint precision. Bounds cut off nothing
+    of the steps.
+    """
+    channels = len(own)
+    inverse_sd = prior.gaussian()[1]
+    if inverse_sd > 0.0:
+        cut = own.sum() - channels * (0.5 * math.log(2 * math.pi) - math.log(inverse_sd))
+        precision = inverse_sd**2 * np.eye(channels) + steps.T @ steps
+        whole = cut + 0.5 * channels * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(precision)[1]
+    else:
+        scales = -np.log(np.max(np.abs(steps), axis=1))
+        whole = own[0] + np.sum(scales) + 0.5 * (channels - 1) * math.log(2 * math.pi)
+    return np.array([whole] + [0.0] * (channels - 1))
+
+
+# ---- what may stand in a stack where a number may ----
 
 
 @dataclass(frozen=True)
@@ -66,9 +213,11 @@ class Free:
     ):
         prior = Uniform() if prior is None else prior
         if not isinstance(prior, Prior):
-            raise ValueError(f"Free.prior is {shown(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None")
+            raise ValueError(
+                f"Free.prior is {in_short(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None"
+            )
         if not isinstance(same_for_all_texels, bool):
-            raise ValueError(f"Free.same_for_all_texels is {shown(same_for_all_texels)}; it must be True or False")
+            raise ValueError(f"Free.same_for_all_texels is {in_short(same_for_all_texels)}; it must be True or False")
         object.__setattr__(self, "prior", prior)
         object.__setattr__(self, "same_for_all_texels", same_for_all_texels)
         given = {"start": start, "low": low, "high": high, "random_walk_sd": random_walk_sd}
@@ -77,20 +226,34 @@ class Free:
         first, lower, upper = self.arrays()
         if np.any(lower >= upper):
             raise ValueError(
-                f"Free.low is {shown(self.low)} and Free.high is {shown(self.high)}; low must be below high"
+                f"Free.low is {in_short(self.low)} and Free.high is {in_short(self.high)}; low must be below high"
             )
         if np.any((first < lower) | (first > upper)):
             raise ValueError(
-                f"Free.start is {shown(self.start)}; it must lie in [{shown(self.low)}, {shown(self.high)}]"
+                f"Free.start is {in_short(self.start)}; it must lie in [{in_short(self.low)}, {in_short(self.high)}]"
             )
-        require_computable(prior, lower, upper)
+        _require_computable(prior, lower, upper)
         if self.random_walk_sd is not None:
-            require_steps(np.asarray(self.random_walk_sd), self.shape)
+            self._require_steps()
 
     @property
     def shape(self) -> tuple[int, ...]:
         """() or (C,)."""
         return self.arrays()[0].shape
+
+    def _require_steps(self) -> None:
+        """ValueError for standard deviations between neighbouring channels that are none."""
+        steps, shape = np.asarray(self.random_walk_sd), self.shape
+        if not shape or shape[0] < 2:
+            raise ValueError(
+                "Free.random_walk_sd is given for a single number; start, low or high must have two channels"
+            )
+        if steps.shape not in ((), (shape[0] - 1,)):
+            raise ValueError(
+                f"Free.random_walk_sd has {steps.size} entries; it must have 1 or {shape[0] - 1}, one a step"
+            )
+        if not np.all(steps > 0.0):
+            raise ValueError(f"Free.random_walk_sd is {in_short(steps.tolist())}; it must be above 0")
 
     def __repr__(self) -> str:
         words = [repr(value) for value in (self.start, self.low, self.high)]
@@ -105,10 +268,129 @@ class Free:
             start, low, high = np.broadcast_arrays(*(np.asarray(x, float) for x in (self.start, self.low, self.high)))
         except ValueError:
             raise ValueError(
-                f"Free: start {shown(self.start)}, low {shown(self.low)} and high {shown(self.high)} have different "
-                "numbers of channels"
+                f"Free: start {in_short(self.start)}, low {in_short(self.low)} and high {in_short(self.high)} have "
+                "different numbers of channels"
             ) from None
         return start, low, high
+
+
+def _plain(field: str, value: Any) -> float | tuple[float, ...]:
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{field} is {in_short(value)}; it must be a number or one number per channel") from None
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(f"{field} has shape {array.shape}; it must be a number or one number per channel")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{field} is {in_short(array.tolist())}; it must be finite")
+    return float(array) if array.ndim == 0 else tuple(array.tolist())
+
+
+def is_free(leaf: Any) -> bool:
+    """Whether this leaf is a free parameter."""
+    return isinstance(leaf, Free)
+
+
+class PowerLaw(Shown):
+    """A number a channel, ``amplitude (wavelength / reference)^-exponent``: in the place of one in a stack.
+
+    amplitude: the number at the reference, in its unit, or `Free` with low >= 0. exponent: unitless, or `Free`; of
+    reduced scattering 0.5 to 4 are common. wavelengths: one a channel, in nm. reference: in nm; the geometric mean of
+    the wavelengths by default.
+
+    Raises:
+        ValueError: nothing is free, a number a channel, fewer than two wavelengths, or one that is not above 0.
+    """
+
+    amplitude: Any
+    exponent: Any
+    wavelengths: tuple[float, ...] = eqx.field(static=True)
+    reference: float = eqx.field(static=True)
+
+    __layerjax_placeholder__: ClassVar[bool] = True
+
+    def __init__(
+        self, amplitude: Any, exponent: Any, wavelengths: Sequence[float], reference: float | None = None
+    ) -> None:
+        self.amplitude, self.exponent = amplitude, exponent
+        given = np.asarray(wavelengths, float)
+        if given.ndim != 1 or given.size < 2:
+            raise ValueError(f"PowerLaw.wavelengths has shape {given.shape}; it must be one a channel, two or more")
+        self.wavelengths = tuple(given.tolist())
+        self.reference = float(np.exp(np.mean(np.log(given)))) if reference is None else float(reference)
+        for name, values in (("wavelengths", given), ("reference", np.array([self.reference]))):
+            if not np.all(np.isfinite(values) & (values > 0.0)):
+                raise ValueError(f"PowerLaw.{name} is {in_short(values.tolist())}; it must be finite and above 0")
+        ends = {"amplitude": amplitude, "exponent": exponent}
+        if not any(map(is_free, ends.values())):
+            raise ValueError("PowerLaw: nothing is free; write the number of each channel instead")
+        for name, value in ends.items():
+            shape = value.shape if is_free(value) else np.shape(value)
+            if shape != ():
+                raise ValueError(f"PowerLaw.{name} has {shape[0]} channels; it must be one number")
+        if _ends(amplitude)[0] < 0.0:
+            raise ValueError(f"PowerLaw.amplitude reaches down to {_ends(amplitude)[0]:g}; it must be at least 0")
+
+    def values(self) -> Array:
+        """(C,), of numbers that are not free."""
+        ratio = np.asarray(self.wavelengths) / self.reference
+        return jnp.asarray(self.amplitude) * jnp.exp(-jnp.asarray(self.exponent) * jnp.log(ratio))
+
+    def extremes(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest of each channel, (C,), within the bounds of what is free."""
+        ratio = np.asarray(self.wavelengths) / self.reference
+        corners = np.array([a * ratio**-b for a in _ends(self.amplitude) for b in _ends(self.exponent)])
+        return corners.min(axis=0), corners.max(axis=0)
+
+
+def is_law(leaf: Any) -> bool:
+    """Whether this leaf is a power law."""
+    return isinstance(leaf, PowerLaw)
+
+
+def with_values(tree: Any) -> Any:
+    """The tree with the numbers of each channel in place of power laws."""
+    return jax.tree.map(lambda leaf: leaf.values() if is_law(leaf) else leaf, tree, is_leaf=is_law)
+
+
+def require_in_range(material: Any) -> None:
+    """Refuse power laws where no number a channel stands, or that leave its range: ValueError that names the place."""
+    seen = 0
+    stacks = stacks_by_name(material) if isinstance(material, lj.Stack | lj.Mixture) else {}
+    for prefix, stack in stacks.items():
+        named = [(f"{prefix}layers[{place}]", layer) for place, layer in enumerate(stack.layers)]
+        for where, part in (*named, (f"{prefix}base", stack.base)):
+            for name, law in _laws(part):
+                seen += 1
+                for end in law.extremes():
+                    try:
+                        dataclasses.replace(cast(Any, part), **{name: end})
+                    except ValueError as error:
+                        raise ValueError(f"{where}: within the bounds of its power law {error}") from None
+    if seen < sum(map(is_law, jax.tree.leaves(material, is_leaf=is_law))):
+        raise ValueError("PowerLaw stands where no number a channel may; it may be in a layer or base of a stack")
+
+
+def _laws(part: Any) -> list[tuple[str, PowerLaw]]:
+    """Power laws of a layer or a base, in the place of numbers that may differ by channel."""
+    if not dataclasses.is_dataclass(part):
+        return []
+    kinds = [kind.__name__ for kind in inspect.getmro(type(part))]
+    named = [(field.name, getattr(part, field.name)) for field in dataclasses.fields(part)]
+    return [
+        (name, value)
+        for name, value in named
+        if is_law(value) and any(f"{kind}.{name}" in PER_CHANNEL for kind in kinds)
+    ]
+
+
+def _ends(value: Any) -> tuple[float, float]:
+    if isinstance(value, Free):
+        return float(value.arrays()[1]), float(value.arrays()[2])
+    return float(value), float(value)
+
+
+# ---- what all free parameters of a tree are together ----
 
 
 class Box(eqx.Module):
@@ -133,16 +415,16 @@ class Box(eqx.Module):
         high = np.concatenate([np.ravel(b[2]) for b in bounds]) if bounds else np.zeros(0)
         priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
-        logs = np.array([log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
+        logs = np.array([_log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
         between = [np.zeros((0, len(low)))]
         first = 0
         for entry in free:
             here = slice(first, first := first + math.prod(entry.shape))
             if entry.random_walk_sd is not None:
                 rows = np.zeros((here.stop - here.start - 1, len(low)))
-                rows[:, here] = steps(entry.random_walk_sd, here.stop - here.start)
+                rows[:, here] = _steps(entry.random_walk_sd, here.stop - here.start)
                 between.append(rows)
-                logs[here] = shared_normaliser(entry.prior, rows[:, here], logs[here])
+                logs[here] = _random_walk_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(
             low=jnp.asarray(low),
             high=jnp.asarray(high),
@@ -246,20 +528,3 @@ def split(tree: Any, rename: Any = lambda name: name) -> tuple[Template, tuple[s
             free.append(leaf)
         leaves.append(None if isinstance(leaf, Free) else leaf)
     return Template(tuple(leaves), structure, tuple(slots)), tuple(names), tuple(free)
-
-
-def is_free(leaf: Any) -> bool:
-    """Whether this leaf is a free parameter."""
-    return isinstance(leaf, Free)
-
-
-def _plain(field: str, value: Any) -> float | tuple[float, ...]:
-    try:
-        array = np.asarray(value, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{field} is {shown(value)}; it must be a number or one number per channel") from None
-    if array.ndim > 1 or array.size == 0:
-        raise ValueError(f"{field} has shape {array.shape}; it must be a number or one number per channel")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{field} is {shown(array.tolist())}; it must be finite")
-    return float(array) if array.ndim == 0 else tuple(array.tolist())

@@ -1,14 +1,15 @@
-"""A fitting problem: stack, data sets, noise model, instrument.
+"""A fitting problem: stacks, data sets, noise model, instrument; one measurement, or several with parameters in common.
 
-`Problem` is what users and results hold; its `model` holds the same as arrays, for compiled programs.
+`Problem` and `Joint` are what users and results hold; their `model` holds the same as arrays, for compiled programs.
 """
 
 import abc
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, NamedTuple, get_args
 
 import equinox as eqx
@@ -24,15 +25,12 @@ from fits.data.scans import groups
 from fits.data.totals import Totals
 from fits.names import Objective
 from fits.problem.compilation import Static, run
-from fits.problem.discrepancy.parameters import Discrepancy, numbers_of
-from fits.problem.discrepancy.process import Process, make_process
+from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import Density, Model, Parts, Side, Transport
+from fits.problem.model import Density, JointModel, Model, Parts, Transport
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
-from fits.problem.parameters import Box, Free, LogNormal, Normal, Template, is_free, split
-from fits.problem.spectra import require_in_range
-from fits.problem.values import shown
+from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, require_in_range, split
 from layerjax._checks import in_short, require_kind
 from layerjax._parameters import plain_name
 from layerjax._shapes import channel_count
@@ -42,19 +40,45 @@ from layerjax.transport.known_directions import known_directions
 
 Floats = NDArray[np.float64]
 
+UNITS = {
+    "noise.floor": "1/sr",
+    "instrument.tilt": "deg",
+    "noise.discrepancy.length_half": "deg",
+    "noise.discrepancy.length_difference": "deg",
+    "thickness": "optical depth",
+    "thickness_mm": "mm",
+    "mu_s": "1/mm",
+    "mu_a": "1/mm",
+}
+"""Units of parameters by how their names end; all others are plain ratios."""
+
+PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
+"""How names begin of what stands in each place of `Parts`."""
+
+PER_PARAMETER = tuple(field for field in Box.__dataclass_fields__ if field != "between")
+"""What a box holds of each parameter."""
+
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given; start, low, high: (P,)."""
+    """What follows from a problem as it was given.
+
+    start, low, high: (P,). places: where the parameters of each data set stand in the vector, by its name.
+    """
 
     names: tuple[str, ...]
     start: Floats
     low: Floats
     high: Floats
     model: Any
+    places: dict[str, tuple[int, ...]]
 
 
 class FittingProblem(abc.ABC):
-    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,)."""
+    """One data set or several: parameters in a box, and what the data say of them, as functions of the vector (P,).
+
+    Attributes:
+        problems: a `Problem` for each data set, by its name; one measurement by itself has none: "".
+    """
 
     objective: Objective
 
@@ -65,24 +89,11 @@ class FittingProblem(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def units(self) -> dict[str, str]:
-        """Unit of each parameter; "1" for plain ratios."""
-
-    @property
-    @abc.abstractmethod
-    def problems(self) -> Mapping[str, Any]:
+    def problems(self) -> "Mapping[str, Problem]":
         """A `Problem` for each data set, by its name."""
 
     @abc.abstractmethod
-    def places(self, name: str) -> tuple[int, ...]:
-        """Where the parameters of one data set stand in the vector."""
-
-    @abc.abstractmethod
-    def shares(self, predicted: Floats) -> dict[str, Floats]:
-        """What `predict` gives of each data set, in the shape of its data."""
-
-    @abc.abstractmethod
-    def with_problems(self, changed: Mapping[str, Any]) -> "FittingProblem":
+    def with_problems(self, changed: "Mapping[str, Problem]") -> "FittingProblem":
         """The same with other problems in the place of those of the same names."""
 
     @property
@@ -106,6 +117,11 @@ class FittingProblem(abc.ABC):
         return self._assembled.high
 
     @property
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter; "1" for plain ratios."""
+        return {name: unit(name) for name in self.names}
+
+    @property
     def model(self) -> Any:
         """The problem as pure functions of the physical vector (P,)."""
         return self._assembled.model
@@ -114,6 +130,18 @@ class FittingProblem(abc.ABC):
     def count(self) -> int:
         """Number of data: used samples times channels."""
         return int(self.model.values.size)
+
+    def places(self, name: str = "") -> tuple[int, ...]:
+        """Where the parameters of one data set stand in the vector."""
+        if name not in self.problems:
+            raise ValueError(f"part {name!r} is not one of {', '.join(self.problems)}")
+        return self._assembled.places[name]
+
+    def shares(self, predicted: Floats) -> dict[str, Floats]:
+        """What `predict` gives of each data set, in the shape of its data."""
+        shapes = [problem.model.values.shape for problem in self.problems.values()]
+        split = np.split(predicted.ravel(), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        return {name: part.reshape(shape) for name, part, shape in zip(self.problems, split, shapes, strict=True)}
 
     def build(self, vector: ArrayLike) -> Any:
         """Stack, scale and noise levels with the physical vector (P,)."""
@@ -205,16 +233,6 @@ class Problem(FittingProblem):
         return _assemble(self)
 
     @property
-    def model(self) -> Model:
-        """The problem as pure functions of the physical vector (P,)."""
-        return self._assembled.model
-
-    @property
-    def units(self) -> dict[str, str]:
-        """Unit of each parameter; "1" for plain ratios."""
-        return {name: unit(name) for name in self.names}
-
-    @property
     def noise_is_assumed(self) -> bool:
         """Whether neither the data nor `noise` nor the instrument say how large the noise is: see `Noise`."""
         return is_assumed(with_floor(self.noise, self.instrument), self.data)
@@ -223,14 +241,6 @@ class Problem(FittingProblem):
     def problems(self) -> "dict[str, Problem]":
         """The one measurement, which has no name."""
         return {"": self}
-
-    def places(self, name: str = "") -> tuple[int, ...]:
-        """All places of the vector."""
-        return tuple(range(len(self.names)))
-
-    def shares(self, predicted: Floats) -> dict[str, Floats]:
-        """All that is predicted."""
-        return {"": predicted}
 
     def with_problems(self, changed: "Mapping[str, Problem]") -> "Problem":
         """What stands in its place."""
@@ -263,43 +273,182 @@ class Problem(FittingProblem):
         return other
 
 
-UNITS = {
-    "noise.floor": "1/sr",
-    "instrument.tilt": "deg",
-    "noise.discrepancy.length_half": "deg",
-    "noise.discrepancy.length_difference": "deg",
-    **{"thickness": "optical depth", "thickness_mm": "mm", "mu_s": "1/mm", "mu_a": "1/mm"},
-}
-"""Units of parameters by their names, or by what these end with; all others are plain ratios."""
+class JointParts(NamedTuple):
+    """What a vector makes of each data set, by its name: stacks, and calibration factors."""
 
-PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
-"""How names begin of what stands in each place of `Parts`."""
+    stack: dict[str, Any]
+    scale: dict[str, Any]
+
+
+class Joint(FittingProblem):
+    """Data sets that are fitted together, each a `Problem` of its own, with parameters in common.
+
+    It stands in the place of a stack and its data: `fits.fit(fits.Joint({...}, shared=[...]))`. What is found of one
+    data set is `Fit.part(name)`, and `Posterior.part(name)`.
+
+    Args:
+        parts: the problems by name, two or more, each with a likelihood.
+        shared: names of parameters that are one in all problems: ``layers[0].ior``, or how names begin, such as
+            ``layers[0]`` for all that is free in that layer. Bounds and priors must agree; they start as in the first.
+            The others are named after their problem, ``plane.scale``.
+
+    Raises:
+        ValueError: fewer than two problems, a named objective, a shared name that is not in every problem, or free
+            parameters of one name that differ.
+    """
+
+    objective: Objective = "likelihood"
+
+    def __init__(self, parts: Mapping[str, Problem], shared: Sequence[str] = ()):
+        self.parts, self.shared = dict(parts), tuple([shared] if isinstance(shared, str) else shared)
+        if len(self.parts) < 2:
+            raise ValueError(f"Joint.parts is {list(self.parts)}; it must name at least two problems")
+        for name, problem in self.parts.items():
+            if problem.objective != "likelihood":
+                raise ValueError(f"Joint.parts[{name!r}].objective is {problem.objective!r}; it must be 'likelihood'")
+        _ = self._assembled
+
+    @cached_property
+    def _assembled(self) -> Assembled:
+        # what is shared comes first, then the others of each data set under its name
+        common = self._common()
+        names, places = list(common), dict[str, tuple[int, ...]]()
+        for part, problem in self.parts.items():
+            own = [name if name in common else f"{part}.{name}" for name in problem.names]
+            names += [name for name in own if name not in common]
+            places[part] = tuple(map(names.index, own))
+
+        def gathered(key: str) -> NDArray[Any]:
+            """What each data set has of its parameters, at their places in the vector; of shared ones, of the first."""
+            values = {part: np.asarray(attrgetter(key)(problem)) for part, problem in self.parts.items()}
+            found = np.zeros(len(names), next(iter(values.values())).dtype)
+            for part in reversed(values):
+                found[list(places[part])] = values[part]
+            return found
+
+        between: list[Floats] = []  # rows of random walks over channels; of shared ones once
+        for part, problem in self.parts.items():
+            for row in np.asarray(problem.model.box.between):
+                whole = np.zeros(len(names))
+                whole[list(places[part])] = row
+                between += [] if any(np.array_equal(whole, one) for one in between) else [whole]
+        each = {key: jnp.asarray(gathered(f"model.box.{key}")) for key in PER_PARAMETER}
+        models = tuple(problem.model for problem in self.parts.values())
+        model = JointModel(
+            parts=models,
+            box=Box(**each, between=jnp.asarray(np.array(between).reshape(-1, len(names)))),
+            places=tuple(places.values()),
+            varying=any(one.varying for one in models),
+        )
+        start, low, high = map(gathered, ("start", "low", "high"))
+        return Assembled(tuple(names), start, low, high, model, places)
+
+    def _common(self) -> list[str]:
+        """The shared names, as the first data set has them. ValueError where they are not in every one, or differ."""
+        (first, one), *others = self.parts.items()
+        for given in self.shared:
+            sets = {part: set(filter(_begins(given), problem.names)) for part, problem in self.parts.items()}
+            every = set.union(*sets.values())
+            if not every:
+                raise ValueError(f"Joint.shared: no problem has a free parameter {given!r}")
+            for part, names in sets.items():
+                if names != every:
+                    missing = ", ".join(sorted(every - names))
+                    raise ValueError(f"Joint.shared: {missing} is not free in {part!r}; it must be in every problem")
+        common = [name for name in one.names if any(_begins(given)(name) for given in self.shared)]
+        for name in common:
+            for part, problem in others:
+                if not _same(one, problem, name):
+                    raise ValueError(
+                        f"Joint.shared: {name} has other bounds or another prior in {part!r} than in {first!r}"
+                    )
+        return common
+
+    def build(self, vector: ArrayLike) -> JointParts:
+        """Stacks and scales with the physical vector (P,)."""
+        vector = np.asarray(vector)
+        built = {name: problem.build(vector[list(self.places(name))]) for name, problem in self.parts.items()}
+        return JointParts(*({name: one[k] for name, one in built.items()} for k in range(2)))
+
+    @property
+    def problems(self) -> dict[str, Problem]:
+        """`parts`."""
+        return self.parts
+
+    def with_problems(self, changed: Mapping[str, Problem]) -> "Joint":
+        """The same with other problems in the place of those of the same names; what is new in them is not shared."""
+        return Joint({**self.parts, **changed}, self._common()) if changed else self
+
+
+def _begins(prefix: str) -> Callable[[str], bool]:
+    """Whether a parameter's name is this, or that of a part of it."""
+    return lambda name: name == prefix or name.startswith((f"{prefix}.", f"{prefix}["))
+
+
+def _same(one: Problem, other: Problem, name: str) -> bool:
+    """Whether a parameter has the same bounds and prior in both."""
+    i, j = one.names.index(name), other.names.index(name)
+    mine, theirs = one.model.box, other.model.box
+    first, second = (np.asarray(box.between[:, place]) for box, place in ((mine, i), (theirs, j)))
+    return np.array_equal(first[first != 0.0], second[second != 0.0]) and all(
+        math.isclose(float(getattr(mine, field)[i]), float(getattr(theirs, field)[j]), rel_tol=1e-12)
+        for field in PER_PARAMETER
+    )
 
 
 def _assemble(problem: Problem) -> Assembled:
+    """What follows from a problem; ValueError for parts that do not fit together."""
+    # 1. each part is of its kind
     _require_kinds(problem)
-    _require_known(problem.objective, problem.scale)
-    require_in_range(problem.stack)
-    if isinstance(problem.data, Totals):
-        _refuse_angular_only(problem)
-    used = problem.data.used()
+    used, noise = problem.data.used(), problem.noise
     if not used.values.size:
         raise ValueError("data: no sample is used; at least one must be")
-    levels = noise_levels(with_floor(problem.noise, problem.instrument), used)
-    process = make_process(used.wi, used.wo, used.values.shape[1]) if problem.noise.discrepancy else None
-    if process is not None:
+
+    # 2. all that a parameter may stand for, in the order of `Parts`
+    levels = noise_levels(with_floor(noise, problem.instrument), used)
+    process = correlation = setting = None
+    if isinstance(noise.discrepancy, Discrepancy):
+        process = make_process(used.wi, used.wo, used.values.shape[1])
         process = replace(process, gram=levels.gram(process, used.values))
-    template, names, free = split(_numbers(problem, levels, process), _parameter_name)
+        correlation = numbers_of(noise.discrepancy, np.asarray(process.shortest), used.values.shape[1])
+    if problem.instrument is not None:
+        setting = setting_of(problem.instrument, polar_angles(problem.data))
+    scale = 1.0 if problem.scale is None else problem.scale
+    rest = (scale, setting, levels.relative, levels.floor, correlation)
+    rest = jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free)
+    template, names, free = split((_with_known(problem.stack), *rest), _parameter_name)
     if not names:
         raise ValueError("stack: nothing is free; put fits.Free(start, low, high) where a number is to be fitted")
-    if problem.objective == "likelihood":
-        _require_noise(levels)
-    else:
-        _refuse_likelihood_only(problem, levels, free)
-    model = _model(problem, used, levels, template, Box.of(free), process, names)
+
+    _require_weights(problem.objective, levels, process, free)
+
+    # 3. the same as arrays
+    model = Model(
+        template=template,
+        box=Box.of(free),
+        values=jnp.asarray(used.values),
+        variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
+        lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
+        degrees_of_freedom=jnp.asarray(float(noise.degrees_of_freedom)),
+        transport=Totalling.of(used, problem.transport) if isinstance(used, Totals) else problem.transport,
+        process=process,
+        softness=None if process is None else jnp.asarray(levels.softness(used.values)),
+        objective=problem.objective,
+        tails=noise.tails,
+        varying=levels.varying if process is None else levels.fitted,
+        moving=sum(not name.startswith("noise.") for name in names),
+        **_directions(problem, used.wi, used.wo),
+    )
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
-    _require_same_channels(model, start, used)
-    return Assembled(names, start, low, high, model)
+    material = model.build(jnp.asarray(start)).stack
+    if isinstance(material, lj.Stack | lj.Mixture):
+        channel_count(material)
+    shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
+    if shape[-1] not in (1, used.values.shape[-1]):
+        raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
+    if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
+        raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
+    return Assembled(names, start, low, high, model, {"": tuple(range(len(names)))})
 
 
 def _require_kinds(problem: Problem) -> None:
@@ -310,121 +459,65 @@ def _require_kinds(problem: Problem) -> None:
     require_kind("data", problem.data, Measurements)
     require_kind("noise", problem.noise, Noise)
     require_kind("instrument", problem.instrument, Instrument, None)
-
-
-def _require_known(objective: str, scale: Any) -> None:
-    if objective not in get_args(Objective):
-        raise ValueError(f"objective is {objective!r}; it must be one of {', '.join(get_args(Objective))}")
+    if problem.objective not in get_args(Objective):
+        raise ValueError(f"objective is {problem.objective!r}; it must be one of {', '.join(get_args(Objective))}")
+    scale = problem.scale
     above_zero = isinstance(scale, int | float) and math.isfinite(scale) and scale > 0
     if not (scale is None or is_free(scale) or above_zero):
         raise ValueError(f"scale is {scale!r}; it must be a finite number above 0, Free or None")
+    require_in_range(problem.stack)
+    if isinstance(problem.data, Totals):
+        for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
+            if given:
+                raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
 
 
-def _numbers(problem: Problem, levels: Levels, process: Process | None) -> tuple[Any, ...]:
-    """All that a parameter may stand for, in the order of `Parts`."""
-    # what is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it
-    stack = _with_known(problem.stack)
-    scale = 1.0 if problem.scale is None else problem.scale
-    correlation = None
-    if process is not None:
-        assert isinstance(problem.noise.discrepancy, Discrepancy)
-        correlation = numbers_of(problem.noise.discrepancy, process, problem.data.values.shape[1])
-    instrument = None if problem.instrument is None else setting_of(problem.instrument, polar_angles(problem.data))
-    rest = (scale, instrument, levels.relative, levels.floor, correlation)
-    return (stack, *jax.tree.map(lambda x: x if is_free(x) else jnp.asarray(x), rest, is_leaf=is_free))
+def _require_weights(objective: Objective, levels: Levels, process: Process | None, free: tuple[Free, ...]) -> None:
+    """A likelihood needs noise; beside a named residual nothing may stand that only a likelihood weighs."""
+    if objective == "likelihood":
+        if not np.all(levels.smallest > 0):
+            raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
+        return
+    fitted = [f"noise.{name}" for name in ("relative", "floor") if is_free(getattr(levels, name))]
+    if fitted or process is not None:
+        raise ValueError(f"{(*fitted, 'noise.discrepancy')[0]}: objective {objective!r} has no noise model to fit")
+    weighted = [f"the prior {one.prior}" for one in free if isinstance(one.prior, Normal | LogNormal)]
+    weighted += [f"Free.random_walk_sd {one.random_walk_sd}" for one in free if one.random_walk_sd is not None]
+    if weighted:
+        raise ValueError(f"{weighted[0]} has no weight beside objective {objective!r}; omit it")
 
 
 def _with_known(stack: Any) -> Any:
-    if isinstance(stack, lj.Mixture):
-        _require_room(stack)
-        return stack.each(_with_known)
-    return with_known(stack) if isinstance(stack, lj.Stack) else stack
-
-
-def _require_room(mixture: lj.Mixture) -> None:
-    """Refuse weights that could leave less than nothing for the rest."""
-    given = [weight for weight in mixture.weights.values() if weight is not None]
-    if any(map(is_free, given)):
-        most = sum(float(weight.arrays()[2] if is_free(weight) else weight) for weight in given)
-        if most > 1.0:
-            raise ValueError(f"Mixture.weights: at their upper bounds they sum to {most:g}; it must be at most 1")
+    """What is 0 or 1 stays known where the rest is traced: it costs nothing, and some transports ask for it."""
+    if not isinstance(stack, lj.Mixture):
+        return with_known(stack) if isinstance(stack, lj.Stack) else stack
+    given = [weight for weight in stack.weights.values() if weight is not None]
+    most = sum(float(weight.arrays()[2] if is_free(weight) else weight) for weight in given)
+    if any(map(is_free, given)) and most > 1.0:
+        raise ValueError(f"Mixture.weights: at their upper bounds they sum to {most:g}; it must be at most 1")
+    return stack.each(_with_known)
 
 
 def _parameter_name(path: str) -> str:
-    """The name of a place in the tuple that `_numbers` returns."""
-    for index, name in enumerate(PLACES):
-        if path.startswith(f"[{index}]"):
-            return plain_name(name + path.removeprefix(f"[{index}]"))
-    return path
-
-
-def _require_noise(levels: Levels) -> None:
-    if not np.all(levels.smallest > 0):
-        raise ValueError("noise: sigma could become 0; give a floor above 0, or data with sigma")
-
-
-def _refuse_angular_only(problem: Problem) -> None:
-    """What is said of measurements along directions, and means nothing of totals."""
-    for name, given in (("instrument", problem.instrument), ("noise.discrepancy", problem.noise.discrepancy)):
-        if given:
-            raise ValueError(f"{name} is given, but the data are totals, which have no direction of view")
-
-
-def _refuse_likelihood_only(problem: Problem, levels: Levels, free: tuple[Free, ...]) -> None:
-    objective = problem.objective
-    fitted = [name for name in ("relative", "floor") if is_free(getattr(levels, name))]
-    if problem.noise.discrepancy:
-        raise ValueError(f"noise.discrepancy stands beside objective {objective!r}, which has no noise model")
-    if fitted:
-        raise ValueError(f"noise.{fitted[0]} is free, but objective {objective!r} has no noise model")
-    weighted = [entry.prior for entry in free if isinstance(entry.prior, Normal | LogNormal)]
-    if weighted:
-        raise ValueError(f"the prior {weighted[0]} has no weight beside objective {objective!r}; omit it")
-    smooth = [entry.random_walk_sd for entry in free if entry.random_walk_sd is not None]
-    if smooth:
-        raise ValueError(f"Free.random_walk_sd is {shown(smooth[0])}, but has no weight beside objective {objective!r}")
-
-
-def _model(
-    problem: Problem,
-    used: Measurements,
-    levels: Levels,
-    template: Template,
-    box: Box,
-    process: Process | None,
-    names: tuple[str, ...],
-) -> Model:
-    return Model(
-        template=template,
-        box=box,
-        values=jnp.asarray(used.values),
-        variance=jnp.asarray(np.broadcast_to(levels.variance, used.values.shape)),
-        lowest=jnp.asarray(np.broadcast_to(levels.smallest, used.values.shape)),
-        degrees_of_freedom=jnp.asarray(float(problem.noise.degrees_of_freedom)),
-        transport=Totalling.of(used, problem.transport) if isinstance(used, Totals) else problem.transport,
-        process=process,
-        softness=None if process is None else jnp.asarray(levels.softness(used.values)),
-        objective=problem.objective,
-        tails=problem.noise.tails,
-        varying=levels.varying if process is None else levels.fitted,
-        moving=sum(not name.startswith("noise.") for name in names),
-        **_directions(problem, used.wi, used.wo),
-    )
+    """The name of a place in a tuple in the order of `Parts`."""
+    index, rest = re.fullmatch(r"\[(\d)\](.*)", path, re.DOTALL).groups()  # type: ignore[union-attr]
+    return plain_name(PLACES[int(index)] + rest)
 
 
 def _directions(problem: Problem, wi: Floats, wo: Floats) -> dict[str, Any]:
     """What a model holds of measurements along these directions, (N, 3) each."""
-    follow, given, optics = _uses_known(problem.transport), problem.instrument, None
-    if isinstance(problem.data, Totals):
-        follow = False  # light leaves along all directions
-    if given is not None:
-        optics = optics_of(given, problem.stack, wi, wo, polar_angles(problem.data), follow)
+    transport, optics = problem.transport, None
+    # where known directions are of no use, programs should not depend on how many there are
+    follow = transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known)
+    follow = follow and not isinstance(problem.data, Totals)  # whose light leaves along all directions
+    if problem.instrument is not None:
+        optics = optics_of(problem.instrument, problem.stack, wi, wo, polar_angles(problem.data), follow)
     return {
         "wi": jnp.asarray(wi),
         "wo": jnp.asarray(wo),
         "known": known_directions(wi, wo) if follow and optics is None else None,
         "optics": optics,
-        "side": _side(wi, wo),
+        "side": "reflection" if np.all(wi[:, 2] > 0) and np.all(wo[:, 2] > 0) else "all",
     }
 
 
@@ -444,32 +537,11 @@ def polar_angles(data: Measurements) -> Floats:
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
 
-def _side(wi: Floats, wo: Floats) -> Side:
-    return "reflection" if np.all(wi[:, 2] > 0) and np.all(wo[:, 2] > 0) else "all"
-
-
 def _over_vectors(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
 
 
-def _uses_known(transport: Any) -> bool:
-    """Whether known directions are of use; where they are not, programs should not depend on how many there are."""
-    return transport == "auto" or (isinstance(transport, lj.Transport) and transport.uses_known)
-
-
-def _require_same_channels(model: Model, start: Floats, used: Measurements) -> None:
-    material = model.build(jnp.asarray(start)).stack
-    if isinstance(material, lj.Stack | lj.Mixture):
-        channel_count(material)
-    shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
-    if shape[-1] not in (1, used.values.shape[-1]):
-        raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
-    if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
-        raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-
-
 def unit(name: str) -> str:
     """The unit of a parameter of this name; "1" for plain ratios."""
-    known = UNITS.get(name)
     whole = re.sub(r"\[\d+\]$|\.amplitude$", "", name)  # of a channel, or of a power law's reference
-    return known or UNITS.get(whole.rpartition(".")[2], "1")
+    return next((one for end, one in UNITS.items() if whole.endswith(end)), "1")

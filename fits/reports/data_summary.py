@@ -102,83 +102,82 @@ def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> lis
     return [
         *found,
         *_brighter_side(sides(data)),
-        _reciprocity(reciprocity(data)),
+        _agreement(
+            "Reciprocity",
+            reciprocity(data),
+            "light and viewer are exchanged in {count:,} pairs of measurements; {difference}. A reciprocal model can "
+            "be no closer to them than half of that",
+            "no two measurements have light and viewer exchanged, it cannot be tested",
+        ),
         _energy(energies(data)),
-        _symmetry(symmetry(data)),
+        _agreement(
+            "Symmetry",
+            symmetry(data),
+            "{count:,} pairs lie on either side of the plane of incidence; {difference}",
+            "no measurements lie on both sides of the plane of incidence, it cannot be tested",
+        ),
         _sampling(peaks(data), options),
-        _repeats(repeats(data)),
+        _agreement(
+            "Repeats",
+            repeats(data),
+            "{count:,} measurements were repeated; {difference}: a noise of about {noise:.2g} %",
+            "no measurement was repeated; the noise has to come from the file's sigma or from the fit",
+        ),
     ]
 
 
-def _brighter_side(found: list[Sides]) -> list[str]:
+def _agreement(what: str, pairs: Agreement | None, words: str, without: str) -> str:
+    """How well measurements agree that should; without: what is said where there are none."""
+    if pairs is None:
+        return f"{what}: {without}."
+    difference = (
+        f"they differ by {100.0 * pairs.median:.2g} % (median; 95 % of them by up to {100.0 * pairs.p95:.2g} %)"
+    )
+    if not math.isnan(pairs.z):
+        difference += f", {pairs.z:.2g} of their standard errors"
+    return f"{what}: {words.format(count=pairs.count, difference=difference, noise=100.0 * pairs.noise)}."
+
+
+def _brighter_side(by_incidence: list[Sides]) -> list[str]:
+    """That the brightest side is the light's, where it is: azimuths may be counted from the mirror direction."""
     doubt = (
         "Unless the sample is retro-reflective, azimuths of this file count from the mirror direction, which must lie "
         "at phi_o = phi_i + 180."
     )
-    if found and all(math.isnan(one.mirror) for one in found):
+    if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
         return [f"Sides: all measurements in the plane of incidence lie on the light's side. {doubt}"]
-    of_light = [one for one in found if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    of_mirror = [one for one in found if one.mirror > BRIGHTER * max(one.light, 0.0)]
-    if len(of_light) <= len(of_mirror):
+    of_light = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
+    if len(of_light) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
         return []
     worst = max(of_light, key=lambda one: one.light)
-    return [
-        f"Sides: the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there, and "
-        f"{worst.mirror:.3g} on the mirror side. {doubt}"
-    ]
+    where = f"at {worst.theta:g}° up to {worst.light:.3g} there, and {worst.mirror:.3g} on the mirror side"
+    return [f"Sides: the brightest side is the light's: {where}. {doubt}"]
 
 
-def _reciprocity(found: Agreement | None) -> str:
-    if found is None:
-        return "Reciprocity: no two measurements have light and viewer exchanged, it cannot be tested."
-    return (
-        f"Reciprocity: light and viewer are exchanged in {found.count:,} pairs of measurements; {_difference(found)}. "
-        "A reciprocal model can be no closer to them than half of that."
-    )
-
-
-def _symmetry(found: Agreement | None) -> str:
-    if found is None:
-        return "Symmetry: no measurements lie on both sides of the plane of incidence, it cannot be tested."
-    return f"Symmetry: {found.count:,} pairs lie on either side of the plane of incidence; {_difference(found)}."
-
-
-def _repeats(found: Agreement | None) -> str:
-    if found is None:
-        return "Repeats: no measurement was repeated; the noise has to come from the file's sigma or from the fit."
-    noise = f"{100.0 * found.noise:.2g} %"
-    return f"Repeats: {found.count:,} measurements were repeated; {_difference(found)}: a noise of about {noise}."
-
-
-def _difference(found: Agreement) -> str:
-    words = f"they differ by {100.0 * found.median:.2g} % (median; 95 % of them by up to {100.0 * found.p95:.2g} %)"
-    return words if math.isnan(found.z) else f"{words}, {found.z:.2g} of their standard errors"
-
-
-def _energy(found: list[Energy]) -> str:
-    if not found:
+def _energy(by_incidence: list[Energy]) -> str:
+    if not by_incidence:
         return "Energy: no incidence is measured over half of the hemisphere, the directional albedo is unknown."
     parts = []
-    for one in found[:MOST_ENERGIES]:
+    for one in by_incidence[:MOST_ENERGIES]:
         share = "/".join(f"{part:.3g}" for part in one.share)
         parts.append(f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it")
-    more = f", and {len(found) - MOST_ENERGIES} more incidences" if len(found) > MOST_ENERGIES else ""
+    more = f", and {len(by_incidence) - MOST_ENERGIES} more incidences" if len(by_incidence) > MOST_ENERGIES else ""
     words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}{more}."
-    above = [one for one in found if max(one.share) > 1.0]
+    above = [one for one in by_incidence if max(one.share) > 1.0]
     if above:
         words += f" It exceeds 1 at {', '.join(f'{one.theta:g}°' for one in above)}: the scale is wrong."
     return words
 
 
-def _sampling(found: list[Peak], options: ReportOptions) -> str:
-    if not found:
+def _sampling(by_incidence: list[Peak], options: ReportOptions) -> str:
+    if not by_incidence:
         return "Sampling: no scan crosses the mirror direction of its light, the peak was not measured."
-    if not any(one.stands_out for one in found):
+    if not any(one.stands_out for one in by_incidence):
         return (
             f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
             "to half of the brightest one."
         )
-    worst = min((one for one in found if one.stands_out), key=lambda one: one.count)
+    worst = min((one for one in by_incidence if one.stands_out), key=lambda one: one.count)
     words = (
         f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.count} or "
         f"more (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"

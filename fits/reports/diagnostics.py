@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fits.data.neighbours import correlation, neighbours
-from fits.data.scans import incidences
-from fits.problem.model import Density
+from fits.data.scans import correlation, incidences, neighbours
+from fits.problem.model import Model
 
 if TYPE_CHECKING:
     from fits.data.measurements import Measurements
@@ -37,15 +36,10 @@ class ResidualStructure:
     mean: float
     rms: float
     beyond_three: float  # share of |residual| > 3; a normal law has 0.0027
-    normal_distance: float  # Kolmogorov-Smirnov distance from the unit normal
     lag_one: float  # correlation of neighbours in angle; NaN when no plane holds enough points
     pairs: int
     lag_one_sigma: float  # lag_one over its standard error under white noise, 1 / sqrt(pairs)
     by_incidence: tuple[ResidualGroup, ...]
-
-    @property
-    def worst(self) -> ResidualGroup:
-        return max(self.by_incidence, key=lambda group: group.rms)
 
     @property
     def independent_share(self) -> float:
@@ -90,7 +84,7 @@ def misfit(fit: "Fit") -> np.ndarray:
 
     With a model discrepancy these are smaller than the noise, since it follows the data: `standardised` are not.
     """
-    independent = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+    independent = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
     return over_all_rows(fit, independent / _unit(fit))
 
 
@@ -112,8 +106,6 @@ def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualS
     Raises:
         ValueError: no residual is finite.
     """
-    from scipy import stats
-
     finite = residuals[np.isfinite(residuals)]
     if not finite.size:
         raise ValueError("residuals must hold at least one finite value, got none")
@@ -130,7 +122,6 @@ def residual_structure(data: "Measurements", residuals: np.ndarray) -> ResidualS
         mean=float(finite.mean()),
         rms=_rms(finite),
         beyond_three=float(np.mean(np.abs(finite) > 3.0)),
-        normal_distance=float(stats.kstest(finite, "norm").statistic),
         lag_one=lag_one,
         pairs=first.size,
         lag_one_sigma=lag_one * float(np.sqrt(first.size)),

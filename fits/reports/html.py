@@ -6,15 +6,17 @@ posterior and comparison.
 
 import html
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from fits._files import write_text, write_together
+from fits._files import write_together
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.reports import tables, verdicts
 from fits.reports.diagnostics import residual_label, standardised
-from fits.reports.pages import Pictures, document, image, made_with, section, sentences
+from fits.reports.pages import Pictures, document, html_table, image, made_with, section, sentences, verdict
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.plots import parameters as parameter_pictures
@@ -39,36 +41,6 @@ class HeldOut(NamedTuple):
     prediction: "Prediction"
 
 
-def report(
-    fit: "Fit",
-    posterior: "Posterior | None" = None,
-    path: str | Path = "report.html",
-    *,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: Measurements | None = None,
-    options: ReportOptions = verdicts.DEFAULT,
-    force: bool = True,
-) -> None:
-    """Writes the report of a fit to `path`, whole or not at all: see `fits.report`, which calls this."""
-    fit.require_one("report")
-    predicted = None if held_out is None else predict_held_out(fit, posterior, held_out)
-    images = draw(fit, posterior, others, name, predicted)
-    write_text(path, page(fit, posterior, images, others, name, predicted, options), force=force)
-
-
-def write_report(
-    folder: Path, name: str, fit: "Fit", posterior: "Posterior | None" = None, others: Results | None = None
-) -> HeldOut | None:
-    """Writes the report of a result directory, its pictures beside it; returns the prediction of its held-out data."""
-    held_out = load_held_out(folder)
-    predicted = None if held_out is None else predict_held_out(fit, posterior, held_out)
-    images = draw(fit, posterior, others, name, predicted)
-    text = page(fit, posterior, images, others, name, predicted)
-    write_together(folder, {**{f"{key}.png": image for key, image in images.items()}, REPORT: text.encode()})
-    return predicted
-
-
 def predict_held_out(fit: "Fit", posterior: "Posterior | None", data: Measurements) -> HeldOut:
     """The prediction of held-out data by the posterior, or by the fit where there is none to report from."""
     from fits.prediction.predict import predict
@@ -76,104 +48,107 @@ def predict_held_out(fit: "Fit", posterior: "Posterior | None", data: Measuremen
     return HeldOut(data, predict(posterior if posterior is not None and reportable(posterior) else fit, data))
 
 
-def draw(
-    fit: "Fit",
-    posterior: "Posterior | None" = None,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: HeldOut | None = None,
-) -> dict[str, bytes]:
-    """Every picture that applies, as PNG by name."""
-    data = fit.problem.data
-    estimates = posterior if posterior is not None and reportable(posterior) else None
-    figures: dict[str, Figure | None] = {
-        "stack": parameter_pictures.stack_picture(fit.stack),
-        "correlation": parameter_pictures.correlation_picture(fit),
-    }
-    if isinstance(data, Totals):
-        figures["totals"] = pictures.totals_picture(data, fit)
-    else:
-        figures |= {
-            "model": model_pictures.curves_picture({name: fit}, estimates),
-            "maps": model_pictures.maps_picture(fit),
-            "residuals": pictures.residual_picture(data, standardised(fit), residual_label(fit)),
-        }
-    if estimates is not None:
-        figures["corner"] = parameter_pictures.corner_picture(estimates)
-    if posterior is not None:
-        figures["trace"] = parameter_pictures.trace_picture(posterior)
-    if held_out is not None:
-        figures["held_out"] = model_pictures.prediction_picture(held_out.prediction, held_out.data)
-    if others:
-        figures["comparison"] = model_pictures.curves_picture({name: fit, **_fits(others)})
-    return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
+def write_report(
+    folder: Path, name: str, fit: "Fit", posterior: "Posterior | None" = None, others: Results | None = None
+) -> HeldOut | None:
+    """Writes the report of a result directory, its pictures beside it; returns the prediction of its held-out data."""
+    held_out = load_held_out(folder)
+    report = FitReport(fit, posterior, others or {}, name, held_out)
+    pictures = {f"{key}.png": image for key, image in report.images.items()}
+    write_together(folder, pictures | {REPORT: report.page().encode()})
+    return report.predicted
 
 
-def page(
-    fit: "Fit",
-    posterior: "Posterior | None",
-    images: Pictures,
-    others: Results | None = None,
-    name: str = "this fit",
-    held_out: HeldOut | None = None,
-    options: ReportOptions = verdicts.DEFAULT,
-) -> str:
-    """The HTML text of the report, with the pictures inside."""
-    facts = verdicts.assess(fit, options)
-    found = verdicts.verdict(fit, facts)
-    title = f"Fit of {source_name(fit.problem.data)}"
-    curves = "In the plane of incidence. Grey: one sigma of the noise model."
-    if fit.problem.noise.discrepancy:
-        curves += " Residuals are those of the curve with model discrepancy."
-    body = [
-        f"<h1>{html.escape(title)}</h1>",
-        f'<p class="verdict{" fine" if found.sound else ""}">{html.escape(" ".join(found.sentences))}</p>',
-        sentences(found.remarks) if found.remarks else "",
-        section(
-            "Values",
-            tables.html_table(tables.parameter_table(fit)),
-            "" if fit.without_discrepancy is None else tables.html_table(tables.discrepancy_table(fit)),
-            image(images, "stack", "Fitted stack, from top to bottom; not to scale."),
-            _stack_text(fit),
-        ),
-        section(
-            "Data and model",
-            tables.html_table(tables.problem_table(fit)),
-            image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
-            image(images, "model", curves),
-            image(
-                images, "maps", "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
+@dataclass(frozen=True, eq=False)
+class FitReport:
+    """What the report of a fit is made of; arguments as of `fits.report`."""
+
+    fit: "Fit"
+    posterior: "Posterior | None" = None
+    others: Results = field(default_factory=dict)
+    name: str = "this fit"
+    held_out: Measurements | None = None
+    options: ReportOptions = verdicts.DEFAULT
+
+    @cached_property
+    def predicted(self) -> HeldOut | None:
+        """The prediction of held-out data; None without any."""
+        return None if self.held_out is None else predict_held_out(self.fit, self.posterior, self.held_out)
+
+    @cached_property
+    def images(self) -> Pictures:
+        """Every picture that applies, as PNG by name."""
+        fit, posterior, data = self.fit, self.posterior, self.fit.problem.data
+        estimates = posterior if posterior is not None and reportable(posterior) else None
+        figures: dict[str, Figure | None] = {"correlation": parameter_pictures.correlation_picture(fit)}
+        if isinstance(data, Totals):
+            figures["totals"] = pictures.totals_picture(data, fit)
+        else:
+            figures["model"] = model_pictures.curves_picture({self.name: fit}, estimates)
+            figures["maps"] = model_pictures.maps_picture(fit)
+            figures["residuals"] = pictures.residual_picture(data, standardised(fit), residual_label(fit))
+        if estimates is not None:
+            figures["corner"] = parameter_pictures.corner_picture(estimates)
+        if posterior is not None:
+            figures["trace"] = parameter_pictures.trace_picture(posterior)
+        if self.predicted is not None:
+            figures["held_out"] = model_pictures.prediction_picture(self.predicted.prediction, self.predicted.data)
+        if self.others:
+            figures["comparison"] = model_pictures.curves_picture({self.name: fit, **_fits(self.others)})
+        return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
+
+    def page(self) -> str:
+        """The HTML text, with the pictures inside."""
+        fit, images, held_out = self.fit, self.images, self.predicted
+        facts = verdicts.assess(fit, self.options)
+        found = verdicts.verdict(fit, facts)
+        title = f"Fit of {source_name(fit.problem.data)}"
+        curves = "In the plane of incidence. Grey: one sigma of the noise model."
+        if fit.problem.noise.discrepancy:
+            curves += " Residuals are those of the curve with model discrepancy."
+        hemispheres = "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
+        directions = verdicts.sentences(verdicts.identification(facts))
+        body = [
+            f"<h1>{html.escape(title)}</h1>",
+            verdict(found.sentences, found.sound),
+            sentences(found.remarks) if found.remarks else "",
+            section(
+                "Values",
+                tables.parameter_table(fit),
+                None if fit.without_discrepancy is None else tables.discrepancy_table(fit),
+                _stack_text(fit),
             ),
-            "" if held_out is None else _scores(held_out),
-            image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
-        ),
-        section(
-            "Diagnostics",
-            sentences(verdicts.sentences(verdicts.residuals(facts))),
-            tables.html_table(tables.incidence_table(facts.structure)),
-            image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
-            sentences(verdicts.minima(fit)),
-            tables.html_table(tables.minima_table(fit)),
-        ),
-        section(
-            "Identifiability",
-            sentences(
-                [
-                    f"The condition number of the scaled problem is {fit.condition_number:.3g}.",
-                    *verdicts.sentences(verdicts.identification(facts)),
-                ]
+            section(
+                "Data and model",
+                tables.problem_table(fit),
+                image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
+                image(images, "model", curves),
+                image(images, "maps", hemispheres),
+                None if held_out is None else tables.scores_table(held_out.prediction, held_out.data, "Held-out data"),
+                image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
             ),
-            tables.html_table(tables.unidentified_table(fit)) if fit.unidentified else "",
-            image(images, "correlation", "Correlation of the fitted parameters."),
-        ),
-        section("Posterior", *_posterior(fit, posterior, images, options)),
-    ]
-    if others:
-        from fits.prediction.compare import compare
+            section(
+                "Diagnostics",
+                verdicts.sentences(verdicts.residuals(facts)),
+                tables.incidence_table(facts.structure),
+                image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
+                verdicts.minima(fit),
+                tables.minima_table(fit),
+            ),
+            section(
+                "Identifiability",
+                [f"The condition number of the scaled problem is {fit.condition_number:.3g}.", *directions],
+                tables.unidentified_table(fit) if fit.unidentified else None,
+                image(images, "correlation", "Correlation of the fitted parameters."),
+            ),
+            section("Posterior", *_posterior(fit, self.posterior, images, self.options)),
+        ]
+        if self.others:
+            from fits.prediction.compare import compare
 
-        own = fit if posterior is None or not reportable(posterior) else posterior
-        body.append(_comparison(compare({name: own, **others}), images))
-    return document(title, [*body, made_with()])
+            own = fit if self.posterior is None or not reportable(self.posterior) else self.posterior
+            body.append(_comparison(compare({self.name: own, **self.others}), images))
+        return document(title, [*body, made_with()])
 
 
 def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, options: ReportOptions) -> tuple[str, ...]:
@@ -183,20 +158,16 @@ def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, opti
         return ("<p>There is none: the objective is a named residual, not a likelihood.</p>",)
     return (
         sentences(verdicts.sampled(posterior, options)),
-        tables.html_table(tables.posterior_table(posterior)) if reportable(posterior) else "",
+        html_table(tables.posterior_table(posterior)) if reportable(posterior) else "",
         image(images, "corner", "Samples of the posterior; orange: the best fit."),
         image(images, "trace", "Every walker; estimates use the steps right of the orange line."),
     )
 
 
-def _scores(held_out: HeldOut) -> str:
-    return tables.html_table(tables.scores_table(held_out.prediction, held_out.data, "Held-out data"))
-
-
 def _stack_text(fit: "Fit") -> str:
     import tomli_w
 
-    from fits.problem.toml import material_to_dict
+    from fits.problem.stack_file import material_to_dict
 
     return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
 
@@ -212,18 +183,15 @@ def comparison_page(candidates: Results, compared: "Comparison") -> str:
     figure = model_pictures.curves_picture(fits)
     images = {} if figure is None else {"comparison": pictures.as_png(figure)}
     title = f"Fits of {source_name(next(iter(fits.values())).problem.data)}"
-    body = [f"<h1>{html.escape(title)}</h1>", _comparison(compared, images)]
-    body += [
-        section(name, _stack_text(fit), tables.html_table(tables.parameter_table(fit))) for name, fit in fits.items()
-    ]
-    return document(title, body)
+    each = [section(name, _stack_text(fit), tables.parameter_table(fit)) for name, fit in fits.items()]
+    return document(title, [f"<h1>{html.escape(title)}</h1>", _comparison(compared, images), *each])
 
 
 def _comparison(compared: "Comparison", images: Pictures) -> str:
     return section(
         "Comparison",
-        sentences(compared.verdict),
-        tables.html_table(tables.comparison_table(compared)),
+        compared.verdict,
+        tables.comparison_table(compared),
         image(images, "comparison", "The fits beside the same data."),
     )
 
@@ -247,21 +215,21 @@ def fit_fragment(fit: "Fit") -> str:
         fragments += [
             f"<h4>{html.escape(name)}</h4>" if name else "",
             _paragraph(words),
-            tables.html_table(tables.parameter_table(part)),
-            tables.html_table(tables.unidentified_table(part)) if part.unidentified else "",
+            html_table(tables.parameter_table(part)),
+            html_table(tables.unidentified_table(part)) if part.unidentified else "",
         ]
     return "".join(fragments)
 
 
 def posterior_fragment(posterior: "Posterior") -> str:
     """How far the chain has converged, and its estimates, if there are any."""
-    table = tables.html_table(tables.posterior_table(posterior)) if reportable(posterior) else ""
+    table = html_table(tables.posterior_table(posterior)) if reportable(posterior) else ""
     return _paragraph(verdicts.sampled(posterior)) + table
 
 
 def comparison_fragment(comparison: "Comparison") -> str:
     """Which of several fits predicts the data best, and by how much."""
-    return _paragraph(list(comparison.verdict)) + tables.html_table(tables.comparison_table(comparison))
+    return _paragraph(list(comparison.verdict)) + html_table(tables.comparison_table(comparison))
 
 
 def _paragraph(words: list[str]) -> str:

@@ -1,11 +1,36 @@
-"""What reports are made of: a page, its sections, sentences and pictures, as text of HTML."""
+"""What pages of fits, maps, searches and batches are made of: sections of sentences, tables and pictures, as HTML."""
 
 import base64
 import html
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from string import Template
 
 Pictures = Mapping[str, bytes]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, column heads, and rows of as many words; `note` stands below.
+
+    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
+    """
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    keys: int = 1
+
+    def numeric(self, column: int) -> bool:
+        """Whether a column holds numbers."""
+        words = [row[column] for row in self.rows if row[column]]
+        return bool(words) and all(word.rstrip("°%").lstrip("+-")[:1].isdigit() or word == "unknown" for word in words)
+
+
+Part = str | Table | Sequence[str] | None
+"""Of a section: HTML, a table, or sentences."""
+
 
 _PAGE = Template("""<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -41,9 +66,34 @@ def made_with() -> str:
     return f'<p class="note">Made with {html.escape(", ".join(words))}.</p>'
 
 
-def section(head: str, *parts: str) -> str:
+def verdict(words: Sequence[str], sound: bool) -> str:
+    """What a page opens with; sound: whether there is no reservation."""
+    return f'<p class="verdict{" fine" if sound else ""}">{html.escape(" ".join(words))}</p>'
+
+
+def section(head: str, *parts: Part) -> str:
     """A part of a page under a heading; empty parts are omitted."""
-    return f"<h2>{html.escape(head)}</h2>\n" + "\n".join(part for part in parts if part)
+    return "\n".join([f"<h2>{html.escape(head)}</h2>", *(_fragment(part) for part in parts if part)])
+
+
+def _fragment(part: Part) -> str:
+    if isinstance(part, Table):
+        return html_table(part)
+    return part if isinstance(part, str) else sentences(part or ())
+
+
+def html_table(table: Table) -> str:
+    """The table as an HTML fragment, every word escaped."""
+    kinds = [' class="number"' if table.numeric(index) else "" for index in range(len(table.columns))]
+
+    def line(tag: str, words: Sequence[str]) -> str:
+        cells = (f"<{tag}{kind}>{html.escape(word)}</{tag}>" for kind, word in zip(kinds, words, strict=True))
+        return f"<tr>{''.join(cells)}</tr>"
+
+    body = "\n".join(line("td", row) for row in table.rows)
+    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
+    caption = f"<caption>{html.escape(table.title)}</caption>" if table.title else ""
+    return f"<table>{caption}<thead>{line('th', table.columns)}</thead>\n<tbody>{body}</tbody></table>{note}\n"
 
 
 def sentences(words: Sequence[str]) -> str:

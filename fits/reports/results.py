@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fits._files import locked, read_json, require_there, text_checksum, write_json, write_text
-from fits.data.formats import read, totals_csv
+from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
+from fits.data.reading import read
 from fits.data.spheres import Sphere, Spheres
 from fits.data.totals import Totals
 
@@ -78,7 +79,7 @@ def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
 
     require_kind("fit", fit, Fit)
     fit.require_one("save_fit")
-    with reserved(directory, force), replacing(directory, force) as folder:
+    with writing(directory, force) as folder:
         write_fit(fit, folder)
 
 
@@ -88,8 +89,7 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     text: the stack file as the user wrote it, which is kept as it is; it must describe the problem of the fit.
     """
     from fits.problem.parameters import Free
-    from fits.problem.stack_file import write_problem
-    from fits.problem.toml import transport_to_dict
+    from fits.problem.stack_file import transport_to_dict, write_problem
     from layerjax import Transport
 
     problem, transport = fit.problem, fit.problem.transport
@@ -151,8 +151,8 @@ def load_fit(directory: str | Path) -> "Fit":
     Raises:
         ValueError, FileNotFoundError: on one line, for a directory that holds none, a damaged one, or none at all.
     """
-    from fits.optimise.identifiability import Direction
     from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
+    from fits.optimise.uncertainty import Direction
 
     directory = Path(directory)
     content = _content(directory)
@@ -193,8 +193,7 @@ def load_fit(directory: str | Path) -> "Fit":
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
     """The fitting problem: the stack file and the data, with what the fit chose beside them."""
     from fits.problem.problem import Problem
-    from fits.problem.stack_file import read_problem
-    from fits.problem.toml import transport_from_dict
+    from fits.problem.stack_file import read_problem, transport_from_dict
 
     given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
     source = Source(**content["source"] | {"notes": tuple(content["source"]["notes"])})
@@ -319,52 +318,41 @@ def check_directory(directory: Path, force: bool) -> None:
 
 
 @contextmanager
-def reserved(directory: str | Path, force: bool = False) -> Iterator[None]:
-    """While the block lasts, no other process writes this result: a ValueError where one does, or as `replacing`."""
-    directory = Path(directory)
-    check_directory(directory, force)
-    target = directory.resolve()
-    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
-        new, old = _beside(target)  # as a killed process left them
-        if old.exists() and not target.exists():
-            old.rename(target)
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
-        yield
-
-
-def _beside(target: Path) -> tuple[Path, Path]:
-    return target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
-
-
-@contextmanager
-def replacing(directory: str | Path, force: bool = False) -> Iterator[Path]:
+def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     """A new folder beside `directory` that takes its place when the block ends well, and is removed when it does not.
 
-    The directory must be `reserved`. Raises ValueError for one that is not empty, unless `force` is given and it is an
-    earlier result.
+    While the block lasts, no other process writes this result.
+
+    Raises:
+        ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
     directory = Path(directory)
     check_directory(directory, force)
     target = directory.resolve()
-    folder, old = _beside(target)
-    try:
-        folder.mkdir()
-        yield folder
-        check_directory(directory, force)  # someone else may have written there in the meantime
-        if not target.exists():
-            folder.rename(target)
-            return
-        with locked(target / LOCK, str(directory)):
-            target.rename(old)
-            try:
+    folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")
+    with locked(target.with_name(f".{target.name}.lock"), str(directory)):
+        # as a killed process left them
+        if old.exists() and not target.exists():
+            old.rename(target)
+        for left in (folder, old):
+            shutil.rmtree(left, ignore_errors=True)
+        try:
+            folder.mkdir()
+            yield folder
+            check_directory(directory, force)  # someone else may have written there in the meantime
+            if not target.exists():
                 folder.rename(target)
-            except OSError:
-                old.rename(target)
-                raise
-        shutil.rmtree(old)
-    except BaseException as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
-            error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
-        raise
+                return
+            with locked(target / LOCK, str(directory)):
+                target.rename(old)
+                try:
+                    folder.rename(target)
+                except OSError:
+                    old.rename(target)
+                    raise
+            shutil.rmtree(old)
+        except BaseException as error:
+            shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, OSError) and str(error.filename).startswith(f"{folder}"):
+                error.filename = f"{directory}{str(error.filename).removeprefix(str(folder))}"  # which the user knows
+            raise

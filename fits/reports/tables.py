@@ -1,11 +1,9 @@
 """Tables of fits and predictions: built once as words, then shown by rich on a terminal or as HTML in the report."""
 
 import csv
-import html
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
@@ -18,15 +16,16 @@ from fits.optimise.limits import instrument_limits
 from fits.optimise.result import OUTCOMES
 from fits.prediction.predict import scores
 from fits.reports.diagnostics import ResidualStructure
+from fits.reports.pages import Table
+from fits.reports.pages import html_table as html_table
 from fits.reports.verdicts import identifiability, numerical_error
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table as Boxed
 
     from fits.optimise.result import Fit
     from fits.prediction.compare import ComparedFit, Comparison
-    from fits.prediction.model_scores import ModelScore
+    from fits.prediction.cross_validation import ModelScore
     from fits.prediction.predict import Prediction
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
@@ -40,49 +39,29 @@ UNRELIABLE = (
 LONGEST_WORD = 30  # letters of a text that is never wrapped
 
 
-@dataclass(frozen=True)
-class Table:
-    """A title, column heads, and rows of as many words; `note` stands below.
-
-    keys: how many columns, from the left, say what a row is of: a table too wide for a terminal repeats them.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
-    keys: int = 1
-
-
 def print_table(table: Table, stream: TextIO) -> None:
     """Writes the table to `stream`: boxed and as wide as the terminal, or 120 columns where there is none.
 
-    One that does not fit becomes several below each other, so that every column is shown.
+    One that does not fit becomes several below each other, each with the keys, so that every column is shown.
     """
     from rich.console import Console
 
     console = Console(file=stream, width=None if stream.isatty() else 120, highlight=False, markup=False)
-    parts = _parts(table, console)
-    for number, part in enumerate(parts, start=1):
-        title = table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"
-        console.print(_boxed(table, part, title, squeezed=_least_width(table, part, console) > console.width))
-    if table.note:
-        console.print(table.note)
 
+    def least_width(columns: list[int]) -> int:
+        return console.measure(_boxed(table, columns), options=console.options.update(width=10_000)).minimum
 
-def _parts(table: Table, console: "Console") -> list[list[int]]:
-    """The columns of the tables that this one is printed as: its keys, and as many of the others as fit."""
     keys = list(range(table.keys))
     parts = [keys]
     for column in range(table.keys, len(table.columns)):
-        if parts[-1] != keys and _least_width(table, [*parts[-1], column], console) > console.width:
+        if parts[-1] != keys and least_width([*parts[-1], column]) > console.width:
             parts.append(keys)
         parts[-1] = [*parts[-1], column]
-    return parts
-
-
-def _least_width(table: Table, columns: list[int], console: "Console") -> int:
-    return console.measure(_boxed(table, columns), options=console.options.update(width=10_000)).minimum
+    for number, part in enumerate(parts, start=1):
+        title = table.title if len(parts) == 1 else f"{table.title} ({number} of {len(parts)})"
+        console.print(_boxed(table, part, title, squeezed=least_width(part) > console.width))
+    if table.note:
+        console.print(table.note)
 
 
 def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = False) -> "Boxed":
@@ -93,9 +72,8 @@ def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = F
 
     boxed = Boxed(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     for index in columns:
-        words = [table.columns[index], *(row[index] for row in table.rows)]
-        longest = max(map(cell_len, words))
-        number = _numeric(table, index)
+        longest = max(map(cell_len, [table.columns[index], *(row[index] for row in table.rows)]))
+        number = table.numeric(index)
         wraps = not number and (index == len(table.columns) - 1 or longest > LONGEST_WORD)
         boxed.add_column(
             table.columns[index],
@@ -107,21 +85,6 @@ def _boxed(table: Table, columns: list[int], title: str = "", squeezed: bool = F
     for row in table.rows:
         boxed.add_row(*(row[index] for index in columns))
     return boxed
-
-
-def html_table(table: Table) -> str:
-    """The table as an HTML fragment, every word escaped."""
-    kinds = [' class="number"' if _numeric(table, index) else "" for index in range(len(table.columns))]
-    head = "".join(f"<th{kind}>{html.escape(word)}</th>" for kind, word in zip(kinds, table.columns, strict=True))
-    body = "".join(
-        "<tr>"
-        + "".join(f"<td{kind}>{html.escape(word)}</td>" for kind, word in zip(kinds, row, strict=True))
-        + "</tr>\n"
-        for row in table.rows
-    )
-    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
-    caption = f"<caption>{html.escape(table.title)}</caption>" if table.title else ""
-    return f"<table>{caption}<thead><tr>{head}</tr></thead>\n<tbody>{body}</tbody></table>{note}\n"
 
 
 def problem_table(fit: "Fit") -> Table:
@@ -203,7 +166,7 @@ def parameter_table(fit: "Fit") -> Table:
         low, high = float(fit.problem.low[index]), float(fit.problem.high[index])
         error = fit.standard_errors[name]
         number, spread = (f"< {limits[name]:.2g}", "-") if name in limits else with_error(value, error)
-        rows.append((name, number, spread, fit.units[name], f"{low:g} to {high:g}", words[name]))
+        rows.append((name, number, spread, fit.units[name], f"{low:.4g} to {high:.4g}", words[name]))
     notes = ["Errors are those of the best minimum only."] if fit.alternatives else []
     if not fit.is_posterior:
         notes.append("The objective is a named residual, not a likelihood: the errors are only indicative.")
@@ -284,7 +247,7 @@ def incidence_table(structure: ResidualStructure) -> Table:
         (degrees(group.theta), str(group.count), f"{group.mean:+.2f}", f"{group.rms:.2f}")
         for group in structure.by_incidence
     ]
-    note = "In units of the assumed sigma; the true model and noise give mean 0 and rms 1 at every incidence."
+    note = "In standard deviations; the true model and noise give mean 0 and rms 1 at every incidence."
     return Table(
         "Residuals by incidence", ("incidence", "measurements", "mean", "rms"), tuple(shortened(rows, 40)), note
     )
@@ -405,8 +368,3 @@ def shortened(rows: Sequence[tuple[str, ...]], most: int) -> Sequence[tuple[str,
         return rows
     gap = (f"... {len(rows) - most} more", *[""] * (len(rows[0]) - 1))
     return [*rows[: most // 2], gap, *rows[len(rows) - most // 2 :]]
-
-
-def _numeric(table: Table, column: int) -> bool:
-    words = [row[column] for row in table.rows if row[column]]
-    return bool(words) and all(word.rstrip("°%").lstrip("+-")[:1].isdigit() or word == "unknown" for word in words)

@@ -1,7 +1,7 @@
 """What a report says of a fit: every statement with the condition under which it is made, in one list.
 
-`assess` collects the facts of a fit, and statements depend on these alone. Each says what it claims of the errors, the
-residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
+`assess` collects the facts of a fit, and statements depend on these alone. Each says what it claims of the errors,
+the residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
 statements of a report contradict each other. With a model discrepancy, statements on residuals are about those whitened
 by the fitted covariance.
 """
@@ -15,10 +15,10 @@ import numpy as np
 
 from fits.data.checks import repeats
 from fits.data.totals import Totals
-from fits.optimise.identifiability import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.optimise.limits import instrument_limits, limited_with
 from fits.optimise.options import FitOptions
-from fits.problem.model import Density
+from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
+from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.problem.parameters import is_free
 from fits.reports.diagnostics import ResidualStructure, residual_structure, standardised
@@ -57,6 +57,9 @@ class ReportOptions:
 
 
 DEFAULT = ReportOptions()
+
+
+# ---- facts ----
 
 
 @dataclass(frozen=True)
@@ -106,17 +109,6 @@ class Assessment:
     numerical_limit: float
 
     @property
-    def size(self) -> float:
-        """Root mean square of the residuals over its expectation, where that is not chance; else 1."""
-        return math.sqrt(self.ratio) if self.large or self.small else 1.0
-
-    @property
-    def independent_share(self) -> float:
-        """Independent residuals a residual, where neighbours are correlated and that is not chance; else 1."""
-        significant = self.structure.lag_one_sigma > self.options.significance
-        return self.structure.independent_share if significant else 1.0
-
-    @property
     def large(self) -> bool:
         """Whether the residuals are significantly larger than expected."""
         return self.excess > self.options.significance
@@ -129,21 +121,38 @@ class Assessment:
     @property
     def correlated(self) -> bool:
         """Whether neighbouring residuals are significantly correlated."""
-        return self.independent_share < 1.0
+        return self.structure.lag_one_sigma > self.options.significance and self.structure.independent_share < 1.0
+
+    @property
+    def error_factors(self) -> tuple[float, float]:
+        """Factors by which the standard errors are too small, for the size and the correlation of the residuals."""
+        share = self.structure.independent_share if self.correlated else 1.0
+        return math.sqrt(self.ratio) if self.large or self.small else 1.0, share**-0.5
 
     @property
     def error_factor(self) -> float:
-        """Factor by which the standard errors are too small, for size and correlation of the residuals together."""
-        return self.size / math.sqrt(self.independent_share)
+        """Both together."""
+        return math.prod(self.error_factors)
+
+    @property
+    def which(self) -> str:
+        """The residuals that statements are about, in words."""
+        return "whitened residuals" if self.discrepancy else "residuals"
+
+    @property
+    def expectation(self) -> str:
+        """What says how large they should be, in words."""
+        return "the fitted covariance" if self.discrepancy else "the stated noise"
+
+    @property
+    def physical(self) -> dict[str, str]:
+        """What the data say of the parameters of stack and scale; those of the noise are nuisance parameters."""
+        return {name: word for name, word in self.words.items() if not name.startswith("noise.")}
 
     @property
     def identified(self) -> bool:
-        """Whether the data identify every parameter of stack and scale; those of the noise are nuisance parameters."""
-        return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical(self.words).values())
-
-    def physical(self, words: Mapping[str, Any]) -> dict[str, Any]:
-        """Those of parameters by name that are not of the noise."""
-        return {name: word for name, word in words.items() if not name.startswith("noise.")}
+        """Whether the data identify every one of these."""
+        return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical.values())
 
     @property
     def resolved(self) -> bool:
@@ -157,15 +166,15 @@ def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
     positive = used.values > 0.0
     described, noise, discrepancy = True, math.nan, None
     if likelihood:
-        offsets = np.abs(np.asarray(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted), float))
+        offsets = np.abs(np.asarray(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted), float))
         significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > options.significance
         described = not (significant and float(np.median(offsets)) > options.misfit)
         if positive.any():
-            sigma = np.asarray(fit.problem.call(Density.sigma_at, fit.vector, used.values))
+            sigma = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, used.values))
             noise = float(np.median(sigma[positive] / used.values[positive]))
     fitted = fit.problem.build(fit.vector).correlation
     if likelihood and fitted is not None:
-        remaining = np.asarray(fit.problem.call(Density.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
+        remaining = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
         whole = float(np.sum(offsets**2))
         discrepancy = fitted, 1.0 - float(np.sum(remaining**2)) / whole if whole > 0.0 else 0.0
     return Assessment(
@@ -248,36 +257,39 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
     return words
 
 
+# ---- statements ----
+
+
 class Statement(NamedTuple):
-    """A sentence, and what it claims of "errors", "residuals", "noise" and so on, in a word each."""
+    """A sentence, and what it claims of which topic, in a word each."""
 
     sentence: str
-    claims: Mapping[str, str]
+    claims: Mapping[str, str] = {}
 
 
-def _say(sentence: str, **claims: str) -> Statement:
-    return Statement(sentence, claims)
+def opening(f: Assessment) -> list[Statement]:
+    """The verdict: how well the model describes the data, what the errors mean, and what the data identify."""
+    return [_description(f), _errors(f), _parameters(f)]
 
 
-def description(f: Assessment) -> Statement:
-    """First sentence of the verdict: how well the model describes the data."""
-    near, expected = "None of the measurements is above zero", _expected(f)
+def _description(f: Assessment) -> Statement:
+    near, chi_square = "None of the measurements is above zero", f"(reduced chi-square {f.ratio:.3g})"
     if f.misfit is not None:
         half, most = (in_words(factor, f.options) for factor in f.misfit)
         which = "stack without model discrepancy" if f.discrepancy else "model"
         near = f"Half of the {f.count:,} measurements are within {half} of the {which}, 95 % within {most}"
     if not f.likelihood:
-        return _say(f"{near}; the objective is {f.objective}, which has no noise model to judge this by.")
+        return Statement(f"{near}; the objective is {f.objective}, which has no noise model to judge this by.")
     if not f.described:
-        return _say(not_described(f), description="no")
+        return Statement(not_described(f), {"description": "no"})
     if f.large:
-        what = f"which {expected} does not explain"
-        return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="no", size="large")
+        words = f"{near}, which {f.expectation} does not explain {chi_square}."
+        return Statement(words, {"description": "no", "size": "large"})
     if f.small:
-        what = f"closer than {expected} predicts"
-        return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="yes", size="small")
-    what = f"as {expected} predicts"
-    return _say(f"{near}, {what} (reduced chi-square {f.ratio:.3g}).", description="yes", size="expected")
+        words = f"{near}, closer than {f.expectation} predicts {chi_square}."
+        return Statement(words, {"description": "yes", "size": "small"})
+    words = f"{near}, as {f.expectation} predicts {chi_square}."
+    return Statement(words, {"description": "yes", "size": "expected"})
 
 
 def not_described(f: Assessment) -> str:
@@ -288,47 +300,47 @@ def not_described(f: Assessment) -> str:
     return f"This stack does not describe the sample: median misfit {median}, stated noise {100.0 * f.noise:.2g} %."
 
 
-def errors(f: Assessment) -> Statement:
-    """Second sentence of the verdict: what the standard errors mean."""
+def _errors(f: Assessment) -> Statement:
     if not f.converged:
         words = "The fit did not converge: values are the best found, not a minimum, and have no valid errors."
-        return _say(words, errors="invalid")
+        return Statement(words, {"errors": "invalid"})
     if not f.likelihood:
-        return _say("The errors are scaled by the remaining scatter and are only indicative.", errors="indicative")
+        words = "The errors are scaled by the remaining scatter and are only indicative."
+        return Statement(words, {"errors": "indicative"})
     if not f.described:
         words = "Values and standard errors hold only within this model, which does not describe the data."
-        if f.discrepancy is not None:
+        if f.discrepancy:
             words = "The standard errors include the model discrepancy, and hold only if it accounts for the misfit."
-        return _say(words, errors="conditional", description="no")
+        return Statement(words, {"errors": "conditional", "description": "no"})
     if f.alternatives:
-        others = "Another local minimum" if f.alternatives == 1 else f"{f.alternatives} other local minima"
-        words = f"{others} of the same model {'fits' if f.alternatives == 1 else 'fit'} equally well"
-        return _say(f"{words}: the standard errors are those of the best one only, sampling covers all.", errors="one")
-    if f.error_factor != 1.0:
-        parts = [f"{f.size:.2g} for the size of the {_residuals(f)}"] if f.size != 1.0 else []
+        others = "Another local minimum of the same model fits"
+        if f.alternatives > 1:
+            others = f"{f.alternatives} other local minima of the same model fit"
+        words = f"{others} equally well: the standard errors are those of the best one only, sampling covers all."
+        return Statement(words, {"errors": "one minimum"})
+    size, correlation = f.error_factors
+    if size * correlation != 1.0:
+        parts = [f"{size:.2g} for the size of the {f.which}"] if size != 1.0 else []
         if f.correlated:
-            effective = max(1.0, f.structure.count * f.independent_share)
-            parts.append(
-                f"{f.independent_share**-0.5:.2g} for their correlation: {f.structure.count} of them are equivalent to "
-                f"{effective:.0f} independent ones"
-            )
+            count = f.structure.count
+            words = f"{count} of them are equivalent to {max(1.0, count / correlation**2):.0f} independent ones"
+            parts.append(f"{correlation:.2g} for their correlation: {words}")
         wrong, factor = ("small", f.error_factor) if f.error_factor > 1.0 else ("large", 1.0 / f.error_factor)
         words = f"The standard errors are too {wrong} by a factor of about {factor:.2g} ({' times '.join(parts)})."
-        return _say(words, errors=f"too {wrong}", residuals="misfit")
-    if f.discrepancy is not None:
-        return _say("The standard errors include the model discrepancy.", errors="valid", residuals="as assumed")
-    if f.noise_assumed:
+        return Statement(words, {"errors": f"too {wrong}", "residuals": "misfit"})
+    words = "The standard errors follow from the stated noise."
+    if f.discrepancy:
+        words = "The standard errors include the model discrepancy."
+    elif f.noise_assumed:
         words = f"The standard errors are proportional to the noise, assumed to be {100.0 * DEFAULT_RELATIVE:g} %."
-        return _say(words, errors="valid", residuals="as assumed")
-    return _say("The standard errors follow from the stated noise.", errors="valid", residuals="as assumed")
+    return Statement(words, {"errors": "valid", "residuals": "as assumed"})
 
 
-def parameters(f: Assessment) -> Statement:
-    """Third sentence of the verdict: which parameters the data do not identify, and why."""
-    words = f.physical(f.words)
+def _parameters(f: Assessment) -> Statement:
+    words = f.physical
     if f.identified:
         every = "every parameter" if len(words) == len(f.words) else "every parameter of the stack"
-        return _say(f"The data identify {every}.", parameters="all")
+        return Statement(f"The data identify {every}.", {"parameters": "all"})
     directions = [one for one in f.unidentified if any(_weak(one, name) for name in words)]
     parts = [f"{not_identified(one)}{' (and more)' if directions[1:] else ''}" for one in directions[:1]]
     for begins, what in (
@@ -341,7 +353,7 @@ def parameters(f: Assessment) -> Statement:
         names = [name for name, word in words.items() if word.startswith(begins)]
         if names:
             parts.append(f"{listed(names)} {'is' if len(names) == 1 else 'are'} {what}")
-    return _say(f"{'; '.join(parts)}.", parameters="not all")
+    return Statement(f"{'; '.join(parts)}.", {"parameters": "not all"})
 
 
 def not_identified(direction: Direction) -> str:
@@ -363,99 +375,79 @@ def remarks(f: Assessment) -> list[Statement]:
         term, absorbed = f.discrepancy
         amplitude, exponent = 100.0 * float(term.amplitude), float(term.grazing_exponent)
         grazing = f" at normal incidence, {amplitude * 2.0**exponent:.2g} % at 60°" if exponent > 0.0 else ""
-        found.append(
-            _say(
-                f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales "
-                f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)."
-                f" It absorbs {100.0 * absorbed:.3g} % of the residual sum of squares."
-            )
+        lengths = (
+            f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)"
         )
+        words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales {lengths}."
+        found.append(Statement(f"{words} It absorbs {100.0 * absorbed:.3g} % of the residual sum of squares."))
     if not f.resolved:
         error = numerical_error(f.numerical_error)
-        found.append(_say(f"The numerical error of the model is {error}: a finer resolution may give other values."))
+        words = f"The numerical error of the model is {error}: a finer resolution may give other values."
+        found.append(Statement(words))
     for name, least in f.limits.items():
         words = f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved."
-        found.append(_say(words, parameters="not all"))
+        found.append(Statement(words, {"parameters": "not all"}))
     for name, (roughness, shift) in f.limited.items():
         words = (
             f"{name} is limited by the instrument with {roughness}: up to that width it shifts by {shift:.2g} of its"
         )
-        found.append(_say(f"{words} standard errors.", parameters="not all"))
+        found.append(Statement(f"{words} its standard errors.", {"parameters": "not all"}))
     return found
 
 
 def residuals(f: Assessment) -> list[Statement]:
     """Whether the residuals are what the noise model predicts; with a discrepancy, all is about the whitened ones."""
-    which, expected, structure, found = _residuals(f), _expected(f), f.structure, []
+    which, structure = f.which, f.structure
     if f.likelihood:
-        chance = math.sqrt(2.0 / max(f.freedom, 1))
         of = " of the whitened residuals" if f.discrepancy else ""
-        found.append(
-            _say(
-                f"The reduced chi-square{of} is {f.ratio:.3g} with {f.freedom} degrees of freedom; the true model and "
-                f"noise give 1 ± {chance:.2g}."
-            )
-        )
+        words = f"The reduced chi-square{of} is {f.ratio:.3g} with {f.freedom} degrees of freedom; the true model and"
+        found = [Statement(f"{words} noise give 1 ± {math.sqrt(2.0 / max(f.freedom, 1)):.2g}.")]
         if f.large:
-            found.append(_say(f"The {which} are larger than {expected} predicts.", size="large", residuals="misfit"))
+            words = f"The {which} are larger than {f.expectation} predicts."
+            found.append(Statement(words, {"size": "large", "residuals": "misfit"}))
         elif f.small and f.correlated:
-            words = f"The {which} are smaller than {expected} predicts, but correlated."
-            found.append(_say(words, size="small", residuals="misfit"))
+            words = f"The {which} are smaller than {f.expectation} predicts, but correlated."
+            found.append(Statement(words, {"size": "small", "residuals": "misfit"}))
         elif f.small:
-            words = f"The {which} are smaller than {expected} predicts: sigma is too large, or holds a common error."
-            found.append(_say(words, size="small", residuals="misfit", noise="too large"))
-        else:
-            found.append(_say(f"The size of the {which} is what {expected} predicts.", size="expected"))
-    else:
-        found.append(_say("Residuals are in units of their own scatter: a named residual has no noise model."))
-    if math.isfinite(structure.lag_one):
-        found.append(
-            _say(
-                f"Neighbouring {which} are correlated by {structure.lag_one:+.2f} ± {structure.pairs**-0.5:.2g} "
-                f"({structure.pairs} pairs); their root mean square is {structure.rms:.2f}. Independent ones of unit "
-                "variance have 0 and 1."
+            words = (
+                f"The {which} are smaller than {f.expectation} predicts: sigma is too large, or holds a common error."
             )
-        )
+            found.append(Statement(words, {"size": "small", "residuals": "misfit", "noise": "too large"}))
+        else:
+            found.append(Statement(f"The size of the {which} is what {f.expectation} predicts.", {"size": "expected"}))
+    else:
+        found = [Statement("Residuals are in units of their own scatter: a named residual has no noise model.")]
+    if math.isfinite(structure.lag_one):
+        words = f"correlated by {structure.lag_one:+.2f} ± {structure.pairs**-0.5:.2g} ({structure.pairs} pairs)"
+        words = f"Neighbouring {which} are {words}; their root mean square is {structure.rms:.2f}."
+        found.append(Statement(f"{words} Independent ones of unit variance have 0 and 1."))
     if f.correlated:
-        words = "Correlated residuals come from structure that the model lacks, or from a smooth calibration error."
-        found.append(_say(words, residuals="misfit"))
-    if len(structure.by_incidence) > 1:
-        worst = structure.worst
-        words = f"The worst incidence is {worst.theta:g}°: root mean square {worst.rms:.2f} sigma"
-        found.append(_say(f"{words}, mean {worst.mean:+.2f} sigma."))
-    words = f"{structure.beyond_three:.1%} of the {which} are beyond 3 sigma (normal distribution: 0.3 %); their"
-    distance = f"{structure.normal_distance:.2f}"
-    return [*found, _say(f"{words} Kolmogorov-Smirnov distance from the unit normal distribution is {distance}.")]
+        words = "Correlated residuals come from structure that is not in the model, or from a smooth calibration error."
+        found.append(Statement(words, {"residuals": "misfit"}))
+    words = f"{structure.beyond_three:.1%} of the {which} are beyond 3 sigma (normal distribution: 0.3 %)."
+    return [*found, Statement(words)]
 
 
 def identification(f: Assessment) -> list[Statement]:
-    """What the data identify: directions of parameter space, insensitive parameters and those at a bound."""
-    limit, found = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range", []
-    if f.insensitive:
-        words = f"Insensitive: {', '.join(f.insensitive)}. The data do not depend on them."
-        found.append(_say(words))
+    """What the data identify: directions of parameter space, and parameters at a bound."""
+    limit = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range"
+    words = f"The standard error along every principal direction of parameter space is at most {limit}."
+    found = [Statement(words, {"directions": "all"})]
     if f.unidentified:
         words = f"{len(f.unidentified)} of {len(f.words)} principal directions of parameter space have a standard error"
-        found.append(_say(f"{words} above {limit}; there, priors dominate.", directions="not all"))
-    else:
-        words = "The standard error along every principal direction of parameter space is at most"
-        found.append(_say(f"{words} {limit}.", directions="all"))
+        found = [Statement(f"{words} above {limit}; there, priors dominate.", {"directions": "not all"})]
     if f.at_bound:
-        found.append(
-            _say(
-                f"At a bound: {', '.join(f.at_bound)}. The best value may lie beyond it. Parameters at a bound have no "
-                "standard error; the other errors are conditional on them."
-            )
-        )
+        words = f"At a bound: {', '.join(f.at_bound)}. The best value may lie beyond it. Parameters at a bound have no"
+        found.append(Statement(f"{words} standard error; the other errors are conditional on them."))
     return found
 
 
-def _residuals(f: Assessment) -> str:
-    return "whitened residuals" if f.discrepancy else "residuals"
+def sentences(statements: Iterable[Statement]) -> list[str]:
+    """The sentences of statements."""
+    return [one.sentence for one in statements]
 
 
-def _expected(f: Assessment) -> str:
-    return "the fitted covariance" if f.discrepancy else "the stated noise"
+# ---- what is said of a fit ----
 
 
 class Verdict(NamedTuple):
@@ -469,15 +461,11 @@ class Verdict(NamedTuple):
 def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
     """How well the model describes the data, what the errors mean, and what the data identify."""
     facts = facts or assess(fit)
-    opening = [description(facts), errors(facts), parameters(facts)]
-    sound = opening[0].claims.get("description") == "yes" and opening[1].claims["errors"] == "valid"
+    three = opening(facts)
+    claims = {topic: claim for one in three for topic, claim in one.claims.items()}
     notes = [*sentences(remarks(facts)), *automatic_discrepancy(fit), *noise_statements(fit.problem)]
-    return Verdict(sentences(opening), notes, sound and facts.identified and facts.resolved)
-
-
-def sentences(statements: Iterable[Statement]) -> list[str]:
-    """The sentences of statements."""
-    return [one.sentence for one in statements]
+    sound = claims.get("description") == "yes" and claims["errors"] == "valid" and facts.identified and facts.resolved
+    return Verdict(sentences(three), notes, sound)
 
 
 def summary(fit: "Fit") -> list[str]:
@@ -496,10 +484,10 @@ def automatic_discrepancy(fit: "Fit") -> list[str]:
     found = fit.without_discrepancy
     if found is None:
         return []
+    correlation = f"{found.residual_autocorrelation:+.2f} ({found.pairs} pairs; reduced chi-square"
     return [
         "The discrepancy term was added automatically because, with independent noise, neighbouring residuals correlate"
-        f" by {found.residual_autocorrelation:+.2f} ({found.pairs} pairs; reduced chi-square "
-        f"{ratio_without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
+        f" by {correlation} {ratio_without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
     ]
 
 
@@ -508,7 +496,7 @@ def ratio_without_discrepancy(fit: "Fit") -> float:
     if fit.without_discrepancy is not None:
         square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
     else:
-        square = float(np.sum(np.square(fit.problem.call(Density.offsets_at, fit.vector, fit.predicted))))
+        square = float(np.sum(np.square(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted))))
         freedom = fit.degrees_of_freedom
     return square / freedom if freedom > 0 else math.nan
 
@@ -519,26 +507,22 @@ def noise_statements(problem: "Problem") -> list[str]:
     if problem.objective != "likelihood":
         return []
     if problem.noise_is_assumed:
-        found = None if isinstance(used, Totals) else repeats(used)
         words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
-        if found is not None and found.noise > 0.0:
-            return [
-                f"{words} {found.count:,} repeated measurements scatter by about {100.0 * found.noise:.2g} %: "
-                f"`relative = {found.noise:.2g}` under [noise], or `--noise` of a search, states that."
-            ]
-        return [
-            f"{words} State it as `relative` under [noise], or `--noise` of a search; with start, low and high it is "
-            "fitted."
-        ]
+        found = None if isinstance(used, Totals) else repeats(used)
+        if found is None or not found.noise > 0.0:
+            where = "`relative` under [noise], or `--noise` of a search"
+            return [f"{words} State it as {where}; with start, low and high it is fitted."]
+        scatter = f"{found.count:,} repeated measurements scatter by about {100.0 * found.noise:.2g} %"
+        where = f"`relative = {found.noise:.2g}` under [noise], or `--noise` of a search, states that."
+        return [f"{words} {scatter}: {where}"]
     if used.sigma is None or not noise.use_sigma or noise.relative in (None, 0):
         return []
-    positive = used.values > 0.0
-    median = float(np.median(used.sigma[positive] / used.values[positive])) if positive.any() else math.nan
-    own = f", {100.0 * median:.2g} % in the median" if positive.any() else ""
+    share = used.sigma[used.values > 0.0] / used.values[used.values > 0.0]
+    own = f", {100.0 * float(np.median(share)):.2g} % in the median" if share.size else ""
     more = "a fitted relative part" if is_free(noise.relative) else f"relative = {noise.relative:g}"
     return [
         f"Noise: the data's own sigma{own}, and {more}, added in quadrature. Leave `relative` out if sigma holds it "
-        "already; `use_sigma = false` leaves sigma out."
+        "already; `use_sigma = false` ignores sigma."
     ]
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fits._lazy import shown_by
 from fits.optimise.result import Fit
-from fits.problem.discrepancy.logarithm import logarithm
+from fits.problem.discrepancy import logarithm
 from fits.problem.model import Model
 from fits.sampling.chain import Chain
 from fits.sampling.convergence import Convergence, after_burn_in

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from fits.optimise.identifiability import square
-from fits.optimise.uncertainty import local_information
+from fits.optimise.uncertainty import local_information, square
 from fits.problem.problem import Problem
 
 OPEN = 0.1  # boxes: a posterior that is wider may bend

@@ -7,8 +7,7 @@ from typing import Any
 
 import layerjax as lj
 from fits.problem.parameters import Free, LogUniform
-from fits.problem.toml import stack_from_dict
-from fits.problem.values import check_keys, read_tables, require_table
+from fits.problem.stack_file import check_keys, read_tables, require_table, stack_from_dict
 
 Structure = tuple[str, ...]
 """Names of layers from top to bottom, and of the base."""
@@ -30,17 +29,15 @@ class Library:
         for kind, parts in (("base", self.bases), ("layer", self.layers)):
             if not parts:
                 raise ValueError(f"library: it has no {kind}; it must have at least one")
-        twice = sorted(set(self.layers) & set(self.bases))
-        if twice:
-            raise ValueError(f"library: {twice[0]!r} names a layer and a base")
+        files: dict[str, str] = {}
         for name in (*self.layers, *self.bases):
             if not name or any(sign in name for sign in "/\\+") or name.startswith("."):
                 raise ValueError(f"library: {name!r} is no name; it must have no slash, no + and no dot in front")
-        files: dict[str, str] = {}
-        for name in (*self.layers, *self.bases):
             other = files.setdefault(name.replace(" ", "-").casefold(), name)
             if other != name:
                 raise ValueError(f"library: {other!r} and {name!r} are one name as files; they must differ by letters")
+        if twice := sorted(set(self.layers) & set(self.bases)):
+            raise ValueError(f"library: {twice[0]!r} names a layer and a base")
 
     def stack(self, structure: Structure) -> lj.Stack:
         """The stack with these layers over this base."""
@@ -102,24 +99,20 @@ def read_library(path: str | Path) -> Library:
         layers = require_table("layers", tables.get("layers", {}))
         bases = require_table("bases", tables.get("bases", {}))
         return Library(
-            layers={name: _layer(name, table) for name, table in layers.items()},
-            bases={name: _base(name, table) for name, table in bases.items()},
+            layers={name: _part(f"layers.{name}", {"layers": [table]}).layers[0] for name, table in layers.items()},
+            bases={name: _part(f"bases.{name}", _whole(table)) for name, table in bases.items()},
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _layer(name: str, table: Any) -> lj.Interface | lj.Medium:
-    try:
-        return stack_from_dict({"layers": [table]}).layers[0]
-    except ValueError as error:
-        raise ValueError(str(error).replace("layers[0]", f"layers.{name}")) from None
+def _whole(table: Any) -> Any:
+    """The table of a base as that of a stack."""
+    return table if isinstance(table, dict) and {"layers", "base"} & set(table) else {"base": table}
 
 
-def _base(name: str, table: Any) -> lj.Stack:
-    where = f"bases.{name}"
-    whole = {"layers", "base"} & set(require_table(where, table))
+def _part(where: str, table: Any) -> lj.Stack:
     try:
-        return stack_from_dict(table if whole else {"base": table})
+        return stack_from_dict(table)
     except ValueError as error:
-        raise ValueError(f"{where}: {error}" if whole else str(error).replace("base", where, 1)) from None
+        raise ValueError(f"{where}: {error}") from None

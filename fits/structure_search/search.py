@@ -9,25 +9,25 @@ predict as well as one that lacks one.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fits._files import named as errors_named
 from fits.data.measurements import Measurements
-from fits.optimise.discrepancy import needs_discrepancy, undecided, without_discrepancy
-from fits.optimise.fit import fit_problem, fit_with_discrepancy
+from fits.optimise.fit import fit as run_fit
+from fits.optimise.fit import fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
+from fits.optimise.options import DEFAULT, FitOptions
 from fits.optimise.result import Fit
-from fits.prediction.cross_validation import CrossValidation
-from fits.prediction.evidence import Evidence
-from fits.prediction.model_scores import ModelScore, out_of_sample, rank_models
+from fits.prediction.cross_validation import CrossValidation, ModelScore, out_of_sample, rank_models
+from fits.prediction.importance import Evidence
 from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
@@ -59,6 +59,7 @@ class SearchOptions:
         bic_gain: a level that does not predict better is followed by another if it lowers the BIC by more than this.
         budget: minutes after which no stack is begun any more, but those that a result needs; what was begun is
             finished. None: without end.
+        fit: tolerances and thresholds of each fit, of which some decide on a model discrepancy.
     """
 
     layers: int = 3
@@ -67,6 +68,7 @@ class SearchOptions:
     cross_validated: int = 3
     bic_gain: float = 10.0
     budget: float | None = None
+    fit: FitOptions = DEFAULT
 
     def __post_init__(self) -> None:
         most = {"layers": (0, 6), "starts": (1, math.inf), "beam": (1, math.inf), "cross_validated": (1, math.inf)}
@@ -78,6 +80,7 @@ class SearchOptions:
             number = getattr(self, name)
             if number is not None and not 0.0 <= number < math.inf:
                 raise ValueError(f"{name} is {in_short(number)}; it must be a finite number of at least 0")
+        require_kind("fit", self.fit, FitOptions)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +165,7 @@ def search(
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit and every held-out incidence as it is finished: a search that was killed, or whose
+        directory: keeps every fit and cross-validation as it is finished: a search that was killed, or whose
             budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
@@ -174,116 +177,114 @@ def search(
     require_kind("noise", noise, Noise, None)
     require_kind("options", options, SearchOptions, None)
     library = default_library(len(data.channels)) if library is None else library
-    options = SearchOptions() if options is None else options
-    settings = {
-        "transport": transport,
-        "noise": Noise() if noise is None else noise,
-        "scale": scale,
-        "instrument": instrument,
-    }
-    with ExitStack() as stack:
-        store = None
-        if directory is not None:
-            used, directory = data.used(), Path(directory)
-            numbers = [used.wi, used.wo, used.values, used.sigma]
-            whose = fingerprint(data=numbers, library=library, **settings, starts=options.starts, seed=seed)
-            if holds_other_files(directory, STORE):
-                raise ValueError(f"{directory}: is not empty, and holds no search")
-            with errors_named(directory):
-                directory.mkdir(parents=True, exist_ok=True)
-            store = stack.enter_context(Store.open(directory / STORE, whose))
-        run = _Run(data, library, settings, options, seed, store, progress or silent)
-        return run.searched()
+    options = options or SearchOptions()
+    settings = {"transport": transport, "noise": noise or Noise(), "scale": scale, "instrument": instrument}
+    until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
+    used = data.used()
+    numbers = [used.wi, used.wo, used.values, used.sigma]
+    # how far it goes is no part of whose search it is: one may go on where another has ended
+    starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
+    whose = fingerprint(data=numbers, library=library, **settings, **starting)
+    with nullcontext() if directory is None else _opened(Path(directory), whose) as store:
+        work = _Work(data, library, settings, options, seed, store, until, progress or silent)
+        coarse: dict[Structure, Fit] = {}
+        full: dict[Structure, _CrossValidated] = {}
+        level: list[Structure] = [(base,) for base in library.bases]
+        stopped = False
+        while level and not stopped:
+            leader, lowest = _ranked(full)[:1], min(map(_bic, coarse.values()), default=math.inf)
+            if leader and time.monotonic() > until:
+                stopped = True
+                break
+            # every structure of the level with independent noise, at a coarse resolution
+            coarse |= work.in_parallel(f"{len(level[0]) - 1} layers", work.fit_coarsely, level)
+            fitted = sorted((one for one in level if one in coarse), key=lambda one: _bic(coarse[one]))
+            # those of the lowest BIC as `fits.fit` fits them, cross-validated
+            chosen = fitted[: options.cross_validated]
+            full |= work.in_parallel("cross-validation", partial(work.cross_validate, coarse), chosen)
+            stopped = len(fitted) < len(level) or any(one not in full for one in chosen)
+            # a level that neither predicts better nor lowers the BIC clearly is the last
+            ahead = not leader or _scores(full)[named(leader[0])].clear_diff > 0.0
+            if not ahead and not min(map(_bic, coarse.values())) < lowest - options.bic_gain:
+                break
+            by_bic = sorted(coarse, key=lambda one: _bic(coarse[one]))
+            grown = _neighbours(library, dict.fromkeys(_ranked(full)[:1] + by_bic[: options.beam]), options.layers)
+            level = [one for one in grown if one not in coarse]
+        work.progress("cross-validation", 1, 1, "")
+    return _result(coarse, full, options, stopped)
 
 
-class _HeldOut(dict[str, tuple[NDArray[np.float64], bool]]):
-    """Log-densities of the incidences that were held out of a fit so far, kept in a store: see `cross_validate`."""
+class _CrossValidated(NamedTuple):
+    """A fit at full resolution, its cross-validation and its evidence."""
 
-    def __init__(self, store: Store, key: str, fit: Fit):
-        self._store, self._key, self._whose = store, key, fingerprint(fit=fit.vector)
-        kept = store.get(key)
-        super().__init__(kept["groups"] if kept is not None and kept["fit"] == self._whose else {})
-
-    def __setitem__(self, name: str, found: tuple[NDArray[np.float64], bool]) -> None:
-        super().__setitem__(name, found)
-        self._store.put(self._key, {"fit": self._whose, "groups": dict(self)})
+    fit: Fit
+    checked: CrossValidation
+    evidence: Evidence
 
 
-@dataclass
-class _Run:
-    """A search at work: what was fitted and cross-validated so far."""
+@contextmanager
+def _opened(directory: Path, whose: Mapping[str, str]) -> Iterator[Store]:
+    """The store of a search in its directory, which is made if it is not there."""
+    if holds_other_files(directory, STORE):
+        raise ValueError(f"{directory}: is not empty, and holds no search")
+    with errors_named(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+    with Store.open(directory / STORE, whose) as store:
+        yield store
+
+
+class _Work(NamedTuple):
+    """What the fits of a search have in common."""
 
     data: Measurements
     library: Library
-    settings: dict[str, Any]
+    settings: Mapping[str, Any]
     options: SearchOptions
     seed: int
     store: Store | None
+    until: float
     progress: Progress
-    coarse: dict[Structure, Fit] = field(default_factory=dict)
-    full: dict[Structure, tuple[Fit, CrossValidation, Evidence]] = field(default_factory=dict)
 
-    def searched(self) -> Search:
-        """Level by level, as long as a level predicts better than those before, or lowers the BIC clearly."""
-        options, stopped = self.options, False
-        until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
-        level: list[Structure] = [(base,) for base in self.library.bases]
-        while level and not stopped:
-            before, lowest = self.ranked()[:1], self.lowest_bic()
-            if before and time.monotonic() > until:
-                stopped = True
-                break
-            self.coarse |= self._in_parallel(f"{len(level[0]) - 1} layers", self._coarse_fit, level, until)
-            fitted = [one for one in level if one in self.coarse]
-            chosen = sorted(fitted, key=self.bic)[: options.cross_validated]
-            self.full |= self._in_parallel("cross-validation", self._cross_validated, chosen, until)
-            stopped = len(fitted) < len(level) or any(one not in self.full for one in chosen)
-            ahead = not before or self.model_scores()[named(before[0])].clear_diff > 0.0
-            if not ahead and not self.lowest_bic() < lowest - options.bic_gain:
-                break
-            level = self._next_level()
-        self.progress("cross-validation", 1, 1, "")
-        return replace(self.result(), stopped=stopped)
-
-    def _coarse_fit(self, structure: Structure) -> Fit:
+    def fit_coarsely(self, structure: Structure) -> Fit:
         """The fit with independent noise at a coarse resolution."""
+        return self._load_or_fit(
+            structure, "", lambda: self._fit(self._problem(structure, independent=True), screen=True)
+        )
+
+    def cross_validate(self, coarse: Mapping[Structure, Fit], structure: Structure) -> _CrossValidated:
+        """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
 
         def fitted() -> Fit:
-            problem = self._problem(structure)
-            problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed, screen=True)
+            problem, options = self._problem(structure), self.options
+            if not undecided(problem):
+                return self._fit(problem)
+            if needs_discrepancy(without_discrepancy(coarse[structure]), options.fit):
+                return fit_with_discrepancy(
+                    problem, coarse[structure], starts=options.starts, seed=self.seed, options=options.fit
+                )
+            return self._fit(self._problem(structure, independent=True))
 
-        return self._kept(structure, "", fitted)
+        fit = self._load_or_fit(structure, "+full", fitted)
+        kept = None if self.store is None else self.store.get(named(structure))
+        if kept is not None:
+            checked = kept["cross-validation"]
+            checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
+            return _CrossValidated(fit, CrossValidation(**checked), Evidence(**kept["evidence"]))
+        found = _CrossValidated(fit, *out_of_sample(fit))
+        if self.store is not None:
+            record = {"cross-validation": vars(found.checked), "evidence": vars(found.evidence)}
+            self.store.put(named(structure), record)
+        return found
 
-    def _cross_validated(self, structure: Structure) -> tuple[Fit, CrossValidation, Evidence]:
-        """As `fits.fit` fits it, with each incidence held out, and its evidence."""
+    def _problem(self, structure: Structure, independent: bool = False) -> Problem:
+        problem = Problem(self.library.stack(structure), self.data, **self.settings)
+        return replace(problem, noise=replace(problem.noise, discrepancy=False)) if independent else problem
 
-        def fitted() -> Fit:
-            problem, coarse = self._problem(structure), self.coarse[structure]
-            if undecided(problem) and needs_discrepancy(without_discrepancy(coarse)):
-                return fit_with_discrepancy(problem, coarse, starts=self.options.starts, seed=self.seed)
-            if undecided(problem):
-                problem = replace(problem, noise=replace(problem.noise, discrepancy=False))
-            return fit_problem(problem, starts=self.options.starts, seed=self.seed)
+    def _fit(self, problem: Problem, screen: bool = False) -> Fit:
+        options = self.options
+        return run_fit(problem, starts=options.starts, seed=self.seed, options=options.fit, screen=screen)
 
-        fit = self._kept(structure, "+full", fitted)
-        if self.store is None:
-            return fit, *out_of_sample(fit)
-        name = named(structure)
-        stored = self.store.get(name)
-        if stored is None:
-            checked, evidence = out_of_sample(fit, done=_HeldOut(self.store, f"{name}: held out", fit))
-            self.store.put(name, {"cross-validation": vars(checked), "evidence": vars(evidence)})
-        else:
-            kept = stored["cross-validation"]
-            checked = CrossValidation(**kept | {"groups": tuple(kept["groups"]), "rows": tuple(kept["rows"])})
-            evidence = Evidence(**stored["evidence"])
-        return fit, checked, evidence
-
-    def _problem(self, structure: Structure) -> Problem:
-        return Problem(self.library.stack(structure), self.data, **self.settings)
-
-    def _kept(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
+    def _load_or_fit(self, structure: Structure, kind: str, fitted: Callable[[], Fit]) -> Fit:
         """The fit of a structure, from its result directory if it is there."""
         if self.store is None:
             return fitted()
@@ -293,10 +294,10 @@ class _Run:
         save_fit(found := fitted(), path)
         return found
 
-    def _in_parallel(
-        self, stage: str, call: Callable[[Structure], Result], structures: list[Structure], until: float
+    def in_parallel(
+        self, stage: str, call: Callable[[Structure], Result], structures: list[Structure]
     ) -> dict[Structure, Result]:
-        """What the call gives by structure, of the first few whatever the time, of the others until then.
+        """What the call gives by structure: of the first few whatever the time, of the others while there is any.
 
         Several run at a time, since compiling one keeps a single core busy; none runs while programs are thrown away.
         """
@@ -304,58 +305,58 @@ class _Run:
         self.progress(stage, 0, len(structures), named(structures[0]))
         with ThreadPoolExecutor(several) as pool:
             for first in range(0, len(structures), several):
-                if first and time.monotonic() > until:
+                if first and time.monotonic() > self.until:
                     break
                 make_room()
                 some = structures[first : first + several]
-                for structure, found in zip(some, pool.map(call, some), strict=True):
-                    results[structure] = found
+                for structure, result in zip(some, pool.map(call, some), strict=True):
+                    results[structure] = result
                     self.progress(stage, len(results), len(structures), named(structure))
         return results
 
-    def _next_level(self) -> list[Structure]:
-        """Structures not fitted before, with a layer more or less than the best by score and by BIC."""
-        grown: list[Structure] = []
-        best = self.ranked()[:1] + sorted(self.coarse, key=self.bic)[: self.options.beam]
-        for structure in dict.fromkeys(best):
-            above, base = structure[:-1], structure[-1]
-            grown += [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
-            if len(above) < self.options.layers:
-                places = range(len(above) + 1)
-                grown += [(*above[:at], layer, *above[at:], base) for at in places for layer in self.library.layers]
-        different = [one for one in grown if all(a != b for a, b in pairwise(one))]
-        return [one for one in dict.fromkeys(different) if one not in self.coarse]
 
-    def bic(self, structure: Structure) -> float:
-        """BIC of the fit with independent noise."""
-        fit = self.coarse[structure]
-        return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
+def _neighbours(library: Library, structures: Iterable[Structure], most: int) -> list[Structure]:
+    """Structures with a layer more or less than one of these, and at most so many; none twice in a row."""
+    neighbours: list[Structure] = []
+    for *above, base in structures:
+        neighbours += [(*above[:place], *above[place + 1 :], base) for place in range(len(above))]
+        if len(above) < most:
+            places = range(len(above) + 1)
+            neighbours += [(*above[:at], layer, *above[at:], base) for at in places for layer in library.layers]
+    return list(dict.fromkeys(one for one in neighbours if all(a != b for a, b in pairwise(one))))
 
-    def lowest_bic(self) -> float:
-        """Lowest BIC of all that was fitted so far."""
-        return min(map(self.bic, self.coarse), default=np.inf)
 
-    def ranked(self) -> list[Structure]:
-        """What was cross-validated, best first."""
-        return sorted(self.full, key=lambda one: -self.full[one][1].elpd)
+def _bic(fit: Fit) -> float:
+    """Bayesian information criterion of a fit with independent noise."""
+    return len(fit.vector) * float(np.log(fit.problem.count)) - 2.0 * fit.log_likelihood
 
-    def model_scores(self) -> dict[str, ModelScore]:
-        """Scores side by side, best first."""
-        close = {named(one): self.full[one] for one in self.ranked()}
-        return rank_models(
-            {name: checked for name, (_, checked, _) in close.items()},
-            {name: found for name, (*_, found) in close.items()},
-        )
 
-    def result(self) -> Search:
-        """All that was fitted, ranked."""
-        model_scores, lowest = self.model_scores(), self.lowest_bic()
-        rest = sorted((one for one in self.coarse if one not in self.full), key=self.bic)
-        candidates = []
-        for one in (*self.ranked(), *rest):
-            fit = self.full[one][0] if one in self.full else self.coarse[one]
-            bic = self.bic(one) - lowest
-            candidates.append(Candidate(one, len(fit.vector), bic, fit, model_scores.get(named(one))))
-        best = candidates[0].name
-        near = tuple(name for name, one in model_scores.items() if name != best and one.clear_diff <= 0.0)
-        return Search(tuple(candidates), near, self.options)
+def _ranked(full: Mapping[Structure, _CrossValidated]) -> list[Structure]:
+    """What was cross-validated, best first."""
+    return sorted(full, key=lambda one: -full[one].checked.elpd)
+
+
+def _scores(full: Mapping[Structure, _CrossValidated]) -> dict[str, ModelScore]:
+    """Scores side by side by name, best first."""
+    ranked = {named(one): full[one] for one in _ranked(full)}
+    return rank_models(
+        {name: one.checked for name, one in ranked.items()}, {name: one.evidence for name, one in ranked.items()}
+    )
+
+
+def _result(
+    coarse: Mapping[Structure, Fit],
+    full: Mapping[Structure, _CrossValidated],
+    options: SearchOptions,
+    stopped: bool,
+) -> Search:
+    """All that was fitted, ranked."""
+    scores, bic = _scores(full), {structure: _bic(fit) for structure, fit in coarse.items()}
+    candidates = []
+    for structure in (*_ranked(full), *sorted((one for one in coarse if one not in full), key=bic.__getitem__)):
+        fit = full[structure].fit if structure in full else coarse[structure]
+        above = bic[structure] - min(bic.values())
+        candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
+    best = candidates[0].name
+    near = tuple(name for name, one in scores.items() if name != best and one.indistinguishable)
+    return Search(tuple(candidates), near, options, stopped)

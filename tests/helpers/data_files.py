@@ -1,4 +1,4 @@
-"""A small file of every format that is read: its name, and what makes it."""
+"""Files of every format that is read: small ones by what makes them, and any text as one."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +12,13 @@ from tests.helpers.places import ROOT
 
 COATINGS = ROOT / "examples" / "arizona_black_coatings"
 PAINT = lj.Stack([], lj.Lambertian(0.4))
+
+
+def written(folder: Path, text: str | bytes, name: str) -> Path:
+    """A file of this name that holds the text."""
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return path
 
 
 def csv(folder: Path) -> bytes:

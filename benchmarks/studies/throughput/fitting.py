@@ -20,7 +20,6 @@ from benchmarks.measuring.repeats import fit_many
 from benchmarks.measuring.timing import interleaved
 from benchmarks.measuring.writing import Bar, figure, table
 from benchmarks.suite.scenes import pairs
-from fits.optimise.fit import fit_problem
 
 Floats = NDArray[np.float64]
 
@@ -133,13 +132,13 @@ def one_fit(problem: fits.Problem, size: Size) -> list[Row]:
     values = np.asarray(problem.data.values)
     seconds = interleaved(
         {
-            "fit": lambda: fit_problem(problem, starts=1).vector,
+            "fit": lambda: fits.fit(problem, starts=1).vector,
             "solver": lambda: fit_many(problem, values[None]).vectors,
             "scipy": lambda: scipy_fit(problem, values).x,
         },
         size.rounds * 3,
     )
-    ours, theirs = fit_problem(problem, starts=1), scipy_fit(problem, values)
+    ours, theirs = fits.fit(problem, starts=1), scipy_fit(problem, values)
     note = f"cost {ours.cost:.4f} in {ours.iterations} steps, scipy {theirs.cost:.4f} in {theirs.nfev} (+ differences)"
     rows = []
     for way, name, bar in (
@@ -177,7 +176,7 @@ def many_fits(problem: fits.Problem, size: Size) -> Row:
 
 def posterior(problem: fits.Problem, size: Size) -> Row:
     """Effective samples a second of `fits.sample`, until it stops by itself, beside emcee on the numpy likelihood."""
-    fit = fit_problem(problem, starts=1)
+    fit = fits.fit(problem, starts=1)
     fits.sample(fit, walkers=WALKERS, max_steps=100, allow_unconverged=True)
     chain = _NumpyChain(problem, fit)
     rounds = max(size.rounds // 2, 2)

@@ -1,11 +1,11 @@
 """Readers and writers of measured BSDFs, one file format a module.
 
-`read` takes any of them, looks at the content first and at the name last, and gives `fits.Measurements`.
+`read_file` takes any of them, looks at the content first and at the name last, and gives `fits.Measurements`.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any
 
 from fits._files import require_file
 from fits.data.formats import (
@@ -26,9 +26,11 @@ from fits.data.formats import (
 )
 from fits.data.formats._text import without_mark
 from fits.data.formats.csv import write_csv as write_csv
-from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
-from fits.names import FORMATS, Quantity, Strata
+from fits.names import FORMATS, Quantity
+
+if TYPE_CHECKING:
+    from fits.data.reading import ReadOptions
 
 _QUANTITY_GIVEN: dict[
     str, Callable[[Path, Quantity], Measurements]
@@ -53,95 +55,55 @@ _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but hav
 }
 
 
-def read(
-    path: str | Path,
-    format: str | None = None,
-    quantity: str | None = None,
-    *,
-    geometry: Geometry | None = None,
-    lookup: str = "centre",
-    bins: int | Literal["all"] | None = None,
-    strata: Strata = "bins",
-    seed: int = 0,
-    wavelengths: tuple[float, float] | None = None,
-    corrected: bool | None = None,
-) -> Measurements:
-    """Read a measurement file: CSV, MERL, RGL, Zemax, LightTools, Speos, WINDOW XML, FRED, ASTM, pab, ALTA, SSDD, iad.
-
-    Args:
-        path: the file.
-        format: "csv", "totals" (a CSV with shares of light, which gives `Totals`), "rxt" (the totals of a slab, see
-            `read_slab`), "merl", "rgl", "zemax", "lighttools", "klems" and "tensortree" (both are XML of WINDOW and
-            Radiance), "fred", "astm" (E1392), "pab", "alta", "speos" or "ssdd"; None finds out from the content.
-        quantity: what the numbers in the file are: "brdf", f in 1/sr; "brdf_cos", f |cos theta_o|; or
-            "reflectance_factor", pi f. A CSV says so in its column names, and then this picks among them; Zemax,
-            LightTools, FRED and ASTM files hold "brdf" unless this says otherwise; ALTA files that do not say what they
-            hold need it; all others say it themselves.
-        geometry: for MERL and RGL only, the directions to look up; None: of MERL the default `slices`, of RGL the
-            directions at which the file has values.
-        lookup: for MERL only, "centre" or "linear": see `fits.data.formats.merl.read`.
-        bins: for MERL and RGL only: so many bins, or nodes, from all over the table, at most 100,000, or "all".
-        strata: for MERL only, what each of these bins stands for an equal share of: "bins" of the table, or "flux",
-            the projected solid angle of light and viewer.
-        seed: of their choice.
-        wavelengths, corrected: for iad's files only: see `read_slab`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: on one line, which names the file and, where there is one, line, column, value and allowed range.
-    """
-    path = Path(path)
-    checked = check_quantity(quantity)
+def read_file(path: Path, options: "ReadOptions") -> Measurements:
+    """All that a file holds; errors as of `fits.read`."""
+    quantity = check_quantity(options.quantity)
     require_file(path)
-    kind = sniff(path) if format is None else format
-    if kind not in ("merl", "rgl") and (geometry is not None or bins is not None):
-        raise ValueError(f"{path}: geometry and bins apply to MERL and RGL files only, this is a {kind} file")
-    if kind != "merl" and (lookup != "centre" or strata != "bins"):
-        raise ValueError(f"{path}: lookup and strata apply to MERL files only, this is a {kind} file")
-    if kind != "rxt" and not (wavelengths is None and corrected is None):
-        raise ValueError(f"{path}: wavelengths and corrected apply to rxt files only, this is a {kind} file")
-    if kind in ("totals", "rxt") and checked is not None:
-        raise ValueError(f"{path}: quantity is {checked!r}, a {kind} file holds shares of the light")
+    kind = sniff(path) if options.format is None else options.format
+    applying: dict[tuple[str, ...], dict[str, Any]] = {
+        ("merl", "rgl"): {"geometry": None, "bins": None},
+        ("merl",): {"lookup": "centre", "strata": "bins"},
+        ("rxt",): {"wavelengths": None, "corrected": None},
+    }
+    if options.strata != "bins" and options.bins in (None, "all"):
+        raise ValueError(f"{path}: strata is given without a number of bins")
+    for kinds, defaults in applying.items():
+        if kind not in kinds and any(getattr(options, name) != default for name, default in defaults.items()):
+            files = " and ".join(one if one == "rxt" else one.upper() for one in kinds)
+            raise ValueError(f"{path}: {' and '.join(defaults)} apply to {files} files only, this is a {kind} file")
     try:
-        if kind == "rxt":
-            return rxt.read_slab(path, wavelengths=wavelengths, corrected=corrected).totals
-        return _read_as(kind, path, checked, geometry, lookup, bins, strata, seed)
+        return _read_as(kind, path, quantity, options)
     except ValueError as error:
         if str(error).startswith(str(path)):
             raise
         raise ValueError(f"{path}: {error}") from None  # of numbers that do not go together
 
 
-def _read_as(
-    kind: str,
-    path: Path,
-    checked: Quantity | None,
-    geometry: Geometry | None,
-    lookup: str,
-    bins: int | Literal["all"] | None,
-    strata: Strata,
-    seed: int,
-) -> Measurements:
+def _read_as(kind: str, path: Path, quantity: Quantity | None, options: "ReadOptions") -> Measurements:
+    always: dict[str, str | None] = {"totals": None, "rxt": None, "merl": "brdf", "rgl": "brdf_cos"}
+    if quantity is not None and quantity != always.get(kind, quantity):
+        held = "holds shares of the light" if always[kind] is None else f"always holds {always[kind]!r}"
+        name = kind if always[kind] is None else kind.upper()
+        raise ValueError(f"{path}: quantity is {quantity!r}, {'an' if kind == 'rgl' else 'a'} {name} file {held}")
     if kind == "csv":
-        return csv.read(path, checked)
+        return csv.read(path, quantity)
     if kind == "totals":
         return totals_csv.read(path)
+    if kind == "rxt":
+        return rxt.read_slab(path, wavelengths=options.wavelengths, corrected=options.corrected).totals
     if kind == "merl":
-        if checked not in (None, "brdf"):
-            raise ValueError(f"{path}: quantity is {checked!r}, a MERL file always holds 'brdf'")
-        return merl.read(path, geometry=geometry, lookup=lookup, bins=bins, strata=strata, seed=seed)
+        choice: dict[str, Any] = {"bins": options.bins, "strata": options.strata, "seed": options.seed}
+        return merl.read(path, geometry=options.geometry, lookup=options.lookup, **choice)
     if kind == "rgl":
-        if checked not in (None, "brdf_cos"):
-            raise ValueError(f"{path}: quantity is {checked!r}, an RGL file always holds 'brdf_cos'")
-        return rgl.read(path, geometry=geometry, bins=bins, seed=seed)
+        return rgl.read(path, geometry=options.geometry, bins=options.bins, seed=options.seed)
     if kind in _QUANTITY_GIVEN:
-        return _QUANTITY_GIVEN[kind](path, checked or "brdf")
+        return _QUANTITY_GIVEN[kind](path, quantity or "brdf")
     if kind == "alta":
-        return alta.read(path, checked)
+        return alta.read(path, quantity)
     if kind in _QUANTITY_STATED:
         found = _QUANTITY_STATED[kind](path)
-        if checked not in (None, found.source.quantity):
-            raise ValueError(f"{path}: quantity is {checked!r}, this {kind} file says {found.source.quantity!r}")
+        if quantity not in (None, found.source.quantity):
+            raise ValueError(f"{path}: quantity is {quantity!r}, this {kind} file says {found.source.quantity!r}")
         return found
     raise ValueError(f"format is {kind!r}, must be one of {', '.join(FORMATS)}")
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
+from matplotlib.patches import Circle
 
 from fits.data.scans import Incidence, in_plane, incidences, relative_azimuth, signed_angle
 from fits.data.totals import KINDS, Totals
@@ -28,7 +28,7 @@ INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
-COARSE = 20.0  # degrees between neighbours on a map from which it shows points
+DISC = 24_000.0  # square points that all points of a map have together
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 MOST_NAMES = 12  # of channels along an axis; of more, some
 MOST_CHANNELS = 6  # in one picture, evenly spaced among all
@@ -56,15 +56,14 @@ def data_picture(data: "Measurements") -> Figure:
 
     Of more than six channels some are shown, evenly spaced and with both ends.
     """
-    shown_channels = np.unique(np.linspace(0, len(data.channels) - 1, MOST_CHANNELS).round().astype(int))
-    data = data.of_channels([data.channels[place] for place in shown_channels])
+    data = data.of_channels(evenly_spaced(data.channels, MOST_CHANNELS))
     shown = chosen(incidences(data))
     maps = mapped(data, shown)
     with mpl.rc_context(STYLE):
         plots = 1 if in_plane(data).any() else 0
-        heights = [3.6] * plots + [map_height(data, maps, 2.0)] * bool(maps)
-        figure = Figure(figsize=(9.5, sum(heights)), layout="constrained")
-        parts = np.ravel(figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False))
+        sizes = [3.6] * plots + [2.6] * bool(maps)
+        figure = Figure(figsize=(9.5, sum(sizes)), layout="constrained")
+        parts = np.ravel(figure.subfigures(len(sizes), 1, height_ratios=sizes, squeeze=False))
         if plots:
             _curves(parts[0].subplots(1, data.values.shape[1], sharey=True, squeeze=False)[0], data, shown)
             parts[0].supxlabel(ANGLE_LABEL, fontsize="medium")
@@ -89,7 +88,7 @@ def _curves(panels: Sequence[Axes], data: "Measurements", shown: list[Incidence]
             draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
         value_axis(axes, data.values[flat], value_label(data, channel))
     if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(loc="upper right", ncols=2 if len(shown) > 4 else 1)
+        panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
 
 
 def value_label(data: "Measurements", channel: int) -> str:
@@ -97,18 +96,21 @@ def value_label(data: "Measurements", channel: int) -> str:
     return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
 
 
-def chosen(every: list[Incidence]) -> list[Incidence]:
-    """At most `MOST_INCIDENCES` of the incidences, evenly spaced and with both ends."""
-    if len(every) <= MOST_INCIDENCES:
-        return every
-    return [every[index] for index in np.round(np.linspace(0, len(every) - 1, MOST_INCIDENCES)).astype(int)]
+def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
+    """At most so many of the items, evenly spaced and with both ends."""
+    return [items[place] for place in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def chosen(all_incidences: list[Incidence]) -> list[Incidence]:
+    """At most `MOST_INCIDENCES` of the incidences."""
+    return evenly_spaced(all_incidences, MOST_INCIDENCES)
 
 
 def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
     """The incidences among `shown` whose viewers leave the plane of incidence enough to draw a map, at most four."""
     off_plane = ~in_plane(data) & data.mask
     spread = [incidence for incidence in shown if np.count_nonzero(off_plane[incidence.rows]) >= 10]
-    return spread if len(spread) <= 4 else [spread[i] for i in np.round(np.linspace(0, len(spread) - 1, 4)).astype(int)]
+    return evenly_spaced(spread, 4) if spread else []
 
 
 def draw_points(
@@ -174,56 +176,21 @@ def hemisphere_map(
 ) -> ScalarMappable:
     """Draws `values` (N,) of one incidence over the viewer's hemisphere: forward to the right, rings every 30 degrees.
 
-    What is NaN, or not positive on a logarithmic scale, is left blank; measurements too far apart for a surface between
-    them are drawn as points.
+    Points are as large as there is room between them; what is NaN, or not positive on a logarithmic scale, is blank.
     """
     rows = incidence.rows[np.isfinite(values[incidence.rows])]
     rows = rows[values[rows] > 0.0] if isinstance(norm, LogNorm) else rows
     radius = np.minimum(data.theta_o, 180.0 - data.theta_o)[rows]  # transmission is drawn from below
     azimuth = np.radians(relative_azimuth(data)[rows])
+    size = np.clip(DISC / max(len(rows), 1), 1.0, 30.0)
     x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
-    surface = _surface(x, y)
-    image: ScalarMappable
-    if surface is None:
-        image = axes.scatter(x, y, c=values[rows], norm=norm, cmap=colours, s=10.0, linewidths=0.0)
-    else:
-        image = axes.tripcolor(surface, values[rows], norm=norm, cmap=colours, shading="gouraud")
-    below, above = _halves(data, incidence)
-    turn = np.linspace(-np.pi if below else 0.0, np.pi if above else 0.0, 181)
+    image = axes.scatter(x, y, c=values[rows], norm=norm, cmap=colours, s=size, linewidths=0.0)
     for ring in (30.0, 60.0, 90.0):
-        axes.plot(ring * np.cos(turn), ring * np.sin(turn), color=GREY, linewidth=0.5)
+        axes.add_patch(Circle((0.0, 0.0), ring, fill=False, color=GREY, linewidth=0.5))
     axes.plot([-incidence.theta], [0.0], "*", color="white", markeredgecolor=INK, markersize=8, clip_on=False)
-    axes.set_aspect("equal")
-    axes.set_xlim(-94.0, 94.0)
-    axes.set_ylim(-94.0 if below else -8.0, 94.0 if above else 8.0)
+    axes.set(aspect="equal", xlim=(-94.0, 94.0), ylim=(-94.0, 94.0), title=f"{incidence.label} (light: star)")
     axes.set_axis_off()
-    axes.set_title(f"{incidence.label} (light: star)")
     return image
-
-
-def map_height(data: "Measurements", shown: list[Incidence], full: float) -> float:
-    """Height for a row of maps: `full` for whole discs, less where every one of them is half a disc."""
-    return full if any(all(_halves(data, incidence)) for incidence in shown) else 0.5 * full + 0.4
-
-
-def _halves(data: "Measurements", incidence: Incidence) -> tuple[bool, bool]:
-    side = np.sin(np.radians(relative_azimuth(data)[incidence.rows]))
-    return bool(side.min() < -0.1), bool(side.max() > 0.1)
-
-
-def _surface(x: np.ndarray, y: np.ndarray) -> Triangulation | None:
-    """Triangles between neighbours on a map, in degrees; None for points on a line or too far apart."""
-    points = np.stack([x, y], axis=-1)
-    if len(points) < 3 or np.linalg.matrix_rank(points - points.mean(axis=0), tol=1.0) < 2:
-        return None
-    corners = Triangulation(x, y)
-    sides = points[corners.triangles] - points[np.roll(corners.triangles, 1, axis=1)]
-    longest = np.linalg.norm(sides, axis=-1).max(axis=-1)
-    if np.quantile(longest, 0.75) > COARSE:
-        return None
-    # a triangle with a side much longer than is usual spans what was not measured, such as the retro cone
-    corners.set_mask(longest > 2.5 * np.quantile(longest, 0.75))
-    return corners
 
 
 def ordered_colours(count: int) -> list[str]:
@@ -250,7 +217,7 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
     """
     from scipy import stats
 
-    from fits.data.neighbours import autocorrelation
+    from fits.data.scans import autocorrelation
     from fits.reports.diagnostics import residual_structure
 
     structure = residual_structure(data, residuals)
@@ -263,17 +230,10 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
         axes = panels["angle"]
         axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
         for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-            angle, values = signed_angle(data)[incidence.rows], residuals[incidence.rows]
-            for channel in range(values.shape[1]):
-                axes.plot(
-                    angle,
-                    values[:, channel],
-                    "o",
-                    markersize=2.5,
-                    color=colour,
-                    markeredgewidth=0,
-                    label=None if channel else incidence.label,
-                )
+            rows = incidence.rows
+            angle = np.repeat(signed_angle(data)[rows], residuals.shape[1])
+            points: dict[str, Any] = {"markersize": 2.5, "markeredgewidth": 0.0, "label": incidence.label}
+            axes.plot(angle, residuals[rows].ravel(), "o", color=colour, **points)
         axes.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
         axes.legend(ncols=len(shown), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
 
@@ -283,22 +243,19 @@ def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) ->
         bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
         axes.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
         axes.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
-        axes.set(
-            xlabel=label, ylabel="density", title=f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}"
-        )
+        title = f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}"
+        axes.set(xlabel=label, ylabel="density", title=title)
         axes.legend(loc="upper right")
 
         axes = panels["lags"]
         correlation = autocorrelation(data, residuals)
-        lags = np.arange(1, len(correlation) + 1)
-        axes.bar(lags, correlation, color=CYCLE[0], width=0.7)
+        axes.bar(np.arange(1, len(correlation) + 1), correlation, color=CYCLE[0], width=0.7)
         if structure.pairs:
             noise = 2.0 / np.sqrt(structure.pairs)
             axes.axhspan(-noise, noise, color="#dddddd", zorder=0, label="white noise, 95 %")
             axes.legend(loc="upper right")
-        axes.set(
-            xlabel="lag, measurements in one plane", ylabel="correlation", ylim=(-1.0, 1.0), title="Neighbours in angle"
-        )
+        axes.set(xlabel="lag, measurements in one plane", ylabel="correlation", ylim=(-1.0, 1.0))
+        axes.set_title("Neighbours in angle")
         axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(5.0))
     return figure
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from fits.data.geometry import Floats, direction
 from fits.data.scans import Incidence, in_plane, incidences, signed_angle
 from fits.prediction.predict import with_discrepancy
-from fits.problem.model import Density
+from fits.problem.model import Model
 from fits.reports.diagnostics import bsdf, misfit, misfit_label, over_all_rows
 from fits.reports.plots.data import (
     ANGLE_LABEL,
@@ -24,7 +24,6 @@ from fits.reports.plots.data import (
     chosen,
     draw_points,
     hemisphere_map,
-    map_height,
     mapped,
     value_axis,
     value_label,
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from fits.prediction.predict import Prediction
     from fits.sampling.posterior import Posterior
 
-BAND_DRAWS = 200  # posterior draws behind an interval
+INTERVAL_DRAWS = 200  # posterior draws behind an interval
 STEEPEST = 89.9  # degrees: in the tangent plane every BRDF of a stack is 0
 STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # measurements that make a panel
@@ -94,16 +93,12 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
             upper.set_title(incidence.label)
             upper.tick_params(labelbottom=False)
-            lower.set_ylabel(_residual_label(first) if column == 0 else "")
+            unit = r"$\sigma$" if first.is_posterior else "scatter"
+            lower.set_ylabel(f"residual / {unit}" if column == 0 else "")
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside upper center", ncols=4)
     return figure
-
-
-def _residual_label(fit: "Fit") -> str:
-    words = r"residual / $\sigma$" if fit.is_posterior else "residual / scatter"
-    return f"{words}\nwith discrepancy" if fit.problem.noise.discrepancy else words
 
 
 def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
@@ -117,8 +112,7 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
     norm = value_norm(values[data.mask])
     limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
     with mpl.rc_context(STYLE):
-        height = map_height(data, shown, 2.4)
-        figure = Figure(figsize=(9.5, height * len(shown) + 0.3), layout="constrained")
+        figure = Figure(figsize=(9.5, 2.6 * len(shown) + 0.3), layout="constrained")
         panels = figure.subplots(len(shown), 3, squeeze=False)
         for row, incidence in zip(panels, shown, strict=True):
             image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
@@ -136,13 +130,11 @@ def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
 def _points(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
     fit = next(iter(fits.values()))
     data, sigma = fit.problem.data, over_all_rows(fit, assumed_sigma(fit))
-    used = data.mask[rows]
+    used, several = data.mask[rows], len(data.channels) > 1
+    what = r"data and assumed $\sigma$" if fit.is_posterior else "data"
     for channel, name in enumerate(data.channels):
-        several = len(data.channels) > 1
         colour = channel_colour(name, channel) if several and len(fits) == 1 else INK
-        what = r"data and assumed $\sigma$" if fit.is_posterior else "data"
-        label = f"{what}, {name}" if several else what
-        draw_points(axes, data, rows[used], channel, colour, label, sigma)
+        draw_points(axes, data, rows[used], channel, colour, f"{what}, {name}" if several else what, sigma)
         draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
 
 
@@ -177,10 +169,9 @@ def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
 
 def assumed_sigma(fit: "Fit") -> Floats:
     """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
-
     if not fit.is_posterior:
         return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call(Density.sigma_at, fit.vector, fit.predicted))
+    return np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
@@ -196,7 +187,7 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
         wo.append(direction(angle, incidence.phi + 180.0))
     vectors = fit.vector[None]
     if posterior is not None:
-        picked = np.linspace(0, len(posterior.samples) - 1, BAND_DRAWS).astype(int)
+        picked = np.linspace(0, len(posterior.samples) - 1, INTERVAL_DRAWS).astype(int)
         vectors = np.concatenate([vectors, np.asarray(posterior.samples)[picked]])
     towards = np.concatenate(wi), np.concatenate(wo)
     values = np.asarray(fit.problem.predict_at(vectors, *towards))
@@ -236,7 +227,7 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
                 axes.plot(angle[rows], used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
                 value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
                 axes.set_title(incidence.label if channel == 0 else "")
-            grid[-1, column].set_xlabel(ANGLE_LABEL)
+        figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure

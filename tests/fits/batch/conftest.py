@@ -1,11 +1,11 @@
-"""A folder of readings, and reports that cost nothing."""
+"""A folder of measurements, and reports that cost nothing."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fits.batch import fit_file
+from fits.batch import fit_file, fit_files
 from tests.helpers.coats import make_folder
 
 
@@ -13,9 +13,10 @@ from tests.helpers.coats import make_folder
 def no_pictures() -> Iterator[None]:
     """Other tests look at reports of single fits; in this process they are not drawn here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            fit_file, "write_report", lambda folder, *_: (folder / "report.html").write_text("drawn") and None
-        )
+        for module in (fit_file, fit_files):
+            patch.setattr(
+                module, "write_report", lambda folder, *_: (folder / "report.html").write_text("drawn") and None
+            )
         yield
 
 

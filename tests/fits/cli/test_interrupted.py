@@ -17,7 +17,7 @@ from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.optimise.result import Fit
 from fits.reports.plots.data import data_picture
-from fits.reports.results import load_fit, load_posterior, reserved, save_fit, save_posterior
+from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior, writing
 from fits.sampling.posterior import Posterior
 from fits.sampling.sample import load, sample
 from fits.store import Store
@@ -277,5 +277,5 @@ def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) 
         save_fit(coat_fit, directory)
     assert contents(directory) == before
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
-    with reserved(directory, force=True), pytest.raises(ValueError, match="in use"):
+    with writing(directory, force=True), pytest.raises(ValueError, match="in use"):
         save_fit(coat_fit, directory, force=True)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fits.data.formats import read
 from fits.data.geometry import Floats, direction
+from fits.data.reading import read
 
 RANDOM = np.random.default_rng(1)
 LIGHT = direction(RANDOM.uniform(1, 80, 40), RANDOM.uniform(-180, 180, 40))
@@ -49,25 +49,32 @@ def _relative(light: Floats, view: Floats) -> Floats:
     return np.stack([light[:, 2], view[:, 2], np.sum(light * view, axis=1), np.cross(light, view)[:, 2]], axis=1)
 
 
-def test_spherical_and_cartesian(tmp_path: Path) -> None:
+TURN = _around(VIEW) - _around(LIGHT)
+HALF = _rusinkiewicz()
+WHOLE = {
+    "SPHERICAL_TL_PL_TV_PV": np.stack([_polar(LIGHT), _around(LIGHT), _polar(VIEW), _around(VIEW)], axis=1),
+    "CARTESIAN": np.hstack([VIEW, LIGHT]),
+    "RUSIN_TH_PH_TD_PD": HALF,
+}
+UP_TO_A_TURN = {
+    "RUSIN_TH_TD_PD": HALF[:, [0, 2, 3]],
+    "ISOTROPIC_TL_TV_PROJ_DPHI": np.stack(
+        [_polar(LIGHT), _polar(VIEW) * np.cos(TURN), _polar(VIEW) * np.sin(TURN)], axis=1
+    ),
+    "ISOTROPIC_TV_TL_DPHI": np.stack([_polar(VIEW), _polar(LIGHT), -TURN], axis=1),  # from the view to the light
+}
+
+
+@pytest.mark.parametrize("coordinates", [*WHOLE, *UP_TO_A_TURN])
+def test_coordinates(tmp_path: Path, coordinates: str) -> None:
     values = np.arange(40.0)[:, None]
-    spherical = np.stack([_polar(LIGHT), _around(LIGHT), _polar(VIEW), _around(VIEW)], axis=1)
-    for coordinates, numbers in (("SPHERICAL_TL_PL_TV_PV", spherical), ("CARTESIAN", np.hstack([VIEW, LIGHT]))):
-        data = read(_file(tmp_path, coordinates, np.hstack([numbers, values])))
-        assert data.source.format == "alta"
-        np.testing.assert_allclose(data.wi, LIGHT, atol=1e-9)
-        np.testing.assert_allclose(data.wo, VIEW, atol=1e-9)
-        np.testing.assert_array_equal(data.values, values)
-
-
-def test_half_vectors(tmp_path: Path) -> None:
-    angles = _rusinkiewicz()
-    values = np.ones((40, 1))
-    data = read(_file(tmp_path, "RUSIN_TH_PH_TD_PD", np.hstack([angles, values])))
-    np.testing.assert_allclose(data.wi, LIGHT, atol=1e-9)
-    np.testing.assert_allclose(data.wo, VIEW, atol=1e-9)
-    data = read(_file(tmp_path, "RUSIN_TH_TD_PD", np.hstack([angles[:, [0, 2, 3]], values])))
+    numbers = (WHOLE | UP_TO_A_TURN)[coordinates]
+    data = read(_file(tmp_path, coordinates, np.hstack([numbers, values])))
+    assert data.source.format == "alta"
+    np.testing.assert_array_equal(data.values, values)
     np.testing.assert_allclose(_relative(data.wi, data.wo), _relative(LIGHT, VIEW), atol=1e-9)
+    if coordinates in WHOLE:
+        np.testing.assert_allclose([data.wi, data.wo], [LIGHT, VIEW], atol=1e-9)
 
 
 @pytest.mark.parametrize("coordinates", ["RUSIN_TH_TD", "COS_TH_TD", "COS_TH"])
@@ -81,17 +88,6 @@ def test_half_angles_alone(tmp_path: Path, coordinates: str) -> None:
     np.testing.assert_allclose(_polar(half), angles[:, 0], atol=1e-9)
     difference = np.arccos(np.clip(np.sum(half * data.wi, axis=1), -1, 1))
     np.testing.assert_allclose(difference, angles[:, 1] if angles.shape[1] == 2 else 0.0, atol=1e-7)
-
-
-def test_angles_of_view_and_light(tmp_path: Path) -> None:
-    turn = _around(VIEW) - _around(LIGHT)
-    values = np.ones((40, 1))
-    projected = np.stack([_polar(LIGHT), _polar(VIEW) * np.cos(turn), _polar(VIEW) * np.sin(turn)], axis=1)
-    data = read(_file(tmp_path, "ISOTROPIC_TL_TV_PROJ_DPHI", np.hstack([projected, values])))
-    np.testing.assert_allclose(_relative(data.wi, data.wo), _relative(LIGHT, VIEW), atol=1e-9)
-    plain = np.stack([_polar(VIEW), _polar(LIGHT), -turn], axis=1)  # from the view to the light, as ALTA has it
-    data = read(_file(tmp_path, "ISOTROPIC_TV_TL_DPHI", np.hstack([plain, values])))
-    np.testing.assert_allclose(_relative(data.wi, data.wo), _relative(LIGHT, VIEW), atol=1e-9)
 
 
 def test_what_numbers_are(tmp_path: Path) -> None:

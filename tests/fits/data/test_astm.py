@@ -1,20 +1,19 @@
 """ASTM E1392 tables: angles, columns and errors."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
+from tests.helpers import data_files
 
 HEAD = "ASTM 1\nDATE 4/8/1998\nSAMPLE Paint, blue\nNUM_POINTS 2\nVARS theta_i,phi_i,theta_s,phi_s"
 
 
-def _file(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "paint.astm"
-    path.write_text(text)
-    return path
+_file = partial(data_files.written, name="paint.astm")
 
 
 def test_by_hand(tmp_path: Path) -> None:

@@ -1,23 +1,22 @@
 """CSV: reading with all its conversions, writing, and errors that name the place."""
 
 import os
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read, write_csv
+from fits.data.formats import write_csv
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements, Source
+from fits.data.reading import read
+from tests.helpers import data_files
 from tests.helpers.places import COATINGS as DATA
 
 HEADER = "theta_i,phi_i,theta_o,phi_o,brdf"
 
 
-def _file(tmp_path: Path, text: str | bytes, name: str = "slices.csv") -> Path:
-    path = tmp_path / name
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return path
+_file = partial(data_files.written, name="slices.csv")
 
 
 def test_real_file_against_numpy():

@@ -1,4 +1,4 @@
-"""Every format, as programs and people leave files behind: each reads right, or is refused on one line."""
+"""Every format, as programs and people leave files behind, and damaged: each reads right, or is refused on one line."""
 
 import re
 from collections.abc import Callable
@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.measurements import LARGEST, Measurements
+from fits.data.reading import read
+from fits.names import FORMATS
 from tests.helpers.data_files import FILES
+from tests.helpers.mutations import mutated
 
 BINARY = ("merl", "rgl")
 TEXT = sorted(set(FILES) - set(BINARY))
@@ -35,11 +37,11 @@ def with_last_number(raw: bytes, number: str) -> bytes:
     return raw[: last.start()] + number.encode() + raw[last.end() :]
 
 
-def found(path: Path, raw: bytes) -> Measurements | None:
+def found(path: Path, raw: bytes, kind: str | None = None) -> Measurements | None:
     """What a file holds; None where it is refused on one line that names it."""
     path.write_bytes(raw)
     try:
-        return read(path)
+        return read(path, format=kind)
     except ValueError as error:
         words = str(error)
     assert words.startswith(str(path)), words
@@ -107,3 +109,21 @@ def test_binary_values_are_limited_too(made: Callable[[str], bytes], tmp_path: P
     if data is not None:
         assert np.abs(data.values).max() <= LARGEST
     assert found(tmp_path / FILES[kind][0], b"\xef\xbb\xbf" + raw) is None
+
+
+@pytest.mark.parametrize("kind", sorted(set(FILES) - {"totals", "rxt", "merl", "rgl"}))
+def test_whole_files_are_known_by_their_content(made: Callable[[str], bytes], tmp_path: Path, kind: str) -> None:
+    assert set(FILES) == set(FORMATS)
+    whole = found(tmp_path / "data.xyz", made(kind))
+    assert whole is not None
+    assert whole.source.format == kind
+
+
+@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize("count", [40, pytest.param(500, marks=pytest.mark.slow)])
+def test_damaged_files(made: Callable[[str], bytes], tmp_path: Path, kind: str, count: int) -> None:
+    raw, random = made(kind), np.random.default_rng(len(kind))
+    count = count if kind not in BINARY else count // 5
+    head = 4000 if kind == "zemax" else 400
+    read_again = [found(tmp_path / FILES[kind][0], mutated(raw, random, head), kind) for _ in range(count)]
+    assert any(one is None for one in read_again)

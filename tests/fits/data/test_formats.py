@@ -1,22 +1,20 @@
 """Choosing a reader, and FRED tables."""
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.formats._text import read_lines
 from fits.data.geometry import direction, slices
+from fits.data.reading import ReadOptions, read
 from fits.names import FORMATS
+from tests.helpers import data_files
 from tests.helpers.places import COATINGS as DATA
 
-
-def _file(tmp_path: Path, text: str | bytes, name: str = "table.txt") -> Path:
-    path = tmp_path / name
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return path
+_file = partial(data_files.written, name="table.txt")
 
 
 @pytest.mark.parametrize(
@@ -28,7 +26,7 @@ def _file(tmp_path: Path, text: str | bytes, name: str = "table.txt") -> Path:
     ],
 )
 def test_content_decides_and_not_the_name(tmp_path, name, format):
-    disguised = _file(tmp_path, (DATA / name).read_bytes(), "data.xyz")
+    disguised = _file(tmp_path, (DATA / name).read_bytes(), name="data.xyz")
     assert read(disguised).source.format == read(DATA / name).source.format == format
 
 
@@ -42,7 +40,7 @@ def test_content_decides_and_not_the_name(tmp_path, name, format):
 )
 def test_unknown_bsdf_files_say_what_was_seen(tmp_path, head, message):
     with pytest.raises(ValueError, match=message):
-        read(_file(tmp_path, head, "sample.bsdf"))
+        read(_file(tmp_path, head, name="sample.bsdf"))
 
 
 def test_bad_arguments(tmp_path):
@@ -123,3 +121,18 @@ def test_fred_by_hand(tmp_path):
 def test_bad_fred(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         read(_file(tmp_path, text))
+
+
+def test_keywords_and_options_are_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    rows = [f"{incidence},180,{theta},0,0.1" for incidence in (10, 50) for theta in range(0, 90, 10)]
+    path.write_text("\n".join(["theta_i,phi_i,theta_o,phi_o,brdf", *rows]))
+    given = {"max_polar_angle": 60.0, "select": ["incidence=10"]}
+    assert read(path, **given).used().values.shape == (7, 1)
+    np.testing.assert_array_equal(read(path, **given).mask, ReadOptions(**given).read(path).mask)
+    fitted, held_out = ReadOptions(hold_out=["incidence=50"]).split(path)
+    assert (len(fitted.used()), len(held_out.used())) == (9, 9)
+    with pytest.raises(ValueError, match="hold_out: it is for a fit"):
+        read(path, hold_out=["incidence=50"])
+    with pytest.raises(TypeError, match="bin"):
+        read(path, bin=4)

@@ -1,12 +1,14 @@
 """LightTools' dialect of the Zemax format: layout, sides, and errors."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
+from tests.helpers import data_files
 
 HEAD = """# a comment
 Symmetry {symmetry}
@@ -28,10 +30,7 @@ def _table(aoi=20, side="Front", kind="BRDF", more="", a=5) -> str:
     return TABLE.format(aoi=aoi, side=side, kind=kind, more=more, a=a)
 
 
-def _file(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "a.bsdf"
-    path.write_text(text)
-    return path
+_file = partial(data_files.written, name="a.bsdf")
 
 
 def test_by_hand(tmp_path: Path) -> None:

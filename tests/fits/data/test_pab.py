@@ -1,13 +1,15 @@
 """pab's goniophotometer texts: the example of Radiance's manual, its own reader, and errors."""
 
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import direction, slices
+from fits.data.reading import read
+from tests.helpers import data_files
 
 MANUAL = """#sample_name "a sample"
 #incident_angle 82.5 180
@@ -18,10 +20,7 @@ MANUAL = """#sample_name "a sample"
 """
 
 
-def _file(tmp_path: Path, text: str, name: str = "a.dat") -> Path:
-    path = tmp_path / name
-    path.write_text(text)
-    return path
+_file = partial(data_files.written, name="a.dat")
 
 
 def test_the_example_of_the_manual(tmp_path: Path) -> None:
@@ -83,11 +82,11 @@ def test_radiance_takes_the_azimuths_as_we_do(tmp_path: Path, monkeypatch: pytes
         rows = np.stack([geometry.theta_o, geometry.phi_o, value], axis=-1)
         head = f"#incident_angle {theta} 0\n#format: theta phi BSDF\n#upphi 90\n"
         body = "\n".join(" ".join(f"{number:.6g}" for number in row) for row in rows)
-        names.append(str(_file(tmp_path, f"{head}{body}\n", f"{theta:g}.dat")))
+        names.append(str(_file(tmp_path, f"{head}{body}\n", name=f"{theta:g}.dat")))
     found = subprocess.run(["pabopto2bsdf", "-s", "i", *names], check=True, capture_output=True).stdout
     (tmp_path / "a.sir").write_bytes(found)
     made = subprocess.run(["bsdf2ttree", "-g", "5", str(tmp_path / "a.sir")], check=True, capture_output=True)
-    theirs = read(_file(tmp_path, made.stdout.decode(), "a.xml"))
+    theirs = read(_file(tmp_path, made.stdout.decode(), name="a.xml"))
     ours = read(tmp_path / "40.dat")
 
     def off_plane(data) -> float:

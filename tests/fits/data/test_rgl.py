@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read, rgl
+from fits.data.formats import rgl
 from fits.data.formats._tensor_file import fields_as_bytes, read_fields
 from fits.data.formats.rgl_table import Table, read_table, table_as_bytes
 from fits.data.geometry import Floats, Geometry, slices
+from fits.data.reading import read
 
 
 def lambertian(albedo: Floats, azimuths: Floats | None = None, wavelengths: Floats | None = None) -> Table:

@@ -1,12 +1,15 @@
 """Input files of inverse adding-doubling: both ways to write them, and what is refused."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 import layerjax as lj
 from fits.cli.parser import main
-from fits.data.formats import read
 from fits.data.formats.rxt import SMOOTH, read_slab
+from fits.data.reading import read
+from tests.helpers import data_files
 
 SAMPLE = """\
 IAD1   # first four characters
@@ -24,10 +27,7 @@ IAD1   # first four characters
 BARE = SAMPLE.format(spheres=0)
 
 
-def written(tmp_path, text):
-    path = tmp_path / "slab.rxt"
-    path.write_text(text)
-    return path
+written = partial(data_files.written, name="slab.rxt")
 
 
 def test_rows_by_a_count(tmp_path):

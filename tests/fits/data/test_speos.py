@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.geometry import Floats
+from fits.data.reading import read
 from tests.helpers.places import ROOT
 
 GAUSSIAN = ROOT / "tests" / "data" / "gaussian_fresnel_30.anisotropicbsdf"

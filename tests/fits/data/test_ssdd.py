@@ -1,13 +1,15 @@
 """SSDD files: the examples of its specification, all coordinates, binary numbers, and errors."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
+from tests.helpers import data_files
 
 LAMBERTIAN = """VERSION 0.2
 
@@ -30,10 +32,7 @@ PARAM3_LIST 0 90 200
 """
 
 
-def _file(tmp_path: Path, text: str | bytes) -> Path:
-    path = tmp_path / "a.ssdd"
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return path
+_file = partial(data_files.written, name="a.ssdd")
 
 
 def _block(kind="brdf", colour="monochrome", system="spherical_coordinate_system", more="", mode="ascii") -> str:

@@ -3,14 +3,16 @@
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.formats import read
 from fits.data.formats.tensor_tree import boxes, disk, look_up, parse
 from fits.data.geometry import Floats
+from fits.data.reading import read
+from tests.helpers import data_files
 
 HEAD = "<?xml version='1.0'?>\n<WindowElement><Optical><Layer><DataDefinition><IncidentDataStructure>TensorTree{rank}"
 HEAD += "</IncidentDataStructure></DataDefinition>"
@@ -26,10 +28,7 @@ def _xml(rank: int, *parts: tuple[str, str, str]) -> str:
     return HEAD.format(rank=rank) + blocks + TAIL
 
 
-def _file(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "tree.xml"
-    path.write_text(text)
-    return path
+_file = partial(data_files.written, name="tree.xml")
 
 
 def test_boxes_by_hand() -> None:

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fits.data.formats import read, totals_csv, write_csv
+from fits.data.formats import totals_csv, write_csv
 from fits.data.geometry import direction
+from fits.data.reading import read
 from fits.data.totals import Totals
 
 HEADER = "theta_i,total_reflectance,total_reflectance_std,total_transmittance,total_transmittance_std"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fits.data.formats import read
+from fits.data.reading import read
 
 MATRIX = """<?xml version="1.0" encoding="UTF-8"?>
 <WindowElement xmlns="http://windows.lbl.gov"><Optical><Layer><DataDefinition>

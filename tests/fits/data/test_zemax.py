@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from fits.data.formats import read
 from fits.data.geometry import direction
+from fits.data.reading import read
 from tests.helpers.places import COATINGS as DATA
 
 SMALL = """# comment

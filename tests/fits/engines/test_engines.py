@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fits.engines import Failure, run, worker
+from fits.engines import Failure, run
 from fits.engines.processes import _death
 from tests.helpers import tasks
 from tests.helpers.places import ROOT
@@ -55,30 +55,18 @@ def test_a_single_thread_is_that_of_the_caller() -> None:
     assert list(found) == [(index, threading.get_ident()) for index in range(4)]
 
 
-def test_nothing_to_do_is_done_at_once(engine: dict[str, Any]) -> None:
+def test_what_is_refused_or_fails(engine: dict[str, Any]) -> None:
+    """A task that fails costs itself alone; a full disk and a mistake end the run, and a mistake says where it is."""
     assert list(run(tasks.square, 5, [], **engine)) == []
-
-
-def test_fewer_than_one_process_is_refused_before_anything_is_asked_for() -> None:
     with pytest.raises(ValueError, match="processes is 0; it must be at least 1"):
         run(tasks.square, 5, [1], processes=0)
-
-
-def test_a_task_that_fails_costs_itself_alone(engine: dict[str, Any]) -> None:
     found = dict(run(tasks.picky, None, [0, 1, 2, 5], **engine))
-    assert found[0] == 0
-    assert found[3] == 5
+    assert (found[0], found[3]) == (0, 5)
     assert found[1] == Failure("task is 1; it must not be")
     assert found[2] == Failure("there.csv: no such file or directory")
-
-
-def test_a_full_disk_ends_the_run(engine: dict[str, Any]) -> None:
-    with pytest.raises(OSError, match="No space left") as error:
+    with pytest.raises(OSError, match="No space left") as full:
         list(run(tasks.picky, None, [0, 3, 5], **engine))
-    assert (error.value.errno, error.value.filename) == (errno.ENOSPC, "full.csv")
-
-
-def test_a_mistake_ends_the_run_and_says_where(engine: dict[str, Any]) -> None:
+    assert (full.value.errno, full.value.filename) == (errno.ENOSPC, "full.csv")
     with pytest.raises(TypeError, match="a mistake in the code") as error:
         list(run(tasks.picky, None, [0, 4, 5], **engine))
     if engine:
@@ -152,21 +140,6 @@ def test_no_task_is_blamed_for_workers_that_are_killed_as_they_start(tmp_path: P
         thread.join()
 
 
-def test_a_worker_takes_away_what_its_parent_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Parent:
-        sentinel, theirs = multiprocessing.Pipe()
-
-    (tmp_path / "layerjax-abc").mkdir()
-    (tmp_path / "layerjax-abc" / "shared.pickle").write_text("large")
-    ended: list[int] = []
-    monkeypatch.setattr(worker, "parent_process", Parent)
-    monkeypatch.setattr(os, "_exit", ended.append)
-    Parent.theirs.close()  # it has been killed
-    worker._end_with_parent(str(tmp_path / "layerjax-abc" / "shared.pickle"))
-    assert ended == [1]
-    assert not list(tmp_path.iterdir())
-
-
 def test_whoever_leaves_the_loop_ends_the_workers_at_once(tmp_path: Path) -> None:
     found = run(tasks.slow, str(tmp_path), range(1000), processes=2)
     next(found)
@@ -189,7 +162,7 @@ def test_what_cannot_be_sent_is_named(engine: dict[str, Any]) -> None:
 
 
 def test_a_worker_is_set_as_its_parent_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Precision and compile cache; one core each, deaf to Ctrl-C; what is large goes by a file."""
+    """Precision and compile cache; one core each, deaf to Ctrl-C."""
     import jax
 
     large = np.arange(10_000.0)

@@ -13,9 +13,8 @@ from fits.data.measurements import Measurements
 from fits.maps.common import _Arrow, _step, common_names, fit_common, hold
 from fits.maps.descent import make_texels
 from fits.maps.options import MapOptions
-from fits.problem.discrepancy.parameters import Discrepancy
-from fits.problem.parameters import is_free
-from fits.problem.spectra import PowerLaw
+from fits.problem.discrepancy import Discrepancy
+from fits.problem.parameters import PowerLaw, is_free
 from fits.problem.stack_file import read_problem, write_problem
 from tests.helpers import quick_maps
 

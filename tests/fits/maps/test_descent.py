@@ -11,7 +11,7 @@ from fits.maps import descent
 from fits.maps.descent import blank_texel, make_texels, with_own_directions
 from fits.maps.options import USUAL
 from fits.maps.search import _program, linearise_all, search, solve, starts_at
-from fits.optimise.descent import COST_TOLERANCE, descend
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.problem.compilation import _run
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps

@@ -12,7 +12,7 @@ from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.maps.emulator import chebyshev, coarser, emulate, with_emulator
 from fits.maps.options import MapOptions
-from fits.problem.model import Density
+from fits.problem.model import Model
 
 TRANSPORT = lj.AddingDoubling(nodes=4, modes=4)
 ERROR = MapOptions.emulator_error
@@ -54,7 +54,7 @@ def test_values_are_those_of_the_transport_within_a_tenth_of_the_noise(problem, 
     ends = np.stack([problem.low, problem.high])
     for vector in (*vectors, *ends):
         exact, found = (np.asarray(one.predict(vector)) for one in (problem, emulator))
-        sigma = np.asarray(problem.call(Density.sigma_at, vector, problem.predict(vector)))
+        sigma = np.asarray(problem.call(Model.sigma_at, vector, problem.predict(vector)))
         assert np.max(np.abs(found - exact) / sigma) < 2.0 * ERROR  # at points that no check has seen
 
 

@@ -12,9 +12,7 @@ from fits.optimise import multi_start as starts_module
 from fits.optimise.fit import fit
 from fits.optimise.multi_start import Floats
 from fits.optimise.result import Fit
-from fits.problem.discrepancy.inducing_points import places
-from fits.problem.discrepancy.kernel import log_scales
-from fits.problem.discrepancy.parameters import Discrepancy
+from fits.problem.discrepancy import Discrepancy, log_scales, places
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
@@ -150,7 +148,7 @@ def test_a_killed_fit_goes_on_in_either_part(tmp_path, wrong: Fit, monkeypatch: 
 
 
 def test_a_result_directory_keeps_it(tmp_path, coat_fit: Fit) -> None:
-    from fits.optimise.discrepancy import without_discrepancy
+    from fits.optimise.fit import without_discrepancy
 
     problem = replace(coat_fit.problem, noise=Noise(relative=0.03, discrepancy=True))
     found = fit(problem.stack, problem.data, transport=problem.transport, noise=problem.noise, starts=1)

@@ -12,16 +12,18 @@ from scipy.optimize import least_squares
 import layerjax as lj
 from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
-from fits.optimise.descent import COST_TOLERANCE
-from fits.optimise.fit import fit, fit_problem, start_points
-from fits.optimise.identifiability import Direction
+from fits.optimise.fit import fit, start_points
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE
+from fits.optimise.options import FitOptions, options_from
+from fits.optimise.uncertainty import Direction
 from fits.problem.compilation import _run
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
+from fits.problem.stack_file import read_problem
 from fits.reports import verdicts
-from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, lobe, measured, noisy_lobe
+from tests.helpers.models import LINE, LOBE, LOBE_STACK, design, line, line_data, lobe, measured, noisy_lobe
 
 COUNT = 300
 
@@ -59,16 +61,15 @@ def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
     assert lobe_fit.reduced_chi_square == pytest.approx(1.0, abs=4 * np.sqrt(2 / 594))
     assert not lobe_fit.at_bound
     assert not any(combination.unconstrained for combination in lobe_fit.unidentified)
-
-
-def test_starts_are_counted(lobe_fit) -> None:
-    counts = [minimum.count for minimum in lobe_fit.minima]
-    costs = [minimum.cost for minimum in lobe_fit.minima]
-    assert costs == sorted(costs)
-    assert sum(counts) <= 16
-    assert counts[0] >= 4
+    # starts are counted
+    counts, costs = zip(*((minimum.count, minimum.cost) for minimum in lobe_fit.minima), strict=True)
+    assert list(costs) == sorted(costs)
+    assert 4 <= counts[0] <= sum(counts) <= 16
     assert f"{counts[0]} of 16 starts" in lobe_fit.status
     assert lobe_fit.minima[0].values == pytest.approx(lobe_fit.values)
+    # and the other solver finds the same minimum
+    other = fit(LOBE_STACK, data, transport=lobe, starts=2, solver="bounded")
+    assert np.all(np.abs(other.vector - lobe_fit.vector) < 0.02 * lobe_fit.errors)
 
 
 def test_new_data_do_not_recompile(lobe_fit) -> None:
@@ -120,11 +121,6 @@ def test_a_value_near_its_bound_is_not_at_it() -> None:
     result = fit({"a": Free(0.5, -1.0, free[0] + 2e-4), "b": Free(0.1, -1.0, 3.0)}, data, transport=line, starts=4)
     assert result.at_bound == ()
     np.testing.assert_allclose(result.vector, free, atol=1e-6)
-
-
-def test_the_bounded_solver_finds_the_same_minimum(lobe_fit) -> None:
-    other = fit(LOBE_STACK, noisy_lobe(0), transport=lobe, starts=2, solver="bounded")
-    assert np.all(np.abs(other.vector - lobe_fit.vector) < 0.02 * lobe_fit.errors)
 
 
 def test_a_product_leaves_its_direction_open() -> None:
@@ -303,13 +299,34 @@ def test_a_medium_over_a_base_is_recovered() -> None:
     assert [call[:3] for call in calls] == [("fit", done, 9) for done in range(1, 10)]
 
 
+TOML = 'transport = "SingleScattering"\n[base]\nkind = "Lambertian"\nalbedo = { start = 0.5, low = 0.0, high = 1.0 }\n'
+
+
+def test_a_stack_file_sets_thresholds(tmp_path) -> None:
+    path = tmp_path / "stack.toml"
+    for more, expected in (("[options]\nautocorrelation = 0.4\n", FitOptions(autocorrelation=0.4)), ("", FitOptions())):
+        path.write_text(TOML + more)
+        assert options_from(read_problem(path).options) == expected
+
+
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [({"starts": 0}, "starts is 0; it must be at least 1"), ({"solver": "newton"}, "solver is 'newton'")],
+    ("call", "message"),
+    [
+        (lambda: fit(LINE, line_data(), transport=line, starts=0), "starts is 0; it must be at least 1"),
+        (lambda: fit(LINE, line_data(), transport=line, solver="newton"), "solver is 'newton'"),
+        (lambda: fit(LINE), "data is None"),
+        (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number above 0"),
+        (lambda: FitOptions(numerical_error="small"), r"FitOptions.numerical_error is 'small'; it must be a number"),
+        (lambda: FitOptions(autocorrelation=np.inf), r"FitOptions.autocorrelation is inf"),
+        (
+            lambda: options_from({"tolerance": 1.0}),
+            r"\[options\] has an unknown key 'tolerance'; it must be one of same",
+        ),
+    ],
 )
-def test_refused(options: dict, message: str) -> None:
+def test_refused(call, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        fit_problem(Problem(LINE, noisy_line(1.0, 0.5), line), **options)
+        call()
 
 
 def test_jaxopt_and_the_sampler_wait_until_it_is_needed() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fits.optimise.identifiability import unidentified_directions
+from fits.optimise.uncertainty import unidentified_directions
 
 
 def test_a_sum_that_alone_is_known_is_told_from_its_parts() -> None:

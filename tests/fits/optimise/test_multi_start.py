@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.data.formats import read
 from fits.data.geometry import slices
+from fits.data.reading import read
 from fits.optimise import multi_start as starts_module
-from fits.optimise.bounded import cost_and_gradient
 from fits.optimise.fit import fit
-from fits.optimise.multi_start import LEAST_GAIN, multi_start, start_points, starts_store
+from fits.optimise.multi_start import LEAST_GAIN, cost_and_gradient, multi_start, start_points, starts_store
 from fits.optimise.result import OUTCOMES
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free
-from fits.problem.priors import LogUniform
+from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.problem.stack_file import read_problem

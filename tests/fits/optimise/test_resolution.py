@@ -11,7 +11,6 @@ from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import slices
 from fits.data.scans import incidences, signed_angle
 from fits.optimise import multi_start as starts_module
-from fits.optimise import refinement
 from fits.optimise import resolution as resolution_module
 from fits.optimise.fit import fit
 from fits.optimise.options import DEFAULT
@@ -22,7 +21,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 from fits.problem.simulate import simulate
 from fits.reports import results, verdicts
-from fits.reports.html import page
+from fits.reports.html import FitReport
 from fits.reports.plots.model import curves_picture
 from tests.helpers.models import LINE, TRUTH, line, line_data
 
@@ -119,7 +118,7 @@ def test_a_result_keeps_its_resolution(refined, tmp_path):
 
 def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
     found, _ = refined
-    text = page(found, None, {})
+    text = FitReport(found).page()
     assert f"AddingDoubling, {found.resolution}" in text
     assert verdicts.numerical_error(found.numerical_error) in text
     figure = curves_picture({"fit": found})
@@ -165,7 +164,7 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
     assert known.in_words(only) == "12 nodes, 24 modes"
     assert known.partly_finer(here, only) == []
 
-    class Alike(refinement.Values):
+    class Alike(resolution_module.Values):
         """A model that nodes change nothing of: its error falls with the modes."""
 
         def __init__(self):
@@ -175,7 +174,9 @@ def test_modes_are_refined_alone_where_nodes_will_do(monkeypatch):
             return abs(36 - transport.modes) / 36 if transport.modes != other.modes else 0.0
 
     monkeypatch.undo()
-    needed, error, finest = refinement._needed(known, here, Alike(), DEFAULT.numerical_error, lambda *_: None)
+    needed, error, finest = resolution_module.needed_resolution(
+        known, here, Alike(), DEFAULT.numerical_error, lambda *_: None
+    )
     assert (needed.nodes, finest) == (12, False)
     assert needed.modes > 30
     assert error <= DEFAULT.numerical_error

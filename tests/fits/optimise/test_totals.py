@@ -13,10 +13,9 @@ from fits.data.geometry import slices
 from fits.data.totals import Totals
 from fits.optimise.fit import fit
 from fits.problem.instrument import Instrument
-from fits.problem.joint import Joint
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
-from fits.problem.problem import Problem
+from fits.problem.problem import Joint, Problem
 from fits.problem.simulate import simulate
 
 SINGLE = lj.SingleScattering()

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
-from fits.prediction.evidence import evidence
+from fits.prediction.importance import evidence
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, Normal
 from fits.problem.problem import Problem

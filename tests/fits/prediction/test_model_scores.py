@@ -14,9 +14,16 @@ from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.average import average
 from fits.prediction.compare import compare
-from fits.prediction.cross_validation import CrossValidation, cross_validate, groups_of, without
-from fits.prediction.evidence import Evidence, evidence, posterior_draws
-from fits.prediction.model_scores import model_scores, rank_models, stacking
+from fits.prediction.cross_validation import (
+    CrossValidation,
+    cross_validate,
+    groups_of,
+    model_scores,
+    rank_models,
+    stacking,
+    without,
+)
+from fits.prediction.importance import Evidence, evidence, posterior_draws
 from fits.prediction.predict import predict
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform, Normal

@@ -12,7 +12,7 @@ from fits.data.selection import select
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.predict import predict, scores
-from fits.problem.discrepancy.parameters import Discrepancy
+from fits.problem.discrepancy import Discrepancy
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem

@@ -1,4 +1,4 @@
-"""Instruments: means over cones beside dense quadrature, samples that lean, gains, and what they cost."""
+"""Instruments: means over cones beside dense quadrature, tilted samples, gains, and what they cost."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +13,21 @@ from benchmarks.measuring.cones import mean_over_cones
 from benchmarks.measuring.repeats import fit_many
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements
+from fits.optimise.limits import limited_with
 from fits.problem.instrument import Instrument
 from fits.problem.model import Model
-from fits.problem.parameters import Free, LogNormal
+from fits.problem.parameters import Free, LogNormal, LogUniform
 from fits.problem.problem import Problem
+from fits.reports import verdicts
 
 SINGLE = lj.SingleScattering()
 GEOMETRY = fits.slices([10.0, 40.0, 65.0], np.arange(-80.0, 81.0, 4.0))
 EXACT = fits.Noise(relative=0.02, floor=1e-4)
+INCIDENCE = 30.0
 
 
-def metal(alpha) -> lj.Stack:
-    return lj.Stack([], lj.Conductor(0.2, 3.0, alpha))
+def metal(alpha, k=3.0) -> lj.Stack:
+    return lj.Stack([], lj.Conductor(0.2, k, alpha))
 
 
 def readings(geometry: fits.Geometry = GEOMETRY) -> Measurements:
@@ -36,8 +39,8 @@ def problem(instrument: Instrument | None, low: float = 0.02, geometry: fits.Geo
     return Problem(metal(Free(max(0.2, low), low, 1.0)), readings(geometry), SINGLE, EXACT, instrument=instrument)
 
 
-@pytest.mark.parametrize(("source", "detector"), [(0.0, 2.0), (1.5, 0.0), (1.0, 3.0), (3.0, 3.0)])
-@pytest.mark.parametrize("alpha", [0.06, 0.15, 0.5])
+@pytest.mark.parametrize(("source", "detector"), [(0.0, 2.0), (1.5, 0.0), (1.0, 3.0)])
+@pytest.mark.parametrize("alpha", [0.06, 0.5])
 def test_readings_are_means_over_cones(source: float, detector: float, alpha: float) -> None:
     of = problem(Instrument(source, detector))
     found = np.asarray(of.predict([alpha]))
@@ -108,17 +111,6 @@ def test_leaning_out_of_the_plane_keeps_angles_between() -> None:
     np.testing.assert_allclose(np.degrees(np.arccos(wi[:, 2])), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("free", [False, True])
-def test_means_are_taken_about_the_peak_of_a_sample_that_leans(free: bool) -> None:
-    """Also where light comes along the normal, and rays of the source's cone from all sides."""
-    lean, alpha, geometry = 4.0, 0.1, fits.slices([0.0, 40.0], np.arange(-60.0, 61.0, 4.0))
-    offset = Free(0.0, -5.0, 5.0) if free else lean
-    found = problem(Instrument(1.5, 0.5, offset), 0.1, geometry).predict([alpha, lean] if free else [alpha])
-    leaning = problem(Instrument(tilt=lean), geometry=geometry).model.optics
-    expected = mean_over_cones(metal(alpha), np.asarray(leaning.wi), np.asarray(leaning.wo), 1.5, 0.5)
-    np.testing.assert_allclose(found, expected, rtol=2e-3)
-
-
 def test_derivatives_by_the_offset() -> None:
     of = problem(Instrument(detector_aperture=1.0, tilt=Free(0.0, -5.0, 5.0)))
 
@@ -150,15 +142,6 @@ def test_light_at_one_polar_angle_has_one_gain() -> None:
     wi = direction(theta + 0.05 * np.sin(7.0 * np.arange(len(given))), phi)
     optics = problem(Instrument(gain_sd=0.03), geometry=fits.Geometry(wi, given.wo)).model.optics
     np.testing.assert_array_equal(optics.incidence, theta > 25.0)
-
-
-def test_readings_at_other_incidences_have_a_gain_that_is_not_known() -> None:
-    data = fits.simulate(metal(0.3), GEOMETRY, SINGLE, 0.01, 1e-5)
-    gains = Instrument(gain_sd=0.1)
-    found = fits.fit(metal(Free(0.2, 0.05, 1.0)), data, transport=SINGLE, starts=1, instrument=gains)
-    known, other = (fits.predict(found, fits.slices([angle], [5.0])) for angle in (40.0, 50.0))
-    assert known.predictive.sd / known.predictive.mean == pytest.approx(0.01, rel=0.3)
-    assert other.predictive.sd / other.predictive.mean == pytest.approx(0.1, rel=0.2)
 
 
 def test_numbers_are_recovered_by_the_model_of_the_instrument() -> None:
@@ -199,35 +182,110 @@ def test_instruments_are_kept_with_a_fit(tmp_path: Path) -> None:
     ("given", "message"),
     [
         ({"detector_aperture": -1.0}, r"Instrument.detector_aperture is -1.0; it must be a number in \[0, 30\]"),
-        ({"source_aperture": 31.0}, r"Instrument.source_aperture is 31.0; it must be a number in \[0, 30\]"),
-        (
-            {"source_aperture": Free(1.0, 0.0, 2.0)},
-            r"Instrument.source_aperture is Free.*; it must be a number in \[0, 30\]",
-        ),
+        ({"source_aperture": Free(1.0, 0.0, 2.0)}, r"Instrument.source_aperture is Free.* in \[0, 30\]"),
         ({"tilt": Free(0.0, -20.0, 5.0)}, r"Instrument.tilt.low is -20.0; it must be a number in \[-10, 10\]"),
         ({"gain_sd": 0.0}, r"Instrument.gain_sd is 0.0; it must be a number in \[0.0001, 1\]"),
-        ({"rings": 9}, r"Instrument.rings is 9; it must be an integer in \[1, 8\]"),
-        ({"rings": 1.5}, r"Instrument.rings is 1.5; it must be an integer in \[1, 8\]"),
         ({"gain_sd": True}, "Instrument.gain_sd is True"),
+        ({"rings": 1.5}, r"Instrument.rings is 1.5; it must be an integer in \[1, 8\]"),
     ],
 )
 def test_bad_instruments_are_refused(given: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Instrument(**given)
-
-
-def test_bad_tables_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "problem.toml"
-    fits.write_problem(path, metal(0.3))
-    whole = path.read_text()
-    for table, message in (
-        ("detector_aperture = 31.0", r"instrument.detector_aperture is 31.0; it must be a number in \[0, 30\]"),
-        ("rings = 0", r"instrument.rings is 0; it must be an integer in \[1, 8\]"),
-        ("aperture = 1.0", "instrument has an unknown key 'aperture'"),
-        ("tilt = { start = 0.0, low = -1.0 }", "instrument.tilt has no high"),
-    ):
-        path.write_text(f"{whole}\n[instrument]\n{table}\n")
-        with pytest.raises(ValueError, match=message):
-            fits.read_problem(path)
     with pytest.raises(ValueError, match=r"Noise.floor and Instrument.floor are both given"):
         problem(Instrument(floor=1e-3))
+
+
+# ---- apertures as wide as a lobe ----
+
+
+def width_of(alpha: float) -> float:
+    """Full width of a lobe at half maximum, degrees of the viewer."""
+    return 4.0 * np.degrees(np.arctan(0.6436 * alpha))
+
+
+def means(stack: lj.Stack, geometry, source: float, detector: float) -> np.ndarray:
+    """Measurements (N, 1) through these apertures, by many rays."""
+    return mean_over_cones(stack, geometry.wi, geometry.wo, source, detector)
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.7, 1.0, 1.4, 3.0])
+@pytest.mark.parametrize("split", [(0.0, 1.0), (0.6, 0.8)])
+def test_readings_are_right_to_a_thousandth_of_the_peak(ratio: float, split: tuple[float, float]) -> None:
+    alpha = 0.02
+    source, detector = (ratio * width_of(alpha) * part for part in split)
+    geometry = fits.slices([INCIDENCE], INCIDENCE + width_of(alpha) * np.array([-3.0, -1.0, -0.5, 0.0, 0.25, 1.0, 2.0]))
+    data = fits.Measurements(geometry.wi, geometry.wo, np.ones((7, 1)), None, np.ones(7, bool), ("value",))
+    of = Problem(
+        metal(alpha, Free(3.5, 2.0, 5.0)), data, SINGLE, fits.Noise(0.02), instrument=Instrument(source, detector)
+    )
+    expected = means(metal(alpha, 3.5), geometry, source, detector)
+    error = np.max(np.abs(np.asarray(of.predict([3.5])) - expected)) / expected.max()
+    # of two cones three widths wide rays would be too many: what a fit says then is in `numerical_error`
+    assert error < (1e-3 if min(split) == 0.0 or ratio < 2.0 else 1e-2)
+
+
+def through(alpha: float, ratio: float, noise: float = 0.01, seed: int = 3) -> tuple[fits.Measurements, Instrument]:
+    """Readings of a metal through a detector that is so many widths of its lobe wide, with noise."""
+    width = width_of(alpha)
+    geometry = fits.slices([INCIDENCE], INCIDENCE + width * np.linspace(-3.0, 3.0, 33))
+    exact = means(metal(alpha, 3.5), geometry, 0.0, ratio * width)
+    values = exact * (1.0 + noise * np.random.default_rng(seed).standard_normal(exact.shape))
+    count = len(geometry)
+    data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(count, bool), ("value",))
+    return data, Instrument(detector_aperture=ratio * width)
+
+
+FREE = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
+NOISE = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
+
+
+def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -> None:
+    """At 1.4 widths of the lobe four rays made k 2.78 +- 0.12 of 3.5."""
+    data, seen = through(0.02, 1.4)
+    found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=4)
+    for name, truth in (("base.alpha", 0.02), ("base.k", 3.5)):
+        assert abs(found.values[name] - truth) < 3.0 * found.standard_errors[name]
+    expected = means(found.stack, data, 0.0, seen.detector_aperture)
+    error = np.abs(found.predicted - expected)
+    assert np.max(error) < 1e-3 * np.max(expected)
+    # the error that the fit tells holds what there is, in standard deviations of the noise
+    assert np.max(error / (0.01 * expected + 1e-4)) <= found.numerical_error + 1e-3
+    assert found.numerical_error <= 0.1
+    assert "rings of rays a cone" in found.status
+    # what the width of the unidentified lobe decides is named beside it
+    words = verdicts.identifiability(found)
+    assert words["base.k"] == "limited by the instrument: correlated with base.alpha"
+    _, lines, sound = verdicts.verdict(found)
+    assert any(line.startswith("base.k is limited by the instrument with base.alpha") for line in lines)
+    assert not sound
+    # few rays again, as given: the error is told, and is what they lack
+    few = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=replace(seen, rings=1), starts=4)
+    lack = np.max(
+        np.abs(few.predicted - means(few.stack, data, 0.0, seen.detector_aperture)) / (0.01 * few.predicted + 1e-4)
+    )
+    assert few.numerical_error == pytest.approx(lack, rel=0.2)
+    assert lack > 2.0
+
+
+def test_a_broad_lobe_keeps_four_rays() -> None:
+    data, seen = through(0.1, 0.2)
+    found = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)
+    assert found.problem.instrument == replace(seen, rings=1)
+    assert np.max(np.bincount(np.asarray(found.problem.model.optics.row))) == 4
+    assert limited_with(found) == {}
+
+
+def test_what_a_lobe_decides_is_named_also_where_its_width_is_at_a_bound() -> None:
+    """The albedo of a matt part beside it is not: readings far from the lobe know it."""
+    data, seen = through(0.004, 8.0)
+    parts = {
+        "metal": metal(Free(0.01, 5e-3, 0.1), Free(3.0, 1.0, 8.0)),
+        "matt": lj.Stack([], lj.Lambertian(Free(0.4, 0.0, 1.0))),
+    }
+    share = lj.Mixture(parts, [0.5, 0.5])
+    matt = 0.5 * np.pi**-1 * 0.3
+    dim = replace(data, values=0.5 * data.values + matt)
+    found = fits.fit(share, dim, transport=SINGLE, noise=NOISE, instrument=seen, starts=2)
+    assert "metal.base.alpha" in found.at_bound
+    assert list(limited_with(found)) == ["metal.base.k"]

@@ -1,4 +1,4 @@
-"""Mixtures in fits: as files, by the names of their parameters, and recovered from simulated readings."""
+"""Mixtures in fits: as files, by the names of their parameters, and recovered from simulated measurements."""
 
 from pathlib import Path
 
@@ -11,8 +11,6 @@ from benchmarks.measuring.repeats import fit_many
 from fits.cli.parser import main
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
-from fits.reports.plots.data import as_png
-from fits.reports.plots.parameters import stack_picture
 
 FILE = """\
 transport = "SingleScattering"
@@ -33,9 +31,10 @@ ior = 0.2
 k = 3.0
 alpha = { start = 0.4, low = 0.1, high = 1.0 }
 """
-NAMES = ("dust.layers[0].thickness", "metal.base.alpha", "weights.dust")
 TRUTH = {"dust.layers[0].thickness": 0.6, "metal.base.alpha": 0.25, "weights.dust": 0.3}
+NAMES = tuple(TRUTH)
 GEOMETRY = fits.slices([10.0, 50.0], np.arange(-75.0, 76.0, 7.5))
+SINGLE = lj.SingleScattering()
 
 
 @pytest.fixture(scope="module")
@@ -45,28 +44,27 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def mixture(thickness: float, alpha: float, weight: float) -> lj.Mixture:
+def simulated(noise: float, seed: int = 0) -> fits.Measurements:
+    thickness, alpha, weight = TRUTH.values()
     dust = lj.Stack([lj.Medium(thickness, 0.6)], lj.Lambertian(0.1))
-    return lj.Mixture({"dust": dust, "metal": lj.Stack([], lj.Conductor(0.2, 3.0, alpha))}, [weight, None])
+    mixed = lj.Mixture({"dust": dust, "metal": lj.Stack([], lj.Conductor(0.2, 3.0, alpha))}, [weight, None])
+    return fits.simulate(mixed, GEOMETRY, SINGLE, noise, 1e-4, seed)
 
 
 def test_files_are_read_and_written(file: Path, tmp_path: Path) -> None:
     given = fits.read_problem(file)
-    assert isinstance(given.stack, lj.Mixture)
     fits.write_problem(tmp_path / "again.toml", given.stack, transport=given.transport)
     again = fits.read_problem(tmp_path / "again.toml")
-    data = fits.simulate(mixture(0.6, 0.25, 0.3), GEOMETRY, lj.SingleScattering(), 0.02, 1e-4)
-    problems = [Problem(one.stack, data, one.transport) for one in (given, again)]
-    assert problems[0].names == problems[1].names == NAMES
-    for one, other in zip((problems[0].start, problems[0].low), (problems[1].start, problems[1].low), strict=True):
-        np.testing.assert_array_equal(one, other)
-    np.testing.assert_allclose(problems[0].predict(problems[0].start), problems[1].predict(problems[1].start))
+    one, other = (Problem(each.stack, simulated(0.02), each.transport) for each in (given, again))
+    assert one.names == other.names == NAMES
+    np.testing.assert_array_equal([one.start, one.low], [other.start, other.low])
+    np.testing.assert_allclose(one.predict(one.start), other.predict(other.start))
 
 
 def test_shares_are_recovered(file: Path) -> None:
     """Over 100 repeats: pulls are of unit width, and weights within three standard errors in 98."""
     given, truth = fits.read_problem(file), np.array(list(TRUTH.values()))
-    every = [fits.simulate(mixture(*truth), GEOMETRY, lj.SingleScattering(), 0.005, 1e-4, seed) for seed in range(100)]
+    every = [simulated(0.005, seed) for seed in range(100)]
     problem = Problem(given.stack, every[0], given.transport)
     repeats = fit_many(problem, np.stack([data.used().values for data in every]), starts=2)
     pulls = (repeats.vectors - truth) / repeats.standard_errors
@@ -76,13 +74,13 @@ def test_shares_are_recovered(file: Path) -> None:
 
 
 def test_all_orders_choose_one_resolution_for_all_parts() -> None:
-    coat = lj.Stack([lj.Interface(1.5, Free(0.3, 0.1, 0.8))], lj.Lambertian(0.3))
-    mixed = lj.Mixture({"coat": coat, "bare": lj.Stack([], lj.Lambertian(0.5))}, [Free(0.5, 0.0, 1.0), None])
-    truth = lj.Mixture(
-        {"coat": lj.Stack([lj.Interface(1.5, 0.2)], coat.base), "bare": mixed.parts["bare"]}, [0.7, None]
-    )
-    data = fits.simulate(truth, GEOMETRY, lj.AddingDoubling(nodes=16, modes=24), 0.02, 1e-4)
-    found = fits.fit(mixed, data, starts=2, noise=fits.Noise(discrepancy=False))
+    def mixed(alpha, weight) -> lj.Mixture:
+        coat = lj.Stack([lj.Interface(1.5, alpha)], lj.Lambertian(0.3))
+        return lj.Mixture({"coat": coat, "bare": lj.Stack([], lj.Lambertian(0.5))}, [weight, None])
+
+    data = fits.simulate(mixed(0.2, 0.7), GEOMETRY, lj.AddingDoubling(nodes=16, modes=24), 0.02, 1e-4)
+    free = mixed(Free(0.3, 0.1, 0.8), Free(0.5, 0.0, 1.0))
+    found = fits.fit(free, data, starts=2, noise=fits.Noise(discrepancy=False))
     assert found.numerical_error is not None
     assert found.numerical_error < 0.1
     for name, value in (("weights.coat", 0.7), ("coat.layers[0].alpha", 0.2)):
@@ -90,19 +88,15 @@ def test_all_orders_choose_one_resolution_for_all_parts() -> None:
 
 
 def test_it_is_fitted_and_reported_on_the_command_line(file: Path, tmp_path: Path, capsys) -> None:
-    data = fits.simulate(mixture(*TRUTH.values()), GEOMETRY, lj.SingleScattering(), 0.03, 1e-4)
-    fits.write_csv(data, tmp_path / "dusty.csv")
+    fits.write_csv(simulated(0.03), tmp_path / "dusty.csv")
     arguments = ["fit", tmp_path / "dusty.csv", "--stack", file, "--out", tmp_path / "result", "--starts", "2"]
     assert main([str(word) for word in arguments]) == 0
     assert "weights.dust" in capsys.readouterr().out
-    loaded = fits.load_fit(tmp_path / "result")
-    assert tuple(loaded.values) == NAMES
-    report = (tmp_path / "result" / "report.html").read_text()
-    assert "[mixture.dust]" in report
+    assert tuple(fits.load_fit(tmp_path / "result").values) == NAMES
+    assert "[mixture.dust]" in (tmp_path / "result" / "report.html").read_text()
 
 
-def test_parts_stand_in_the_picture_of_the_stack() -> None:
-    assert as_png(stack_picture(mixture(0.6, 0.25, 0.3))).startswith(b"\x89PNG")
+WEIGHT = "weight = { start = 0.5, low = 0.0, high = 1.0 }"
 
 
 @pytest.mark.parametrize(
@@ -114,27 +108,18 @@ def test_parts_stand_in_the_picture_of_the_stack() -> None:
         ("albedo = 0.1", "albedo = 1.1", r"mixture.dust.base.albedo is 1.1, must be a number in \[0, 1\]"),
         ("[mixture.metal.base]", "[mixture.metal]\nweight = 0.2\n[mixture.metal.base]", "one has to be free of choice"),
         ("[mixture.metal.base]", "[base]", "mixture is a whole material, must stand without base"),
-        ("weight = { start = 0.5, low = 0.0, high = 1.0 }", "", "mixture: Mixture.weights: 2 are None"),
-        (
-            "weight = { start = 0.5, low = 0.0, high = 1.0 }",
-            "weight = [0.1, 0.2]",
-            r"weight is \[0.1, 0.2\], must be one",
-        ),
+        (WEIGHT, "", "mixture: Mixture.weights: 2 are None"),
+        (WEIGHT, "weight = [0.1, 0.2]", r"weight is \[0.1, 0.2\], must be one"),
     ],
 )
 def test_bad_files_are_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "bad.toml"
-    assert old in FILE
-    path.write_text(FILE.replace(old, new))
+    (tmp_path / "bad.toml").write_text(FILE.replace(old, new))
     with pytest.raises(ValueError, match=message):
-        fits.read_problem(path)
+        fits.read_problem(tmp_path / "bad.toml")
 
 
 def test_weights_must_leave_something_for_the_rest() -> None:
     bare = lj.Stack([], lj.Lambertian(0.5))
     mixed = lj.Mixture({"a": bare, "b": bare, "c": bare}, [Free(0.2, 0.0, 0.7), Free(0.2, 0.0, 0.5), None])
-    data = fits.simulate(bare, GEOMETRY, lj.SingleScattering(), 0.02, 1e-4)
-    with pytest.raises(
-        ValueError, match=r"Mixture.weights: at their upper bounds they sum to 1.2; it must be at most 1"
-    ):
-        Problem(mixed, data, lj.SingleScattering())
+    with pytest.raises(ValueError, match=r"Mixture.weights: at their upper bounds they sum to 1.2; it must be at most"):
+        Problem(mixed, simulated(0.02), SINGLE)

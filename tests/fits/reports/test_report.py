@@ -9,20 +9,19 @@ import pytest
 from matplotlib.figure import Figure
 
 import layerjax as lj
+from fits.any_report import report
 from fits.data.geometry import direction, slices
 from fits.data.measurements import Measurements, Source
-from fits.data.neighbours import autocorrelation
-from fits.data.scans import in_plane, incidences, relative_azimuth, signed_angle
+from fits.data.scans import autocorrelation, in_plane, incidences, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.reports import tables
 from fits.reports.diagnostics import residual_structure, standardised
-from fits.reports.html import page, report
+from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
-from fits.reports.plots import parameters as parameter_pictures
 
 
 def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:
@@ -38,30 +37,43 @@ def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
     np.testing.assert_allclose(signed_angle(data), [20, -20, 20, 20, 20, -20], atol=1e-9)
     np.testing.assert_allclose(relative_azimuth(data), [0, 180, 0, 0, 60, 120], atol=1e-9)
     np.testing.assert_array_equal(in_plane(data), [True, True, True, True, False, False])
+    normal = slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0))  # its planes are those of the slices
+    np.testing.assert_allclose(signed_angle(normal), [-40, 0, 40], atol=1e-9)
+    assert in_plane(normal).all()
 
 
-def test_light_along_the_normal_has_the_planes_of_the_slices() -> None:
-    geometry = slices(incidence=0.0, outgoing=(-40.0, 0.0, 40.0))
-    count = len(geometry)
-    data = Measurements(geometry.wi, geometry.wo, np.ones((count, 1)), None, np.ones(count, bool), ("value",))
-    np.testing.assert_allclose(signed_angle(data), [-40, 0, 40], atol=1e-9)
-    assert in_plane(data).all()
-
-
-def test_incidences_differ_by_either_angle() -> None:
-    data = measurements([10, 30, 10, 30, 10], [180, 180, 0, 180, 180.0], [5] * 5, [0] * 5)
-    found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
-    assert found == [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])]
-
-
-def test_incidences_are_the_same_within_the_jitter_of_an_instrument() -> None:
-    theta = [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0]
-    phi = [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6]
-    data = measurements(theta, phi, [5] * 8, [0] * 8)
-    found = [(group.theta, group.phi, group.rows.tolist()) for group in incidences(data)]
-    assert [rows for _, _, rows in found] == [[4, 5], [0, 1, 2], [3], [6], [7]]
-    np.testing.assert_allclose([theta for theta, _, _ in found], [0.15, 30.27, 30.74, 50.0, 50.0], atol=0.005)
-    np.testing.assert_allclose([phi for _, phi, _ in found[1:]], [0.0, 0.0, 90.0, 90.6], atol=0.005)
+@pytest.mark.parametrize(
+    ("theta", "phi", "found"),
+    [
+        # incidences differ by either angle
+        (
+            [10, 30, 10, 30, 10],
+            [180, 180, 0, 180, 180.0],
+            [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])],
+        ),
+        # and are the same within the jitter of an instrument
+        (
+            [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0],
+            [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6],
+            [
+                (0.15, None, [4, 5]),
+                (30.27, 0.0, [0, 1, 2]),
+                (30.74, 0.0, [3]),
+                (50.0, 90.0, [6]),
+                (50.0, 90.6, [7]),
+            ],
+        ),
+    ],
+)
+def test_rows_of_one_incidence(
+    theta: list[float], phi: list[float], found: list[tuple[float, float | None, list[int]]]
+) -> None:
+    for group, (polar, azimuth, rows) in zip(
+        incidences(measurements(theta, phi, [5] * len(theta), [0] * len(theta))), found, strict=True
+    ):
+        assert group.rows.tolist() == rows
+        assert group.theta == pytest.approx(polar, abs=0.005)
+        assert azimuth is None or group.phi == pytest.approx(azimuth, abs=0.005)
 
 
 def series(correlation: float, count: int, seed: int) -> np.ndarray:
@@ -146,7 +158,7 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
-    assert len(pictured) == 6  # stack, curves, maps, residuals, correlation, comparison
+    assert len(pictured) == 5  # curves, maps, residuals, correlation, comparison
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
 
@@ -154,7 +166,9 @@ def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
 def test_the_report_lists_the_incidences_that_were_fitted(coat_fit: Fit) -> None:
     data = coat_fit.problem.data
     kept = data.where(np.isclose(data.theta_i, 10.0), "held out: incidence=50")
-    text = page(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)), None, {})
+    report = FitReport(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)))
+    vars(report)["images"] = {}  # none is drawn
+    text = report.page()
     assert "<td>incidence</td><td>10°</td>" in text
     heads = re.findall("<h2>(.*?)</h2>", text)
     assert heads == ["Values", "Data and model", "Diagnostics", "Identifiability", "Posterior"]
@@ -223,10 +237,3 @@ def test_axes_are_logarithmic_where_the_range_is_wide() -> None:
     assert pictures.is_logarithmic(np.array([0.0, 0.01, 0.2]))
     assert not pictures.is_logarithmic(np.array([0.0, 0.1, 0.2]))
     assert not pictures.is_logarithmic(np.array([0.0]))
-
-
-def test_the_stack_is_drawn_with_its_numbers(coat_fit: Fit) -> None:
-    figure = parameter_pictures.stack_picture(coat_fit.stack)
-    words = " ".join(text.get_text() for text in figure.axes[0].texts)
-    assert f"{coat_fit.values['base.albedo']:.4g}" in words
-    assert "HenyeyGreenstein: g 0" in words

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit, Minimum
+from fits.optimise.uncertainty import Direction
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.reports.results import load_fit, load_posterior, replacing, save_fit
+from fits.reports.results import load_fit, load_posterior, save_fit, writing
 from fits.sampling.sample import sample
+from tests.helpers.files import contents
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
 
@@ -101,41 +102,30 @@ def test_numbers_that_are_not_finite_are_strings_in_json(coat_fit: Fit, tmp_path
     assert loaded.condition_number == np.inf
 
 
-def test_a_result_is_replaced_only_by_force(coat_fit: Fit, tmp_path: Path) -> None:
-    directory = tmp_path / "result"
+def test_a_result_is_replaced_only_by_force_and_as_a_whole(coat_fit: Fit, tmp_path: Path) -> None:
+    directory, precious = tmp_path / "result", tmp_path / "home" / "precious.txt"
     save_fit(coat_fit, directory)
     (directory / "leftover").touch()
+    before = contents(directory)
     with pytest.raises(ValueError, match="holds a result already"):
         save_fit(coat_fit, directory)
-    assert (directory / "leftover").exists()
-    save_fit(coat_fit, directory, force=True)
-    assert not (directory / "leftover").exists()
-    assert [path.name for path in tmp_path.iterdir()] == ["result"]
-
-
-def test_a_directory_of_other_things_is_never_replaced(coat_fit: Fit, tmp_path: Path) -> None:
-    precious = tmp_path / "home" / "precious.txt"
-    precious.parent.mkdir()
-    precious.write_text("data")
-    with pytest.raises(ValueError, match="not a result directory"):
-        save_fit(coat_fit, precious.parent, force=True)
-    assert precious.read_text() == "data"
-
-
-def test_a_failure_leaves_what_was_there(coat_fit: Fit, tmp_path: Path) -> None:
-    directory = tmp_path / "result"
-    save_fit(coat_fit, directory)
-    before = {path.name: path.read_bytes() for path in directory.iterdir()}
 
     def half_way() -> None:
-        with replacing(directory, force=True) as folder:
+        with writing(directory, force=True) as folder:
             (folder / "fit.json").write_text("half")
             raise RuntimeError("half way")
 
     with pytest.raises(RuntimeError, match="half way"):
         half_way()
-    assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
+    assert contents(directory) == before
+    save_fit(coat_fit, directory, force=True)
+    assert not (directory / "leftover").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
+    precious.parent.mkdir()
+    precious.write_text("data")
+    with pytest.raises(ValueError, match="not a result directory"):
+        save_fit(coat_fit, precious.parent, force=True)
+    assert precious.read_text() == "data"
 
 
 def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) -> None:

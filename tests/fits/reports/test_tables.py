@@ -2,12 +2,10 @@
 
 import io
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.cli.parser import main
 from fits.data.geometry import direction
 from fits.data.measurements import Measurements
 from fits.reports.data_summary import data_table
@@ -53,6 +51,7 @@ def test_angles_stay_beside_many_channels(channels: int, width: int, monkeypatch
     for word in (*table.columns, *(word for row in table.rows for word in row)):
         assert word in text
     assert len(re.findall("theta_o", text)) == 1
+    assert not re.search(r"\d\.\d{3,}°", text)
     heads = [index for index, line in enumerate(lines) if "theta_i" in line]
     assert (len(heads) == 1) == ("(1 of " not in text)
     for head in heads:  # each part says which incidence a line is of
@@ -77,21 +76,6 @@ def test_texts_are_wrapped_before_a_table_is_cut(monkeypatch: pytest.MonkeyPatch
     text = printed(table, 60, monkeypatch)
     assert text.count("parameter") == 1
     assert set(sentence.split()) <= set(text.split())
-
-
-def test_info_keeps_its_angles_in_a_pipe(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    heads = ",".join(f"brdf_{name}" for name in measured(11).channels)
-    rows = [f"{i},180,{o},0,{','.join(['0.123456'] * 11)}" for i in INCIDENCES for o in OUTGOING]
-    (tmp_path / "many.csv").write_text("\n".join([f"theta_i,phi_i,theta_o,phi_o,{heads}", *rows, ""]))
-    assert main(["info", "many.csv"]) == 0
-    text = capsys.readouterr().out
-    for word in ("theta_i", "phi_i", "theta_o", "in plane", "8.12°", "0° to 89.85°", "BRDF 500nm"):
-        assert word in text
-    assert not re.search(r"\d\.\d{3,}°", text)
-    assert max(map(len, text.splitlines())) <= 120
 
 
 @pytest.mark.parametrize(

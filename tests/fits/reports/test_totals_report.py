@@ -40,19 +40,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_totals_come_back_from_a_file(tmp_path: Path) -> None:
-    given = fits.Totals.of(
-        [0.0, 60.0], reflectance=[[0.1, 0.2], [0.3, 0.4]], unscattered=[[0.5, 0.6], [0.7, 0.8]], channels=("a", "b nm")
-    )
+def test_what_a_file_cannot_hold_is_refused(tmp_path: Path) -> None:
+    given = fits.Totals.of([0.0, 60.0], reflectance=[[0.1, 0.2], [0.3, 0.4]], channels=("a", "b nm"))
     totals_csv.write(given, tmp_path / "t.csv")
-    read = fits.read(tmp_path / "t.csv")
-    assert (read.kinds, read.channels) == (given.kinds, given.channels)
-    for name in ("wi", "wo", "values", "sigma"):
-        np.testing.assert_allclose(getattr(read, name), getattr(given, name), atol=1e-15)
     with pytest.raises(ValueError, match="exists"):
         totals_csv.write(given, tmp_path / "t.csv")
     with pytest.raises(ValueError, match="rows that are not used"):
-        totals_csv.write(given.where(np.array([True, True, True, False])), tmp_path / "masked.csv")
+        totals_csv.write(given.where(np.array([True, False])), tmp_path / "masked.csv")
     with pytest.raises(ValueError, match="'a_std' of a channel would not come back"):
         totals_csv.write(fits.Totals.of(reflectance=0.1, channels=("a_std",)), tmp_path / "named.csv")
 

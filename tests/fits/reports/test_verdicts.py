@@ -11,12 +11,11 @@ from matplotlib.figure import Figure
 
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements
-from fits.data.neighbours import correlation, neighbours
-from fits.data.scans import signed_angle
+from fits.data.scans import correlation, neighbours, signed_angle
 from fits.optimise.fit import fit
-from fits.optimise.identifiability import Direction
 from fits.optimise.result import Fit
-from fits.problem.model import Density
+from fits.optimise.uncertainty import Direction
+from fits.problem.model import Model
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
@@ -58,8 +57,8 @@ def fitted() -> Fit:
 
 def said(facts: Assessment) -> list[verdicts.Statement]:
     """All statements of a report that depend on facts."""
-    opening = [verdicts.description(facts), verdicts.errors(facts), verdicts.parameters(facts)]
-    return [*opening, *verdicts.remarks(facts), *verdicts.residuals(facts), *verdicts.identification(facts)]
+    more = (verdicts.remarks(facts), verdicts.residuals(facts), verdicts.identification(facts))
+    return [*verdicts.opening(facts), *(one for section in more for one in section)]
 
 
 def test_no_two_statements_contradict_each_other(coat_fit: Fit) -> None:
@@ -125,10 +124,10 @@ def test_one_statement_weighs_size_and_correlation_of_residuals(coat_fit: Fit) -
     case = replace(facts, excess=-9.0, ratio=0.19, structure=structure, discrepancy=(TERM, 0.9))
     factor = np.sqrt(0.19) * np.sqrt(1.9 / 0.1)  # (1 + r) / (1 - r) for the correlation
     assert f"too small by a factor of about {factor:.2g} (0.44 for the size of the whitened residuals times 4.4" in (
-        verdicts.errors(case).sentence
+        verdicts.opening(case)[1].sentence
     )
     large = replace(facts, excess=9.0, ratio=9.0, structure=replace(facts.structure, lag_one_sigma=0.0))
-    assert "too small by a factor of about 3 (3 for the size of the residuals)" in verdicts.errors(large).sentence
+    assert "too small by a factor of about 3 (3 for the size of the residuals)" in verdicts.opening(large)[1].sentence
 
 
 def test_the_verdict_is_three_sentences_and_quotes_the_misfit(coat_fit: Fit) -> None:
@@ -186,9 +185,7 @@ def test_a_stack_that_misses_is_named_though_the_discrepancy_absorbs_all(fitted:
     assert match is not None
     assert float(match[1]) == pytest.approx(100.0 * np.median(off.predicted / values - 1.0), abs=1.0)
     assert float(match[2]) == pytest.approx(2.0)
-    without = (
-        np.sum(np.square(off.problem.call(Density.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
-    )
+    without = np.sum(np.square(off.problem.call(Model.offsets_at, off.vector, off.predicted))) / off.degrees_of_freedom
     assert f"with the discrepancy term, {without:.4g} without" in verdicts.summary(off)[-1]
     assert not assess(replace(fitted, problem=simulated(0), vector=TRUTH)).described  # 10 % beside a noise of 2 %
     right = replace(fitted, problem=replace(fitted.problem, noise=WIDE), unidentified=())
@@ -204,7 +201,7 @@ def test_a_large_misfit_is_a_factor(fitted: Fit, factor: float, words: str) -> N
         off = replace(fitted, problem=problem_of(values))
         vars(off)["predicted"] = fitted.predicted
         facts = replace(assess(off), described=True)
-        assert verdicts.description(facts).sentence.startswith(f"{near}within {words}, ")
+        assert verdicts.opening(facts)[0].sentence.startswith(f"{near}within {words}, ")
 
 
 def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_discrepancy(fitted: Fit) -> None:
@@ -222,17 +219,35 @@ def test_both_curves_are_drawn_and_the_residuals_are_those_of_the_one_with_the_d
     shown = np.asarray(points.get_ydata())
     drawn = np.interp(angle, *curves["model with discrepancy"].get_data())
     np.testing.assert_allclose(shown, (values - drawn) / (0.02 * values), atol=0.15)
-    assert "discrepancy" in lower.get_ylabel()
 
 
-def test_an_assumed_noise_is_stated_and_repeats_offer_another() -> None:
-    once = problem_of(np.ones((len(GEOMETRY), 1)))
-    (words,) = verdicts.noise_statements(replace(once, noise=Noise()))
-    assert words.startswith("No noise is stated: 5 % of the model's value is assumed.")
-    assert "(assumed)" in tables.noise_in_words(replace(once, noise=Noise()))
-    for stated in (Noise(relative=0.05), Noise(floor=0.01)):
-        assert verdicts.noise_statements(replace(once, noise=stated)) == []
-        assert "(assumed)" not in tables.noise_in_words(replace(once, noise=stated))
+@pytest.mark.parametrize(
+    ("noise", "sigma", "words"),
+    [
+        (Noise(), None, "No noise is stated: 5 % of the model's value is assumed."),
+        (Noise(relative=0.05), None, None),
+        (Noise(floor=0.01), None, None),
+        (
+            Noise(relative=0.03),
+            0.04,
+            "Noise: the data's own sigma, 4 % in the median, and relative = 0.03, added in quadrature.",
+        ),
+        (Noise(), 0.04, None),
+        (Noise(relative=0.03, use_sigma=False), 0.04, None),
+        (Noise(relative=0.0), 0.04, None),
+    ],
+)
+def test_noise_that_is_assumed_or_added_is_announced(noise: Noise, sigma: float | None, words: str | None) -> None:
+    values = np.ones((len(GEOMETRY), 1))
+    data = replace(problem_of(values).data, sigma=None if sigma is None else sigma * values)
+    problem = Problem(STACK, data, line, noise)
+    assert [sentence.startswith(words or "?") for sentence in verdicts.noise_statements(problem)] == [True] * bool(
+        words
+    )
+    assert ("(assumed)" in tables.noise_in_words(problem)) == (words is not None and "assumed" in words)
+
+
+def test_repeated_measurements_offer_a_noise() -> None:
     scattered = 1.0 + 0.0017 * np.random.default_rng(0).standard_normal((2 * len(GEOMETRY), 1))
     wi, wo = (np.tile(w, (2, 1)) for w in (GEOMETRY.wi, GEOMETRY.wo))
     twice = Measurements(wi, wo, scattered, None, np.ones(len(wi), bool), ("value",))
@@ -242,15 +257,6 @@ def test_an_assumed_noise_is_stated_and_repeats_offer_another() -> None:
     # the median of 164 differences: 8 % of itself
     assert float(match[1]) == pytest.approx(0.17, rel=0.3)
     assert float(match[2]) == pytest.approx(0.0017, rel=0.3)
-
-
-def test_relative_noise_beside_the_own_sigma_of_the_data_is_announced() -> None:
-    values = np.ones((len(GEOMETRY), 1))
-    data = replace(problem_of(values).data, sigma=0.04 * values)
-    (words,) = verdicts.noise_statements(Problem(STACK, data, line, Noise(relative=0.03)))
-    assert words.startswith("Noise: the data's own sigma, 4 % in the median, and relative = 0.03, added in quadrature.")
-    for noise in (Noise(), Noise(relative=0.03, use_sigma=False), Noise(relative=0.0)):
-        assert verdicts.noise_statements(Problem(STACK, data, line, noise)) == []
 
 
 def altered(fit: Fit, correlation: np.ndarray | None = None, **fields: object) -> Fit:

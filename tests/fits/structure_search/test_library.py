@@ -49,7 +49,7 @@ def test_a_file_says_the_same(tmp_path: Path) -> None:
     [
         ('[bases.diffuse]\nkind = "Lambertian"\nalbedo = 0.2\n', "it has no layer"),
         ('[layers.coat]\nkind = "Interface"\nior = 1.5\nalpha = 0.3\n', "it has no base"),
-        ('[layers.coat]\nkind = "Lambertian"\nalbedo = 0.2\n', "layers.coat.kind is 'Lambertian'"),
+        ('[layers.coat]\nkind = "Lambertian"\nalbedo = 0.2\n', "layers.coat: layers.0..kind is 'Lambertian'"),
         ('[layers.coat]\nkind = "Interface"\nior = 1.5\nalhpa = 0.3\n', "alhpa"),
         ('[bases.flat]\nkind = "Lambertian"\n', "bases.flat"),
         ("[stack]\n", "stack"),

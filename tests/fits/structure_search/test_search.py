@@ -10,12 +10,12 @@ import fits
 import layerjax as lj
 from fits._files import locked
 from fits.optimise.result import Fit
-from fits.prediction import cross_validation
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.store import Store
 from fits.structure_search import report
+from fits.structure_search import search as structure_search
 from fits.structure_search.library import Library
 from fits.structure_search.search import STORE, SearchOptions, search
 from tests.helpers.files import contents
@@ -74,34 +74,41 @@ def test_others_get_a_discrepancy_term(data: fits.Measurements, found: fits.Sear
     assert again.best.name == found.best.name
 
 
-def test_a_killed_search_goes_on_with_the_incidence_where_it_was(
+def test_a_killed_search_resumes_and_finds_the_same(
     data: fits.Measurements, directory: Path, found: fits.Search, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three incidences are held out: killed at the third, the next run fits without that one alone."""
+    """Killed in the cross-validation of one of four structures: the next run makes that one again, and no other."""
     whole = Store.read(directory / STORE)
     with Store.open(directory / STORE, whole.fingerprint) as store:
-        for key in ("interface / diffuse", "interface / diffuse: held out"):
-            store.put(key, None)
-    refits: list[str] = []
-    refit = cross_validation.refit
+        store.put("interface / diffuse", None)
+    made: list[str] = []
+    out_of_sample = structure_search.out_of_sample
 
-    def counted(*arguments: object) -> Fit:
-        if len(refits) == 2:
+    def interrupted(fit: Fit) -> object:
+        made.append("one")
+        if len(made) == 1:
             raise KeyboardInterrupt
-        refits.append("one")
-        return refit(*arguments)
+        return out_of_sample(fit)
 
-    monkeypatch.setattr(cross_validation, "refit", counted)
+    monkeypatch.setattr(structure_search, "out_of_sample", interrupted)
     with pytest.raises(KeyboardInterrupt):
         search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
-    del refits[:-1]  # one more is let through
     again = search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
-    assert len(refits) == 2
+    assert len(made) == 2
     assert again.ranking == found.ranking
     for one, other in zip(again.candidates, found.candidates, strict=True):
         np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
         assert one.model_score == other.model_score
     assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
+
+
+@pytest.mark.parametrize("correlated", [0.2, 1.0])
+def test_the_options_of_its_fits_decide_on_a_discrepancy(data: fits.Measurements, correlated: float) -> None:
+    """Residuals of a stack without the interface are correlated by more than 0.2, which is the default, and below 1."""
+    library = Library(LIBRARY.layers, {"diffuse": LIBRARY.bases["diffuse"]})
+    options = replace(SHORT, fit=fits.FitOptions(autocorrelation=correlated))
+    found = search(data, library, transport=lj.Statistical(), noise=Noise(relative=0.03, floor=1e-6), options=options)
+    assert bool(found.best.fit.problem.noise.discrepancy) == (correlated < 1.0)
 
 
 def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Measurements, tmp_path: Path) -> None:
@@ -132,6 +139,7 @@ def test_every_structure_is_seen_by_the_instrument_and_another_search_is_refused
         ({"instrument": None}, "instrument"),
         ({"instrument": seen, "seed": 1}, "seed 0, not 1"),
         ({"instrument": seen, "options": replace(SHORT, starts=3)}, "starts 1, not 3"),
+        ({"instrument": seen, "options": replace(SHORT, fit=fits.FitOptions(same_cost=1.0))}, "fit"),
         ({"instrument": seen, "data": data.drop(incidence=10)}, "data"),
     ):
         with pytest.raises(ValueError, match=rf"holds the work of another problem \({message}"):
@@ -177,7 +185,6 @@ def test_it_is_reported_with_one_verdict(found: fits.Search, tmp_path: Path) -> 
     assert "BIC, weight and probability do not overrule this" in near
     assert "It is ahead" not in near
     report.write_report(found, tmp_path)
-    assert (tmp_path / report.PICTURE).read_bytes().startswith(b"\x89PNG")
     page = (tmp_path / report.PAGE).read_text()
     assert "interface / metal" in page
     assert "<h1>Stacks behind" in page

@@ -7,7 +7,7 @@ import pytest
 
 import fits
 import layerjax as lj
-from fits.problem.toml import stack_from_dict, stack_to_dict
+from fits.problem.stack_file import stack_from_dict, stack_to_dict
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_pdf, interface_reflection, interface_sample, interface_transmission
 from layerjax.transport.automatic import automatic
