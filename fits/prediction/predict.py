@@ -30,7 +30,7 @@ from fits.problem.discrepancy import softness as softness_of
 from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
-from fits.sampling.laplace import Approximation
+from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_kind
 from layerjax.mixture import stacks_of
@@ -376,9 +376,7 @@ def _posterior_draws(
         return generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws), math.nan
     random, pareto_k = np.random.RandomState(generator.integers(2**31)), math.nan
     if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
-        normal = Approximation.of(fitted)
-        positions, free = normal.draw(random, draws), ~normal.held
-        positions[:, free] = normal.centre[free] + random.standard_normal((draws, free.sum())) @ normal.root.T
+        positions = normal_draws(fitted, draws, random)
     else:
         weighted = importance_draws(
             fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal

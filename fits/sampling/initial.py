@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from fits.optimise.result import Fit, Minimum
 from fits.optimise.uncertainty import local_information, uncertainty
 from fits.problem.model import Model
 from fits.problem.problem import Problem
-from fits.sampling.mixture import Mixture
+from fits.sampling.mixture import NARROWEST, Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.ridge import Ridge, open_directions, ridge
 
@@ -93,6 +94,27 @@ def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_
     heights = np.asarray(problem.call(log_posteriors, mixture.centre), float)
     own = np.diagonal(mixture.log_parts(mixture.centre))
     return replace(mixture, log_weight=np.where(np.isfinite(heights), heights, -np.inf) - own)
+
+
+def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floats:
+    """Draws (count, P) by the covariance of a fit, without a look at its posterior.
+
+    Parameters at a bound lie at an exponentially distributed distance from it.
+    """
+    unit = np.clip(unit_of(fit.problem, fit.vector), INSIDE, 1.0 - INSIDE)
+    at_bound = np.isin(fit.problem.names, fit.at_bound)
+    free = np.flatnonzero(~at_bound)
+    slope = np.asarray(fit.problem.model.box.slope(jnp.asarray(fit.vector)), float) * unit * (1.0 - unit)
+    values, directions = np.linalg.eigh((fit.covariance / np.outer(slope, slope))[np.ix_(free, free)])
+    spread = np.clip(np.sqrt(np.maximum(values, 0.0)), NARROWEST, WIDEST)
+    drawn = np.tile(logit(unit), (count, 1))
+    drawn[:, free] += generator.standard_normal((count, len(free))) @ (directions * spread).T
+    if at_bound.any():
+        gradient = np.abs(local_information(fit.problem, unit)[1])
+        mean = np.clip(1.0 / np.maximum(gradient, INSIDE), INSIDE, WIDEST_IN_BOX)
+        distance = np.clip(generator.exponential(mean, (count, len(unit))), INSIDE, 1.0 - INSIDE)
+        drawn = np.where(at_bound, np.where(unit < 0.5, 1.0, -1.0) * logit(distance), drawn)
+    return drawn
 
 
 def other_minima(fit: Fit) -> list[Minimum]:
