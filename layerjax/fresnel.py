@@ -40,7 +40,11 @@ def dielectric(cosine: Array, ior: Array, blur: Array | None = None) -> Array:
     Not differentiable at the critical angle (the derivative is infinite there; 0 is returned beyond it), unless that
     is rounded off.
     """
-    refracted, transmits = cosine_of_refraction(cosine, ior, blur)
+    return dielectric_towards(cosine, ior, *cosine_of_refraction(cosine, ior, blur))
+
+
+def dielectric_towards(cosine: Array, ior: Array, refracted: Array, transmits: Array) -> Array:
+    """`dielectric` where the cosine of refraction is known, and whether there is such light."""
     refracted = jnp.where(transmits, refracted, 0.5)
     c = jnp.where(transmits, cosine, 0.5)
     tiny = jnp.finfo(refracted.dtype).tiny

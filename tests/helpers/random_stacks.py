@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import layerjax as lj
+from layerjax._parameters import leaves_with_names
 from layerjax.phase import HenyeyGreenstein
 
 
@@ -59,3 +60,10 @@ STRUCTURES = {
 def drawn(kind, seed):
     random = np.random.default_rng([seed, len(kind)])
     return jnp.asarray([draw(random) for draw in STRUCTURES[kind][0]])
+
+
+def lengths(stack, numbers):
+    """What slopes by the numbers of a stack are multiplied by: by widths and thicknesses by their share."""
+    named = leaves_with_names(stack)
+    shares = {float(leaf) for path, leaf in named if path.endswith(("alpha", "thickness"))}
+    return np.array([value if value in shares else 1.0 for value in map(float, numbers)])

@@ -159,7 +159,9 @@ def wrong_in_single(slopes, vector, point, drawn, compared):
     if drawn:
         # numbers that are rounded belong to another stack: where nothing is absorbed, thick media tell them apart
         rounding += 4 * float(slopes.weight @ np.abs(slopes.forward(vector * (1 - eps), direction)[1] - slope))
-    off = float(slopes.weight @ np.abs(ahead - slope))
+    # what ringing takes below 0 is cut off, and its slope with it, unless it may be rounding: more in single precision
+    lit = np.asarray(slopes.values(vector)) > 0
+    off = float(slopes.weight @ np.where(lit, np.abs(ahead - slope), 0.0))
     if not finite:
         yield "not finite in single precision"
     elif abs(back - float(slopes.weight @ ahead)) > 1e-3 * size + rounding:

@@ -88,8 +88,8 @@ def _through(
 
     blur: see `fresnel.dielectric`.
     """
-    level = fresnel.dielectric(facing, ratio, blur)
     refracted, exists = fresnel.cosine_of_refraction(facing, ratio, blur)
+    level = fresnel.dielectric_towards(facing, ratio, refracted, exists)
     down = combine(facing / ratio - refracted, m, -1.0 / ratio, wi)
     if blur is not None:
         down = normalize(down)

@@ -25,7 +25,7 @@ from layerjax.transport.adding_doubling.elements import Scalars, element
 from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
-from layerjax.transport.adding_doubling.interfaces import interface_layer
+from layerjax.transport.adding_doubling.interfaces import Behind, interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
@@ -99,14 +99,16 @@ def _dtype(stack: Stack) -> Any:
 def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None) -> list[Layer]:
     """Every interface of a stack as a layer. Many of a kind share one program, which is compiled once."""
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    diffuse = stack.base is not None and not isinstance(stack.base, Conductor)
+    behind: Behind = "narrow" if stack.base is None or isinstance(stack.base, Conductor) else "diffuse"
+    if stack.base is None and len(interfaces) > 1:
+        behind = "faces"
     dtype = indices[0].dtype
     found: dict[int, Layer] = {}
     alike: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
     for region, layer in enumerate(interfaces):
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if asked is not None and (layer is stack.layers[0] or leaves):
-            build = partial(_interface, plan, layer.distribution, not leaves, diffuse, dtype, region)
+            build = partial(_interface, plan, layer.distribution, not leaves, behind, dtype, region)
             found[region] = element(build, (indices, layer.alpha), asked.below if leaves else asked.above, dtype)
         else:
             alike[layer.distribution, not leaves].append(region)
@@ -114,10 +116,10 @@ def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirectio
         alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
         if len(regions) < MANY:
             for region, alpha in zip(regions, alphas, strict=True):
-                build = partial(_interface, plan, *kind, diffuse, dtype, region)
+                build = partial(_interface, plan, *kind, behind, dtype, region)
                 found[region] = element(build, (indices, alpha), None, dtype)
         else:
-            build = partial(_numbered_interface, plan, *kind, diffuse, dtype)
+            build = partial(_numbered_interface, plan, *kind, behind, dtype)
             layers = jax.lax.map(
                 lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
                 (jnp.asarray(regions), jnp.stack(alphas)),
@@ -130,7 +132,7 @@ def _interface(
     plan: Plan,
     distribution: Distribution,
     enters: bool,
-    diffuse: bool,
+    behind: Behind,
     dtype: Any,
     region: int | Array,
     numbers: Any,
@@ -142,15 +144,15 @@ def _interface(
     outside = None if asked is None else asked_region(asked, (above if enters else below).ior)
     normals = Normals(jnp.asarray(alpha, dtype), distribution)
     return interface_layer(
-        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, asked=outside, diffuse=diffuse
+        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, asked=outside, behind=behind
     )
 
 
 def _numbered_interface(
-    plan: Plan, distribution: Distribution, enters: bool, diffuse: bool, dtype: Any, numbers: Any, region: Array
+    plan: Plan, distribution: Distribution, enters: bool, behind: Behind, dtype: Any, numbers: Any, region: Array
 ) -> Layer:
     """An interface under a region whose number is traced."""
-    return _interface(plan, distribution, enters, diffuse, dtype, region, numbers, None)
+    return _interface(plan, distribution, enters, behind, dtype, region, numbers, None)
 
 
 def _region(grid: Grid, place: int | Array) -> Region:

@@ -102,7 +102,10 @@ class AddingDoubling(DeterministicTransport):
     8e-4 at 48 for g 0.9; at 17 degrees from the beam 6e-3 at 48 and 3e-4 at 96 for g 0.97, and 2e-2 at 96 for g 0.99.
     Of g -0.97, reflection was right to 7e-3 at 48 nodes and to 1e-3 at 96.
 
-    To be differentiated once, forward or backward: second derivatives may be NaN.
+    To be differentiated once, forward or backward: second derivatives may be NaN. At the resolution that is chosen,
+    slopes by indices, albedos and g, and those by widths and thicknesses for a change by their share, were within
+    6e-3 of |f| + mean(f) / 10 on 28 random stacks of seven structures. A width of 0.05 itself is 20 times its share:
+    by that of a coat on metal the slope was off by 3e-2 at the 6 nodes chosen, and by 3e-3 at 12.
 
     Args:
         nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as

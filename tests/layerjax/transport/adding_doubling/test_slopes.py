@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 import layerjax as lj
-from layerjax._parameters import leaves_with_names
-from tests.helpers.random_stacks import STRUCTURES, drawn
+from tests.helpers.random_stacks import STRUCTURES, drawn, lengths
 
 FLOOR = 1e-2
 SHORT = lj.AddingDoubling(nodes=6, modes=8)
@@ -70,13 +69,6 @@ def pairs(kind):
     return jnp.concatenate([wi, wi]), jnp.concatenate([wo, wo * jnp.array([1.0, 1.0, -1.0])])
 
 
-def lengths(kind, numbers):
-    """By which slopes are multiplied."""
-    named = leaves_with_names(build_of(kind)(numbers))
-    shares = {float(leaf) for path, leaf in named if path.endswith(("alpha", "thickness"))}
-    return np.array([value if value in shares else 1.0 for value in map(float, numbers)])
-
-
 @cache
 def program(kind, transport, known, reverse):
     """Values, their Jacobian, the gradient of their weighted sum. known: whether directions are, while tracing."""
@@ -108,7 +100,7 @@ def wrong(kind, numbers, transport, known=True, reverse=True):
     size = (1.0 / scale) @ np.abs(forward)
     if np.any(np.abs(back - (1.0 / scale) @ forward) > 1e-7 * (size + 1.0)):
         yield f"reverse {back}, forward {(1.0 / scale) @ forward} at {numbers}"
-    for k, length in enumerate(lengths(kind, numbers)):
+    for k, length in enumerate(lengths(build_of(kind)(numbers), numbers)):
 
         def central(step, k=k):
             up, down = (next(run(numbers.at[k].add(sign * step), 1.0 / scale)) for sign in (1, -1))
@@ -151,7 +143,9 @@ def test_slopes_at_the_default_resolution(kind):
         fine = dataclasses.replace(usual, nodes=2 * usual.nodes, modes=min(2 * usual.modes, 96))
         ones = np.ones(len(wi))
         (f, slopes, _), (_, fine_slopes, _) = (program(kind, one, True, False)(numbers, ones) for one in (usual, fine))
-        off = np.max(np.abs(fine_slopes - slopes) / relative_to(f)[:, None], axis=0) * lengths(kind, numbers)
+        off = np.max(np.abs(fine_slopes - slopes) / relative_to(f)[:, None], axis=0) * lengths(
+            build_of(kind)(numbers), numbers
+        )
         if not np.all(off <= 1e-2):
             found.append(f"{usual.nodes} x {usual.modes}: off by {off} of |f| at {numbers}")
     assert not found, "\n".join(found)
