@@ -44,13 +44,14 @@ Floats = NDArray[np.float64]
 
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given; start, low, high: (P,)."""
+    """What follows from a problem as it was given; start, low, high: (P,). free: its parameters as they were given."""
 
     names: tuple[str, ...]
     start: Floats
     low: Floats
     high: Floats
     model: Any
+    free: tuple[Free, ...] = ()
 
 
 class FittingProblem(abc.ABC):
@@ -215,6 +216,12 @@ class Problem(FittingProblem):
         return {name: unit(name) for name in self.names}
 
     @property
+    def common_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are the same for all texels of a map, one a channel where numbers are."""
+        marks = [one.same_for_all_texels for one in self._assembled.free for _ in range(one.arrays()[0].size)]
+        return tuple(name for name, marked in zip(self.names, marks, strict=True) if marked)
+
+    @property
     def noise_is_assumed(self) -> bool:
         """Whether neither the data nor `noise` nor the instrument say how large the noise is: see `Noise`."""
         return is_assumed(with_floor(self.noise, self.instrument), self.data)
@@ -299,7 +306,7 @@ def _assemble(problem: Problem) -> Assembled:
     model = _model(problem, used, levels, template, Box.of(free), process, names)
     start, low, high = (np.concatenate([np.ravel(entry.arrays()[i]) for entry in free]) for i in range(3))
     _require_same_channels(model, start, used)
-    return Assembled(names, start, low, high, model)
+    return Assembled(names, start, low, high, model, free)
 
 
 def _require_kinds(problem: Problem) -> None:

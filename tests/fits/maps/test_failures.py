@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from fits.cli.parser import main
-from fits.maps.fitted_map import FittedMap, open_map
+from fits.maps.store import FittedMap, open_map
 from tests.helpers.files import mounted
 from tests.helpers.places import ROOT
 from tests.helpers.quick_maps import assert_same, command, write_files
