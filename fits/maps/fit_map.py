@@ -126,7 +126,7 @@ def _fit(
 
     # 4. neighbours held together
     if options.spatial_prior is not None:
-        smooth_map(store, replace(job, source=data) if client is None else job, data, client, options)
+        smooth_map(store, job, data, client, options)
     return open_map(path)
 
 

@@ -19,7 +19,6 @@ from fits.maps.texels import (
     Fits,
     Integers,
     Linearisation,
-    Start,
     Texels,
     Truths,
     first_mapped,
@@ -74,7 +73,7 @@ def starts_at(
     """The starts at these vectors (K, P); own: texels have directions of their own; size: of the program."""
     vectors = vectors[:MOST_PREDICTED] if own else vectors
     units = to_units(problem, vectors)
-    known = None if own else linearise_at(problem, units, size).known
+    known = None if own else linearise_at(problem, units, size)
     return Starts(vectors, units, known, random, explained)
 
 
@@ -99,11 +98,8 @@ def search(
     """
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
     start, restarted = order[:, 0].copy(), np.zeros(texels.number, bool)
-    if starts.known is None:
-        found = fit_texels(problem, starts.units[start], texels, size, fresh=False)
-    else:
-        known = Start(starts.units, starts.known)
-        found = fit_texels(problem, known, texels, size, which=start.copy(), fresh=False)
+    which = None if starts.known is None else start.copy()
+    found = fit_texels(problem, starts.units[start], texels, size, known=starts.known, which=which, fresh=False)
     limit = explained_chi_square(problem, starts, texels, options)
 
     def poor() -> Truths:

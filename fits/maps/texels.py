@@ -182,19 +182,13 @@ class Fits(NamedTuple):
             mine[rows] = theirs
 
 
-class Start(NamedTuple):
-    """Starts that many texels share: K points of the unit box, (K, P), and what the model says there, (K, ...)."""
-
-    units: Floats
-    known: Linearisation
-
-
 def fit_texels(
     problem: Problem,
-    start: Floats | Start,
+    units: Floats,
     texels: Texels,
     size: int,
     *,
+    known: Linearisation | None = None,
     which: Integers | None = None,
     fresh: bool = True,
     most_steps: int = MOST_STEPS,
@@ -202,28 +196,27 @@ def fit_texels(
     """Fits of M texels by a program for up to `size` of them at a time.
 
     Args:
-        start: a point of the unit box for each texel, (M, P), or shared ones that are known.
-        which: of the shared ones, for each texel, (M,).
+        units: where each starts, (M, P), in the unit box.
+        known: what the model says at K starts, (K, ...). which: of these, for each texel, (M,).
         fresh: whether starts are far from minima.
         most_steps: with 1 each ends where it begins, and what is known there is found.
     """
     parts = []
     for first in range(0, texels.number, size):
         rows = np.arange(first, min(first + size, texels.number))
-        part = start if isinstance(start, Start) else start[rows]
         of = None if which is None else which[rows]
-        parts.append(_call(problem, part, of, texels.rows(rows), size, fresh, most_steps)[0])
+        parts.append(_call(problem, units[rows], texels.rows(rows), size, known, of, fresh, most_steps)[0])
     return Fits(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def linearise_at(problem: Problem, units: Floats, size: int) -> Start:
+def linearise_at(problem: Problem, units: Floats, size: int) -> Linearisation:
     """What the model says at K points (K, P) of the unit box, by the program that fits: it is compiled already."""
     parts, nothing = [], make_texels(np.full((1, *problem.model.values.shape), np.nan))
     for first in range(0, len(units), min(KNOWN, size)):
         some = units[first : first + min(KNOWN, size)]
-        row = nothing.rows(np.zeros(len(some), int))
-        parts.append(_call(problem, some, None, row, size, False, 1)[1])
-    return Start(units, Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True))))
+        rows = nothing.rows(np.zeros(len(some), int))
+        parts.append(_call(problem, some, rows, size, None, None, False, 1)[1])
+    return Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def natural(problem: Problem, vectors: Floats) -> Floats:
@@ -280,26 +273,24 @@ def standard_errors(problem: Problem, found: Fits, texels: Texels) -> tuple[Floa
 
 def _call(
     problem: Problem,
-    start: Floats | Start,
-    which: Integers | None,
+    units: Floats,
     texels: Texels,
     size: int,
+    known: Linearisation | None,
+    which: Integers | None,
     fresh: bool,
     most_steps: int,
 ) -> tuple[Fits, Linearisation]:
-    """Fits of at most `size` texels, and the model at the starts of the first `KNOWN` of them after a single step."""
-    count = texels.number
-    places = np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # padded by the last, which is not computed
-    is_known = isinstance(start, Start)
-    units, known = start if isinstance(start, Start) else (start, None)
-    if texels.wi is None and known is None:
-        shape = problem.model.values.shape
-        known = Linearisation(np.zeros((KNOWN, *shape)), np.zeros((KNOWN, units.shape[1], *shape)))
-    units, of = (units[which[places]], which[places]) if which is not None else (units[places], np.zeros_like(places))
+    """Fits of at most `size` texels, and the model where the first `KNOWN` of them ended."""
+    count, shape = texels.number, problem.model.values.shape
+    rows = np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # padded by the last, which is not computed
+    number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+    if known is None and texels.wi is None:
+        known = Linearisation(np.zeros((1, *shape)), np.zeros((1, units.shape[1], *shape)))
     if known is not None:  # few numbers of starts, and of programs for them
         known = Linearisation(*(np.concatenate([one, np.repeat(one[-1:], -len(one) % KNOWN, axis=0)]) for one in known))
-    numbers = (np.asarray(one) for one in (count, count if is_known else 0, fresh, most_steps))
-    found, said = problem.call(_program, units, known, of, texels.rows(places), *numbers)
+    numbers = (np.asarray(one) for one in (count, number_known, fresh, most_steps))
+    found, said = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
     return (
         Fits(*(np.asarray(part)[:count] for part in found)),
         Linearisation(*(np.asarray(part)[:count] for part in said)),

@@ -79,15 +79,15 @@ def test_each_ends_where_a_descent_of_its_own_does(geometry, measured, noise, ob
 @pytest.mark.parametrize("count", [1, 70])
 def test_what_is_known_at_starts_is_what_the_model_says(geometry, count):
     """Values and derivatives of few points, and of more than a program takes at once."""
-    problem = problem_of(geometry, LEVELS)
-    start = linearise_at(problem, np.random.default_rng(count).random((count, 3)), SIZE)
-    assert start.known.values.shape == (count, 16, 1)
+    problem, units = problem_of(geometry, LEVELS), np.random.default_rng(count).random((count, 3))
+    known = linearise_at(problem, units, SIZE)
+    assert known.values.shape == (count, 16, 1)
     for place in (0, count - 1):
-        vector = problem.model.box.from_unit(jnp.asarray(start.units[place]))
-        np.testing.assert_allclose(start.known.values[place], problem.model.predict(vector), rtol=1e-12)
+        vector = problem.model.box.from_unit(jnp.asarray(units[place]))
+        np.testing.assert_allclose(known.values[place], problem.model.predict(vector), rtol=1e-12)
         slopes = np.moveaxis(np.asarray(jax.jacrev(problem.model.predict)(vector)), -1, 0)
-        np.testing.assert_allclose(start.known.slopes[place], slopes, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(to_units(problem, np.asarray(vector)), start.units[place], rtol=1e-12)
+        np.testing.assert_allclose(known.slopes[place], slopes, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(to_units(problem, np.asarray(vector)), units[place], rtol=1e-12)
 
 
 def test_the_model_stands_in_the_program_once(geometry, measured, monkeypatch):
