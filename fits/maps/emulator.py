@@ -306,9 +306,9 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
     order = np.argsort(sizes)
     kept = np.ones(len(sizes), bool)
     kept[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
-    low, high = space.ends()
+    orders, (low, high) = grid([np.arange(count) for count in terms])[kept], space.ends()
     return Emulator(
-        orders=jnp.asarray(grid([np.arange(count) for count in terms])[kept]),
+        orders=jnp.asarray(orders),
         coefficients=jnp.asarray(series[:, kept]),
         directions=jnp.asarray(directions),
         mean=jnp.asarray(mean.T),
@@ -317,7 +317,7 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
         low=jnp.asarray(low),
         high=jnp.asarray(high),
         places=jnp.asarray(space.places),
-        highest=max(terms) - 1,
+        highest=int(orders.max()),
     )
 
 

@@ -24,7 +24,7 @@ from fits.engines.compile_cache import programs_kept
 from fits.engines.processes import end_if_again
 from fits.maps.inputs import Block, MapData, Measured, map_data, words
 from fits.maps.options import USUAL, VERDICTS, MapOptions
-from fits.maps.pilot import Job, Pilot, fit_pilot, load, save
+from fits.maps.pilot import Job, described, fit_pilot, load, save
 from fits.maps.search import neighbours, reduced_chi_square, search
 from fits.maps.spatial import smooth_map
 from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume, throw_away
@@ -32,9 +32,10 @@ from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise
 from fits.problem.parameters import is_free
-from fits.problem.problem import unit, with_floor
+from fits.problem.problem import with_floor
 from fits.problem.spectra import with_values
 from fits.store import fingerprint, portable_repr
+from layerjax._checks import require_kind
 
 if TYPE_CHECKING:
     from fits.data.geometry import Geometry
@@ -79,8 +80,7 @@ def fit_map(
     if several := options.processes > 1 and client is None:
         end_if_again()
     data = map_data(values, geometry, sigma, mask)
-    if not isinstance(noise, Noise | None):
-        raise ValueError(f"noise is {noise!r}; it must be a fits.Noise, or None")
+    require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
         raise ValueError("instrument is given, but every texel has directions of its own; there can be no instrument")
     if noise is not None and not noise.use_sigma:
@@ -111,7 +111,16 @@ def _fit(
         pilot = fit_pilot(*given)
         if store is None:
             throw_away(path)  # not before it is known that there can be another
-            store = _create(path, pilot, data, stack, options, {"fingerprints": identity, "measurements": measurements})
+            about: dict[str, Any] = {"version": lj.__version__, "stack": repr(stack), "options": options.numbers()}
+            about |= {"samples": data.samples, "channels": list(pilot.problem.data.channels), **described(pilot)}
+            store = create(
+                path,
+                names=pilot.problem.names,
+                units=pilot.problem.units,
+                shape=data.shape,
+                chunk=tile(data.shape, options.chunk_size),
+                attributes=about | {"fingerprints": identity, "measurements": measurements},
+            )
         save(pilot, store)
         pilot = load(store, *given)  # as a run that is resumed has it
     assert store is not None
@@ -133,12 +142,12 @@ def _fit(
 def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, options: MapOptions) -> dict[str, str]:
     """Fingerprints of what makes a fit, by name; of a transport that is a function, by what it predicts."""
 
-    def described(tree: Any) -> list[Any]:
+    def parts_of(tree: Any) -> list[Any]:
         leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
         return [portable_repr(structure), *leaves]
 
     said = {"stack": stack, "noise": noise, "transport": transport, **options.model}
-    said = {name: described(one) for name, one in said.items()}
+    said = {name: parts_of(one) for name, one in said.items()}
     if not isinstance(transport, str | lj.Transport):
         start = jax.tree.map(
             lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, stack, is_leaf=is_free
@@ -148,32 +157,6 @@ def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, opt
         said["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
     numbers = {name: one for name, one in options.numbers().items() if name not in VERDICTS}
     return fingerprint(**said, **numbers, precision=str(np.dtype(jnp.result_type(float))))
-
-
-def _create(
-    path: Path, pilot: Pilot, data: MapData, stack: Any, options: MapOptions, identity: dict[str, Any]
-) -> Store:
-    """An empty store that says how its map is fitted."""
-    problem, common = pilot.problem, {}
-    if pilot.common is not None:
-        for name, value in pilot.common.values.items():
-            error, converged = pilot.common.errors[name], pilot.common.converged
-            common[name] = {"value": value, "error": error, "unit": unit(name), "converged": converged}
-    about = {
-        "version": lj.__version__,
-        "samples": data.samples,
-        "channels": list(problem.data.channels),
-        "stack": repr(stack),
-        "transport": repr(problem.transport),
-        "noise": repr(problem.noise),
-        "options": options.numbers(),
-        "pilot": {"reduced_chi_square": pilot.reduced, "poor_above": pilot.starts.explained},
-        "numerical": {**pilot.words, "error": pilot.numerical_error},
-        "common": common,
-        **identity,
-    }
-    chunk = tile(data.shape, options.chunk_size)
-    return create(path, names=problem.names, units=problem.units, shape=data.shape, chunk=chunk, attributes=about)
 
 
 def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:

@@ -32,7 +32,7 @@ from fits.optimise.resolution import resolutions
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_FLOOR, DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free, is_free
-from fits.problem.problem import Problem
+from fits.problem.problem import Problem, unit
 from fits.problem.toml import transport_from_dict, transport_to_dict
 
 Floats = NDArray[np.float64]
@@ -271,54 +271,62 @@ def _predict_all(model: Model, vectors: Array) -> Array:
 # ---- in the store ----
 
 
-def save(pilot: Pilot, store: Store) -> None:
-    """Keep it in a store."""
-    problem, starts, emulator = pilot.prototype, pilot.starts, pilot.emulator
-    arrays: dict[str, Any] = {"vectors": starts.vectors, "random": starts.random}
-    if emulator is not None:
-        arrays |= {f"emulator/{name}": np.asarray(getattr(emulator, name)) for name in _arrays_of_emulator()}
+def described(pilot: Pilot) -> dict[str, Any]:
+    """What the root of a store says of it."""
+    problem, common = pilot.prototype, {}
+    if pilot.common is not None:
+        for name, value in pilot.common.values.items():
+            error, converged = pilot.common.errors[name], pilot.common.converged
+            common[name] = {"value": value, "error": error, "unit": unit(name), "converged": converged}
     known = isinstance(problem.transport, lj.Transport) or problem.transport == "auto"
-    about = {
+    kept = {
+        "reduced_chi_square": pilot.reduced,
+        "poor_above": pilot.starts.explained,
         "floor": None if is_free(problem.noise.floor) else problem.noise.floor,
         "transport": transport_to_dict(problem.transport) if known else None,  # type: ignore[arg-type]
         "rings": None if problem.instrument is None else problem.instrument.rings,
-        "explained": starts.explained,
-        "highest": None if emulator is None else emulator.highest,
-        "numerical_error": pilot.numerical_error,
-        "words": pilot.words,
-        "common": None if pilot.common is None else list(pilot.common),
-        "reduced": pilot.reduced,
     }
-    store.save_group(PILOT, arrays, about)
+    numerical = {**pilot.words, "error": pilot.numerical_error}
+    words = {"transport": repr(problem.transport), "noise": repr(problem.noise)}
+    return {**words, "pilot": kept, "numerical": numerical, "common": common}
+
+
+def save(pilot: Pilot, store: Store) -> None:
+    """Keep its arrays in a store."""
+    arrays: dict[str, Any] = {"vectors": pilot.starts.vectors, "random": pilot.starts.random}
+    if pilot.emulator is not None:
+        arrays |= {f"emulator/{name}": np.asarray(getattr(pilot.emulator, name)) for name in _arrays_of_emulator()}
+    store.save_group(PILOT, arrays, {})
 
 
 def load(
     store: Store, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions
 ) -> Pilot | None:
-    """What `save` kept, for the same arguments as those of `fit_pilot`; None where it is not there whole."""
-    kept = store.load_group(PILOT)
-    if kept is None:
+    """What a store keeps of it, for the same arguments as those of `fit_pilot`; None where it is not there whole."""
+    found = store.load_group(PILOT)
+    if found is None:
         return None
-    array, about = kept
-    texels, own, common, emulator = pilot_texels(data, options.pilot_texels), data.geometry is None, None, None
+    array, kept, own, common, emulator = found[0], store.attributes["pilot"], data.geometry is None, None, None
+    texels = pilot_texels(data, options.pilot_texels)
     problem = prototype(texels, data, stack, noise, transport, options)
     require_fitting(problem, texels, options)
-    if about["floor"] is not None:
-        problem = replace(problem, noise=replace(problem.noise, floor=about["floor"]))
-    if about["transport"] is not None:
-        problem = replace(problem, transport=transport_from_dict(about["transport"]))
+    if kept["floor"] is not None:
+        problem = replace(problem, noise=replace(problem.noise, floor=kept["floor"]))
+    if kept["transport"] is not None:
+        problem = replace(problem, transport=transport_from_dict(kept["transport"]))
     if problem.instrument is not None:
-        problem = replace(problem, instrument=replace(problem.instrument, rings=about["rings"]))
-    if about["common"] is not None:
-        values, errors, converged = about["common"]
-        common = Common(values, {name: float(error) for name, error in errors.items()}, converged)
+        problem = replace(problem, instrument=replace(problem.instrument, rings=kept["rings"]))
+    if said := store.attributes["common"]:
+        values, errors = ({name: float(one[part]) for name, one in said.items()} for part in ("value", "error"))
+        common = Common(values, errors, all(one["converged"] for one in said.values()))
         problem = with_common(problem, values)
-    if about["highest"] is not None:
+    if "emulator/orders" in array:
         parts = {name: jnp.asarray(array[f"emulator/{name}"]) for name in _arrays_of_emulator()}
-        emulator = Emulator(**parts, highest=about["highest"])
-    ready = map_problem(problem, own, emulator)
-    starts = starts_at(ready, array["vectors"], array["random"], own, options.chunk_size, about["explained"])
-    return Pilot(problem, emulator, starts, common, about["numerical_error"], about["words"], float(about["reduced"]))
+        emulator = Emulator(**parts, highest=int(np.max(array["emulator/orders"])))
+    ready, reduced = map_problem(problem, own, emulator), float(kept["reduced_chi_square"])
+    starts = starts_at(ready, array["vectors"], array["random"], own, options.chunk_size, kept["poor_above"])
+    words = {name: one for name, one in store.attributes["numerical"].items() if name != "error"}
+    return Pilot(problem, emulator, starts, common, store.numerical_error, words, reduced)
 
 
 def _arrays_of_emulator() -> list[str]:

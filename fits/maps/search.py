@@ -15,16 +15,13 @@ from scipy import stats
 
 from fits.maps.options import MapOptions
 from fits.maps.texels import (
-    LANES,
     Fits,
     Integers,
     Linearisation,
     Texels,
     Truths,
-    first_mapped,
     fit_texels,
     linearise_at,
-    model_of,
     to_units,
 )
 from fits.problem.model import Model
@@ -35,8 +32,8 @@ Floats = NDArray[np.float64]
 FIRST = 8
 """Texels of the pilot that are fitted from all starts; the rest of it begins where these ended."""
 
-MOST_PREDICTED = 8
-"""Starts whose values are computed for every texel, where each has directions of its own."""
+MOST_PREDICTED = 4
+"""Starts that are compared for every texel, where each has directions of its own."""
 
 NEIGHBOUR, RANDOM = -1, -2
 """Where a texel's best fit began, if not at a start of the list."""
@@ -159,13 +156,10 @@ def _neighbours_of_poor(found: Fits, poor: Truths, beside: Integers | None) -> t
 
 def likeliest(problem: Problem, starts: Starts, texels: Texels, size: int, most: int) -> Integers:
     """The starts that suit each texel best, (M, at most `most`), best first."""
-    if starts.known is None:
-        parts = []
-        for first in range(0, texels.number, size):
-            count = min(size, texels.number - first)
-            rows = texels.rows(first + np.minimum(np.arange(-(-size // LANES) * LANES), count - 1))
-            parts.append(np.asarray(problem.call(_costs, starts.vectors, rows, np.asarray(count)))[:count])
-        misfit = np.concatenate(parts)
+    if starts.known is None:  # the cost of each along the texel's own directions
+        units = (np.tile(unit, (texels.number, 1)) for unit in starts.units)
+        costs = [fit_texels(problem, unit, texels, size, fresh=False, most_steps=1).cost for unit in units]
+        misfit = np.stack(costs, axis=1)
     else:
         misfit = _misfit(problem, starts, texels)
     return np.argsort(misfit, axis=1, kind="stable")[:, :most]
@@ -187,16 +181,6 @@ def _misfit(problem: Problem, starts: Starts, texels: Texels) -> Floats:
             measured.reshape(texels.number, -1).astype(float) @ of.reshape(len(of), -1).T for measured, of in parts
         )
     return np.nan_to_num(squares, nan=np.inf, posinf=np.inf)
-
-
-def _costs(model: Model, vectors: Array, texels: Texels, number: Array) -> Array:
-    """Of every vector (K, P) for the first `number` of the texels, each along its own directions: (M, K)."""
-
-    def one(row: Texels) -> Array:
-        own = model_of(model, row)
-        return jax.lax.map(lambda vector: own.cost_at(vector, own.predict(vector)), vectors)
-
-    return first_mapped(one, texels, number, jax.numpy.zeros((texels.number, len(vectors))))
 
 
 def sigmas(problem: Problem, vectors: Floats, predicted: Floats) -> Floats:

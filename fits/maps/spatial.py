@@ -121,15 +121,18 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
         arrays, moves = kept[0], list(kept[1]["largest_moves"])
     vectors, errors = (np.stack([arrays[path] for path in _paths(group, names)], axis=-1) for group in GIVEN)
 
+    def units_now() -> Floats:  # whatever of texels that are not fitted
+        return to_units(problem, np.where(fitted[..., None], vectors, 1.0))
+
     def tell() -> None:
         note = f"the farthest moved by {moves[-1]:.2g} errors" if moves else ""
         options.tell("smoothing", len(moves), prior.rounds, note)
 
     while len(moves) < prior.rounds and not (moves and moves[-1] <= options.settled):
         tell()
-        before, errors_before = to_units(problem, np.where(fitted[..., None], vectors, 1.0)), errors.copy()
+        before, errors_before = units_now(), errors.copy()
         for colour in (0, 1):
-            units = to_units(problem, np.where(fitted[..., None], vectors, 1.0))
+            units = units_now()
             centre, precision = edges.pull(units, fitted)
             centre, inverse_sd = low + centre * (high - low), np.sqrt(precision) / (high - low)
             coloured = fitted & (np.indices(fitted.shape).sum(axis=0) % 2 == colour)
@@ -150,9 +153,8 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
                     part[places] = np.where(np.isfinite(result[0]), found, part[places])
                     whole[block] = part.reshape(whole[block].shape)
         # how far a texel moved at most, in standard errors: those of now, or of before where there are none
-        now = to_units(problem, np.where(fitted[..., None], vectors, 1.0))
         error = np.where(np.isfinite(errors), errors, np.where(np.isfinite(errors_before), errors_before, np.inf))
-        share = np.abs(now - before) * widths(problem, vectors) / np.where(error > 0.0, error, np.inf)
+        share = np.abs(units_now() - before) * widths(problem, vectors) / np.where(error > 0.0, error, np.inf)
         moves.append(float(np.max(share[fitted], initial=0.0)))
         _keep(store, vectors, errors, said, moves)
     tell()

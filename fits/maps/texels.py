@@ -346,22 +346,27 @@ def _program(
     def tried(run: _Run, row: Texels) -> Linearisation:
         return _linearise(model_of(model, row), model.box.from_unit(run.state.trial))
 
-    def body(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        following, lanes, rows = carry
-        runs, own = jax.vmap(unravel)(rows[lanes]), texels_at(lanes)
-        runs = jax.vmap(step)(runs, own, jax.vmap(tried)(runs, own))
+    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        following, lanes, runs, rows = carry
+        own = texels_at(lanes)
+        # as a loop of one turn: all that follows would else compute the model again where it needs a part of it
+        said = jax.lax.fori_loop(0, jnp.minimum(number, 1), lambda *_: jax.vmap(tried)(runs, own), nothing)
+        runs = jax.vmap(step)(runs, own, said)
         new = jax.vmap(flat)(runs)
         for lane in range(LANES):
             rows = jax.lax.dynamic_update_slice(rows, new[lane][None], (lanes[lane], jnp.zeros_like(lanes[lane])))
         after = following + jnp.cumsum(runs.stopped) - 1
         lanes = jnp.where(runs.stopped, jnp.where(after < number, after, len(units)), lanes)
-        return following + jnp.sum(runs.stopped), lanes, rows
+        next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane goes on, what it has just written
+        return following + jnp.sum(runs.stopped), lanes, next_runs, rows
 
     def texels_at(lanes: Array) -> Texels:
         return jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
 
     lanes = jnp.where(jnp.arange(LANES) < number, jnp.arange(LANES), len(units))
-    carry = jnp.asarray(LANES), lanes, rows
+    runs = jax.vmap(unravel)(rows[lanes])
+    nothing = jax.tree.map(jnp.zeros_like, runs.state.auxiliary)
+    carry = jnp.asarray(LANES), lanes, runs, rows
     *_, rows = jax.lax.while_loop(lambda carry: jnp.any(carry[1] < number), body, carry)
 
     # what is known where they ended

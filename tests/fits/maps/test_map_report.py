@@ -377,10 +377,5 @@ def test_the_histogram_is_beside_what_noise_makes_of_it() -> None:
     axes = pictures.chi_square_histogram(ratio, np.full(ratio.size, 40)).axes[0]
     at, expected = axes.lines[0].get_data()
     np.testing.assert_allclose(expected, 40 * stats.chi2.pdf(40 * np.asarray(at), 40), rtol=1e-10)
-    stairs = axes.patches[0].get_data()  # type: ignore[attr-defined]
-    middle, width = 0.5 * (stairs.edges[1:] + stairs.edges[:-1]), np.diff(stairs.edges)
-    density = 40 * stats.chi2.pdf(40 * middle, 40)
-    # counting noise of a bar, four deviations, and what a bar's width rounds off the curve
-    assert np.all(np.abs(stairs.values - density) < 4.0 * np.sqrt(density / (ratio.size * width)) + 0.01)
     for each in ([], [np.nan], [2.0], [0.0, 0.0], [np.inf, 1.0, 2.0]):
         pictures.chi_square_histogram(np.array(each), np.full(len(each), 5))
