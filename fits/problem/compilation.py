@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 FULL = 0.5
 """Share of the maps that a process may have."""
@@ -58,6 +58,7 @@ def one_thread() -> Iterator[None]:
     with _Limit.lock:
         _Limit.calls += 1
         if _Limit.calls == 1:
+            _let_any_thread_limit()
             _Limit.limited = _libraries().limit(limits=1)
     try:
         yield
@@ -65,7 +66,15 @@ def one_thread() -> Iterator[None]:
         with _Limit.lock:
             _Limit.calls -= 1
             if not _Limit.calls:
+                _let_any_thread_limit()
                 _Limit.limited.restore_original_limits()
+                _let_any_thread_limit()
+
+
+def _let_any_thread_limit() -> None:
+    """threadpoolctl 3.7 and later ignores, without a word, all threads but the first that set a limit."""
+    if hasattr(OpenBLASController, "clear_controlling_thread"):
+        OpenBLASController.clear_controlling_thread(force=True)
 
 
 @cache

@@ -32,6 +32,7 @@ class Ensemble:
 
     def __init__(self, fit: Fit, chain: MemoryChain, seed: int):
         self.problem, self.chain, self.seed = fit.problem, chain, seed
+        self._compiled: set[int] = set()  # sizes of batches
         self.initial: Proposals = Mixture.of(fit) or Approximation.of(fit)
 
     def decide(self) -> None:
@@ -57,7 +58,10 @@ class Ensemble:
 
     def _log_posteriors(self, positions: Floats) -> Floats:
         share = max(1, len(positions) // cores())
-        (heights,) = in_shares(lambda part: [self.problem.call(log_posteriors, part)], positions, share)
+        (heights,) = in_shares(
+            lambda part: [self.problem.call(log_posteriors, part)], positions, share, share in self._compiled
+        )
+        self._compiled.add(share)
         return heights
 
     def _first_state(self) -> emcee.State:

@@ -1,5 +1,6 @@
 """Compiled programs run by themselves, whatever other libraries do with threads."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import equinox as eqx
@@ -29,6 +30,14 @@ def test_matrices_are_solved_by_one_thread_and_the_others_come_back() -> None:
     arrays, static = eqx.partition((), eqx.is_array)
     with threadpool_limits(2):
         assert int(run(most, (arrays, Static(static)))) == 1
+        assert threads() == {2}
+
+
+def test_programs_of_other_threads_are_limited_too() -> None:
+    arrays, static = eqx.partition((), eqx.is_array)
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:  # this thread has set a limit before
+        program = (arrays, Static(static))
+        assert [int(seen) for seen in pool.map(lambda _: run(most, program), range(4))] == [1] * 4
         assert threads() == {2}
 
 
