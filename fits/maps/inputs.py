@@ -288,6 +288,7 @@ class MapData:
         if not isinstance(values, str | os.PathLike):
             return None
         geometry = geometry if self.geometry is None else (self.geometry.wi, self.geometry.wo)
+        sigma = None if self.sigma is None else sigma  # which a noise model may leave out
         values, geometry, sigma, mask = (
             os.path.abspath(one) if isinstance(one, str | os.PathLike) else one
             for one in (values, geometry, sigma, mask)

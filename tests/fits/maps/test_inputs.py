@@ -1,6 +1,7 @@
 """Measurements of a map by blocks: every source gives the same numbers, and what is wrong is named."""
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ def test_each_source_gives_the_same_blocks(tmp_path: Path) -> None:
         assert found.fingerprints() == expected
         assert (found.portable is not None) == isinstance(source, str | Path)
         if found.portable is not None:
+            assert replace(map_data(source, VIEW, sigma=SIGMA), sigma=None).portable[2] is None
             small = pickle.dumps(found.portable)
             assert len(small) < 2000
             again = map_data(*pickle.loads(small))
