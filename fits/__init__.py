@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from fits.exports.export import ExportReport as ExportReport
     from fits.exports.export import export as export
     from fits.maps.fit_map import fit_map as fit_map
-    from fits.maps.fitted_map import FittedMap as FittedMap
-    from fits.maps.fitted_map import open_map as open_map
     from fits.maps.options import MapOptions as MapOptions
     from fits.maps.options import SpatialPrior as SpatialPrior
+    from fits.maps.store import FittedMap as FittedMap
+    from fits.maps.store import open_map as open_map
     from fits.optimise.fit import fit as fit
     from fits.optimise.options import FitOptions as FitOptions
     from fits.optimise.result import Fit as Fit
@@ -90,8 +90,8 @@ _HOMES = {
     "Fit": "optimise.result",
     "FitOptions": "optimise.options",
     "fit_map": "maps.fit_map",
-    "FittedMap": "maps.fitted_map",
-    "open_map": "maps.fitted_map",
+    "FittedMap": "maps.store",
+    "open_map": "maps.store",
     "MapOptions": "maps.options",
     "SpatialPrior": "maps.options",
     "ModelScore": "prediction.cross_validation",

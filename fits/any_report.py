@@ -5,8 +5,8 @@ from pathlib import Path
 
 from fits._files import write_text
 from fits.data.measurements import Measurements
-from fits.maps.fitted_map import FittedMap
 from fits.maps.report import page
+from fits.maps.store import FittedMap
 from fits.optimise.result import Fit
 from fits.reports import html
 from fits.reports.verdicts import DEFAULT, ReportOptions

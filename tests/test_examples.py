@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fits.maps.fitted_map import open_map
+from fits.maps.store import open_map
 from tests.helpers.places import ROOT
 
 

@@ -36,7 +36,6 @@ def fit_map(arguments: Namespace) -> int:
         prior = SpatialPrior(arguments.spatial_prior, scales.get("", scales), arguments.spatial_rounds)
     use_jax()
     from fits.maps.fit_map import fit_map as run
-    from fits.maps.fitted_map import summarise
     from fits.maps.report import tables
     from fits.problem.stack_file import read_problem
 
@@ -69,7 +68,7 @@ def fit_map(arguments: Namespace) -> int:
                 progress=progress,
             ),
         )
-    found, common = summarise(map), replace(tables.common_table(map), title="Common to all texels")
+    found, common = tables.summarise(map), replace(tables.common_table(map), title="Common to all texels")
     show(tables.count_table(found), tables.quartile_table(found, map), *([common] if common.rows else []))
     if prior is not None:
         show(tables.smoothing_words(map))
@@ -85,9 +84,9 @@ def report_map(arguments: Namespace) -> int:
     path = Path(arguments.directory)
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
     refuse_existing(out, arguments.force)
-    from fits.maps.fitted_map import open_map
     from fits.maps.report import page, tables
     from fits.maps.report.verdicts import verdict
+    from fits.maps.store import open_map
 
     map = open_map(arguments.directory)
     with show_progress() as progress:

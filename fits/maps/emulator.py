@@ -8,8 +8,9 @@ each series needs, and solutions elsewhere whether they were enough.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,6 +28,7 @@ from fits.problem.problem import Problem
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Truths = NDArray[np.bool_]
 
 CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 """Lines through the box beside its middle, nodes on each, points that are checked, and emulators tried."""
@@ -85,15 +87,13 @@ class Emulator(eqx.Module):
         width = self.high - self.low
         x = jnp.clip(2.0 * (coordinate - self.low) / width - 1.0, -1.0, 1.0)
         rate = 2.0 / width * jnp.where(self.logarithmic, 1.0 / tame, 1.0)
-        sums = self._products(x) @ self.coefficients[channel]
-        of_data = sums @ self.directions[channel]
+        of_data = self._products(x) @ self.coefficients[channel] @ self.directions[channel]
         total = jnp.exp(of_data[0] + self.mean[channel])
         return total - self.offset[channel], (of_data[1:] * rate[:, None] * total).T
 
     def _products(self, x: Array) -> Array:
         """The M terms at x (D,), then their derivatives by each coordinate, (1 + D, M)."""
-        count = self.highest + 1
-        parts = [chebyshev(x[place], count) for place in range(x.size)]
+        parts = [chebyshev(x[place], self.highest + 1) for place in range(x.size)]
         basis, slope = ([part[which][self.orders[:, place]] for place, part in enumerate(parts)] for which in (0, 1))
         before = [jnp.ones(len(self.orders), x.dtype)]
         for factor in basis:
@@ -143,22 +143,7 @@ def with_emulator(model: Model, emulator: Emulator) -> EmulatedModel:
     return EmulatedModel(**{one.name: getattr(model, one.name) for one in fields(Model)}, emulator=emulator)
 
 
-def coarser(emulator: Emulator) -> Emulator:
-    """The emulator without the last terms of each series: how far it differs tells of its error."""
-    last = jnp.max(emulator.orders, axis=0)
-    kept = jnp.all(emulator.orders < jnp.maximum(last, 1), axis=1)
-    return eqx.tree_at(lambda t: t.coefficients, emulator, jnp.where(kept[:, None], emulator.coefficients, 0.0))
-
-
 # ---- how it is made ----
-
-
-class Tried(NamedTuple):
-    """An emulator, or None, its largest error at points that it had not seen, in standard deviations, and words."""
-
-    problem: Problem | None
-    error: float
-    words: str
 
 
 @dataclass(frozen=True)
@@ -169,14 +154,13 @@ class _Space:
     places: Integers
     low: Floats
     high: Floats
-    logarithmic: NDArray[np.bool_]
+    logarithmic: Truths
 
     def ends(self) -> tuple[Floats, Floats]:
-        """The number of coordinates."""
-        low, high = (
-            np.where(self.logarithmic, np.log(np.where(self.logarithmic, end, 1.0)), end)
-            for end in (self.low, self.high)
-        )
+        """Of the coordinates, (D,) each."""
+        safe = (np.where(self.logarithmic, end, 1.0) for end in (self.low, self.high))
+        logs = map(np.log, safe)
+        low, high = (np.where(self.logarithmic, log, end) for log, end in zip(logs, (self.low, self.high), strict=True))
         return low, high
 
     def vectors(self, points: Floats) -> Floats:
@@ -196,34 +180,37 @@ class _Space:
         return values, sigma
 
 
-def emulate(problem: Problem, options: MapOptions = USUAL) -> Tried:
-    """The problem with an emulator of its transport over the box of its parameters, if one that holds can be made."""
+def emulate(problem: Problem, options: MapOptions = USUAL) -> tuple[Emulator | None, str]:
+    """An emulator of a problem's transport over the box of its parameters, if one that holds can be made; in words."""
     places = _places(problem)
     if isinstance(places, str):
-        return Tried(None, np.inf, places)
-    most, tolerance = options.emulator_max_solves, 0.5 * options.emulator_error
-    low, high = problem.low[places].min(axis=0), problem.high[places].max(axis=0)
+        return None, places
+    tolerance, low, high = 0.5 * options.emulator_error, problem.low[places].min(0), problem.high[places].max(0)
     space = _Space(problem, places, low, high, np.zeros(len(low), bool))
     chosen = _chosen(space, tolerance)
     if chosen is None:
-        return Tried(None, np.inf, f"no series of less than {LINE_NODES} terms a parameter holds")
+        return None, f"no series of less than {LINE_NODES} terms a parameter holds"
     needed, logarithmic, offset = chosen
-    space, error = replace(space, logarithmic=logarithmic), np.inf
+    space = replace(space, logarithmic=logarithmic)
     terms = tuple(max(2, int(count / MORE)) for count in needed)
     for _ in range(ROUNDS):
         solves = int(np.prod(terms))
-        if solves > most:
+        if solves > options.emulator_max_solves:
             break
         options.tell("emulator", 0, solves, " x ".join(map(str, terms)))
         emulator = _made(space, terms, offset, tolerance)
+        # the largest error at points that it has not seen, in standard deviations of the data
+        points = 2.0 * qmc.Sobol(len(low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0
+        values, sigma = space.values(points)
         ready = problem.with_model(with_emulator(problem.model, emulator))
-        error = _error(space, ready)
-        words = f"an emulator of {len(emulator.orders):,} terms from {solves:,} solutions, error {error:.2g} sd"
+        error = float(np.max(np.abs(np.asarray(ready.call(_emulated, space.vectors(points))) - values) / sigma))
         if error <= options.emulator_error:
-            return Tried(ready, error, words)
+            return emulator, (
+                f"an emulator of {len(emulator.orders):,} terms from {solves:,} solutions, error {error:.2g} sd"
+            )
         terms = tuple(int(np.ceil(MORE * count)) for count in terms)
-    count = int(np.prod(terms))
-    return Tried(None, error, f"an emulator of {count:,} solutions would be needed, of {most:,} allowed")
+    solves = int(np.prod(terms))
+    return None, f"an emulator of {solves:,} solutions would be needed, of {options.emulator_max_solves:,} allowed"
 
 
 def _places(problem: Problem) -> Integers | str:
@@ -246,7 +233,7 @@ def _places(problem: Problem) -> Integers | str:
     return np.array([[*common, *(places[channel] for places in own.values())] for channel in channels])
 
 
-def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[np.bool_], Floats] | None:
+def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Truths, Floats] | None:
     """How many terms each coordinate needs, which are logarithms, and the offset (N, C), by lines through the box."""
     count, nodes = len(space.low), _nodes(LINE_NODES)
     # through its middle and some of its corners, near which series are worst
@@ -265,7 +252,7 @@ def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[n
     best = None
     for offset in OFFSETS:
         shift = offset * np.mean(means, axis=0)
-        terms = [{way: _terms(lines[0], lines[1], shift, tolerance) for way, lines in ways.items()} for ways in found]
+        terms = [{way: _terms(lines, shift, tolerance) for way, lines in ways.items()} for ways in found]
         logs = [min(ways, key=ways.__getitem__) for ways in terms]
         needed = tuple(ways[way] for ways, way in zip(terms, logs, strict=True))
         if max(needed) < LINE_NODES and (best is None or np.prod(needed) < np.prod(best[0])):
@@ -273,8 +260,10 @@ def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], NDArray[n
     return best
 
 
-def _terms(values: Floats, sigma: Floats, offset: Floats, tolerance: float) -> int:
-    """Terms that a series needs on lines, (lines, nodes, N, C); as many as there are nodes where none suffice."""
+def _terms(lines: Sequence[Floats], offset: Floats, tolerance: float) -> int:
+    """Terms that a series needs for values with these standard deviations on lines, (lines, nodes, N, C) each; as many
+    as there are nodes where none suffice."""
+    values, sigma = lines
     if np.any(values + offset <= 0.0):
         return LINE_NODES
     series = np.abs(_series(np.log(values + offset), 1))
@@ -317,9 +306,9 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
     order = np.argsort(sizes)
     kept = np.ones(len(sizes), bool)
     kept[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
-    low, high = space.ends()
+    orders, (low, high) = grid([np.arange(count) for count in terms])[kept], space.ends()
     return Emulator(
-        orders=jnp.asarray(grid([np.arange(count) for count in terms])[kept]),
+        orders=jnp.asarray(orders),
         coefficients=jnp.asarray(series[:, kept]),
         directions=jnp.asarray(directions),
         mean=jnp.asarray(mean.T),
@@ -328,7 +317,7 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
         low=jnp.asarray(low),
         high=jnp.asarray(high),
         places=jnp.asarray(space.places),
-        highest=max(terms) - 1,
+        highest=int(orders.max()),
     )
 
 
@@ -339,14 +328,6 @@ def _compressed(values: Floats, influence: Floats, tolerance: float) -> tuple[Fl
     rest = np.sqrt(np.cumsum((left * sizes)[:, ::-1] ** 2, axis=1))[:, ::-1].max(axis=0)
     rank = max(1, int(np.sum(rest > 0.2 * tolerance)))
     return left[:, :rank] * sizes[:rank], right[:rank] / influence
-
-
-def _error(space: _Space, ready: Problem) -> float:
-    """The largest error of an emulator at points that it has not seen, in standard deviations of the data."""
-    points = 2.0 * qmc.Sobol(len(space.low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0
-    values, sigma = space.values(points)
-    found = np.asarray(ready.call(_emulated, space.vectors(points)), float)
-    return float(np.max(np.abs(found - values) / sigma))
 
 
 def _unscaled(model: Model, vectors: Array) -> tuple[Array, Array]:

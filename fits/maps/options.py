@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args
 
-import numpy as np
-
 from fits.names import Objective
 from fits.problem.instrument import Instrument
 from fits.problem.parameters import Free
 from fits.progress import Progress
+from layerjax._checks import require_choice, require_count, require_kind
 
 Kind = Literal["gaussian", "total_variation"]
 SCALES = 1e-6, 1e6
@@ -41,15 +40,14 @@ class SpatialPrior:
     rounds: int = 10
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"SpatialPrior.kind is {self.kind!r}; it must be one of {', '.join(get_args(Kind))}")
+        require_choice("SpatialPrior.kind", self.kind, get_args(Kind))
         given = self.scale if isinstance(self.scale, Mapping) else {"": self.scale}
         if not given:
             raise ValueError("SpatialPrior.scale is empty; it must name a parameter, or be a number")
         where = {name: f"SpatialPrior.scale[{name!r}]" if name else "SpatialPrior.scale" for name in given}
         checked = {str(name): _number(where[name], one, *SCALES) for name, one in given.items()}
         object.__setattr__(self, "scale", checked if isinstance(self.scale, Mapping) else checked[""])
-        _whole("SpatialPrior.rounds", self.rounds, 1)
+        require_count("SpatialPrior.rounds", self.rounds, 1)
 
     def scales(self, names: Sequence[str]) -> dict[str, float]:
         """Of those of these parameters that are smoothed. ValueError: a scale is of none of them."""
@@ -127,13 +125,12 @@ class MapOptions:
     def __post_init__(self) -> None:
         for name, least in {"starts": 1, "seed": 0, "pilot_texels": 1, "chunk_size": 1, "restarts": 0, "processes": 1,
                             "emulator_min_texels": 0, "emulator_max_solves": 1}.items():  # fmt: skip
-            _whole(name, getattr(self, name), least)
+            require_count(name, getattr(self, name), least)
         for name in ("emulator_error", "settled", "pilot_factor", "numerical_error", "chi_square_sigmas"):
             _number(name, getattr(self, name), 0.0, math.inf)
         for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
             _number(name, getattr(self, name), 0.0, 1.0)
-        if not isinstance(self.spatial_prior, SpatialPrior | None):
-            raise ValueError(f"spatial_prior is {self.spatial_prior!r}; it must be a fits.SpatialPrior, or None")
+        require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
 
     @property
     def model(self) -> dict[str, Any]:
@@ -149,11 +146,6 @@ class MapOptions:
         """Report progress, where somebody listens."""
         if self.progress is not None:
             self.progress(stage, done, total, note)
-
-
-def _whole(name: str, value: object, least: int) -> None:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name} is {value!r}; it must be a whole number of at least {least}")
 
 
 def _number(name: str, value: Any, low: float, high: float) -> float:

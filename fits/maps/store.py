@@ -1,17 +1,15 @@
-"""The store of a fitted map: a group of zarr that grows chunk by chunk, and whose map it is.
+"""The store of a fitted map: a group of zarr that grows chunk by chunk, read by `FittedMap` and written by `Store`.
 
 A directory of zarr version 3 with the arrays ``values/NAME``, ``errors/NAME``, ``reduced_chi_square``, ``flags``,
-``start``, ``at_bound``, ``measurements`` and, where the transport has one, ``numerical_error``, all of the map's shape,
-in chunks of the same texels, uncompressed and with zarr's checksums. The flags of a chunk are written last: a texel
-whose flags are 0 is not there yet, whatever else is. One process at a time writes (it holds a lock); readers change
-nothing.
+``start``, ``at_bound`` and ``measurements``, all of the map's shape, in chunks of the same texels, uncompressed and
+with zarr's checksums; and the groups ``pilot`` and, with a spatial prior, ``smoothed``. The flags of a chunk are
+written last: a texel whose flags are 0 is not there yet, whatever else is. One process at a time writes (it holds a
+lock); readers change nothing.
 """
 
 import asyncio
-import functools
 import glob
 import itertools
-import json
 import os
 import shutil
 import tempfile
@@ -19,10 +17,8 @@ import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from types import CodeType
 from typing import Any
 
-import jax
 import numpy as np
 import zarr
 from numpy.typing import NDArray
@@ -30,11 +26,14 @@ from zarr.codecs import Crc32cCodec
 from zarr.core.sync import sync
 
 from fits._files import named, permissions, plain, require_there
+from fits._lazy import shown_by
 from fits.maps.inputs import UNREADABLE, Block
-from fits.problem.parameters import is_free
-from fits.store import portable_repr
+from fits.store import another, differences
 
-ROOT, KEY, KIND, FORMAT = "zarr.json", "layerjax", "fitted map", 3
+Floats = NDArray[np.float64]
+
+ROOT, KEY, KIND, FORMAT = "zarr.json", "layerjax", "fitted map", 4
+PILOT, SMOOTHED = "pilot", "smoothed"
 PARTIAL = ".partial"
 """How names end, here and in zarr, of what has not been written to its end."""
 
@@ -54,19 +53,17 @@ FLAGS = {
 NO_START = -32768
 """In ``start``: the texel is not fitted. Others: -1 a neighbour's values, -2 random ones, else the start's number."""
 
-MOST_NAMES = 64  # bits of at_bound
 CHECKSUM = (Crc32cCodec(),)
 
 
-def arrays_of(names: Sequence[str], numerical: bool) -> dict[str, tuple[np.dtype, Any]]:
+def arrays_of(names: Sequence[str]) -> dict[str, tuple[np.dtype, Any]]:
     """Path, type and fill value of every array of a store, the flags last."""
-    number, places = np.dtype(np.float64), np.dtype(np.uint32 if len(names) <= 32 else np.uint64)
+    number = np.dtype(np.float64)
     return {
         **{f"{group}/{name}": (number, np.nan) for group in ("values", "errors") for name in names},
         "reduced_chi_square": (number, np.nan),
-        **({"numerical_error": (number, np.nan)} if numerical else {}),
         "start": (np.dtype(np.int16), NO_START),
-        "at_bound": (places, 0),
+        "at_bound": (np.dtype(np.uint32), 0),
         "measurements": (np.dtype(np.uint32), 0),
         "flags": (np.dtype(np.uint16), 0),
     }
@@ -80,7 +77,199 @@ def blocks_of(shape: Sequence[int], chunk: Sequence[int]) -> Iterator[Block]:
         )
 
 
-# ---- making, and what it says of itself ----
+# ---- reading ----
+
+
+class FittedMap:
+    """Parameters of every texel of a map, with errors and flags; arrays are read when they are accessed.
+
+    Of a store that still grows the parts that are not there have flags of 0; asking again reads again.
+    `map["values/base.albedo"]` is the array of zarr, to be read in parts.
+
+    Attributes:
+        path: of the store.
+        names: of the parameters, as in `Problem.names`.
+        units: of each parameter by name; "1" for plain ratios.
+        shape: of the map.
+        chunk: texels along each axis of what is written at once.
+        attributes: what the store says of how it was made.
+    """
+
+    def __init__(self, path: str | Path, mode: Any = "r"):
+        self.path, self.attributes = Path(path), _attributes(Path(path))
+        about = self.attributes
+        if about.get("format") != FORMAT:
+            raise ValueError(f"{path}: is version {about.get('format')} of the format, must be {FORMAT}")
+        try:
+            self.names, self.units = tuple(about["names"]), dict(about["units"])
+            self.shape, self.chunk = tuple(about["shape"]), tuple(about["chunk"])
+            self.root = zarr.open_group(self.path, mode=mode)
+            for name, array in self.arrays.items():
+                if array.shape != self.shape:
+                    raise ValueError(f"{name} has shape {array.shape}, must be {self.shape}")
+        except Exception as error:  # whatever a description that is none leads to
+            raise ValueError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())}") from None
+
+    @cached_property
+    def arrays(self) -> dict[str, Any]:
+        """Arrays of zarr by their paths, all but those of a spatial prior."""
+        return {name: self.root[name] for name in arrays_of(self.names)}
+
+    @property
+    def values(self) -> Mapping[str, Floats]:
+        """Fitted values by name, each of the map's shape, in the parameter's unit; NaN where nothing is fitted."""
+        return _Arrays(self, "values")
+
+    @property
+    def errors(self) -> Mapping[str, Floats]:
+        """Standard errors by name; NaN at a bound, infinite where nothing holds a parameter."""
+        return _Arrays(self, "errors")
+
+    @property
+    def smoothed(self) -> Mapping[str, Floats] | None:
+        """Values of the map with a spatial prior, by name; None if there was none."""
+        return None if self.smoothing is None else _Arrays(self, f"{SMOOTHED}/values")
+
+    @property
+    def smoothed_errors(self) -> Mapping[str, Floats] | None:
+        """Their standard errors by name, with the neighbours of a texel held where they are; None as `smoothed`."""
+        return None if self.smoothing is None else _Arrays(self, f"{SMOOTHED}/errors")
+
+    @property
+    def smoothing(self) -> dict[str, Any] | None:
+        """How the map was smoothed: its prior, rounds, largest moves, whether it settled; None if it was not."""
+        try:
+            about: Any = self.root[SMOOTHED].attrs[KEY]
+        except KeyError:
+            return None
+        return (
+            {name: one for name, one in about.items() if name not in ("arrays", "finished")}
+            if about["finished"]
+            else None
+        )
+
+    @property
+    def reduced_chi_square(self) -> Floats:
+        """Chi-square per degree of freedom of every texel."""
+        return self.read("reduced_chi_square")
+
+    @property
+    def flags(self) -> NDArray[np.uint16]:
+        """What became of every texel, in bits (see `has`); 0: it is not there yet."""
+        return self.read("flags")
+
+    @property
+    def start(self) -> NDArray[np.int16]:
+        """Which start the best fit came from; -1: a neighbour's values, -2: random ones, -32768: it is not fitted."""
+        return self.read("start")
+
+    @property
+    def at_bound(self) -> NDArray[np.uint32]:
+        """Which parameters are at a bound: bit p for `names[p]`."""
+        return self.read("at_bound")
+
+    @property
+    def measurements(self) -> NDArray[np.uint32]:
+        """How many measurements entered."""
+        return self.read("measurements")
+
+    @property
+    def numerical_error(self) -> float | None:
+        """Largest numerical error of the model, in standard deviations of the data, over the texels of the pilot; None
+        for transports that have none."""
+        error = self.attributes["numerical"].get("error")
+        return None if error is None else float(error)
+
+    @property
+    def done(self) -> float:
+        """The share of texels that are there."""
+        return float(np.count_nonzero(self.flags)) / float(np.prod(self.shape))
+
+    def has(self, meaning: str) -> NDArray[np.bool_]:
+        """Which texels have a flag.
+
+        Args:
+            meaning: "fitted", "converged", "at_bound", "poor" (chi-square above what noise and the pilot explain),
+                "restarted", "masked", "too_few_measurements", "failed" (no finite value) or "unidentified".
+        """
+        if meaning not in FLAGS:
+            raise ValueError(f"meaning: {meaning!r} given, must be one of {', '.join(FLAGS)}")
+        return (self.flags & FLAGS[meaning]) != 0
+
+    def option(self, name: str) -> Any:
+        """A number of the `MapOptions` that the map was fitted with."""
+        from fits.maps.options import MapOptions
+
+        return self.attributes.get("options", {}).get(name, getattr(MapOptions, name))
+
+    def __getitem__(self, path: str) -> "zarr.Array[Any]":
+        own = path.removeprefix(f"{SMOOTHED}/")
+        if own not in self.arrays or (own != path and self.smoothing is None):
+            raise KeyError(f"{path!r} is not one of {', '.join(self.arrays)}")
+        return self.root[path]  # type: ignore[return-value]
+
+    def read(self, path: str) -> Any:
+        """A whole array. ValueError, on one line, that names it: a chunk is damaged."""
+        array = self[path]
+        try:
+            return np.asarray(array[...])
+        except Exception as error:  # codecs raise what they like
+            raise ValueError(f"{self.path}/{path}: damaged, {' '.join(str(error).split())}") from None
+
+    def __repr__(self) -> str:
+        size = " x ".join(map(str, self.shape))
+        return f"<FittedMap of {size} texels, {100.0 * self.done:.4g} % done: {', '.join(self.names)}; {self.path}>"
+
+    def _repr_html_(self) -> str:
+        return str(shown_by("fits.maps.report.verdicts:fragment", self))
+
+
+class _Arrays(Mapping[str, Floats]):
+    """Arrays of a group by the names of parameters, each read when it is accessed."""
+
+    def __init__(self, map: FittedMap, group: str):
+        self._map, self._group = map, group
+
+    def __getitem__(self, name: str) -> Floats:
+        if name not in self._map.names:
+            raise KeyError(f"{name!r} is not one of {', '.join(self._map.names)}")
+        found: Floats = self._map.read(f"{self._group}/{name}")
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._map.names)
+
+    def __len__(self) -> int:
+        return len(self._map.names)
+
+    def __repr__(self) -> str:
+        return f"<{self._group} of {', '.join(self)}, each {' x '.join(map(str, self._map.shape))}>"
+
+
+def open_map(path: str | Path) -> FittedMap:
+    """Open the store of a fitted map, finished or not.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        ValueError: it is none, or its description is damaged.
+    """
+    return FittedMap(path)
+
+
+def _attributes(path: Path) -> dict[str, Any]:
+    """What the root of a store says under our key; ValueError for what is no such store."""
+    require_there(path, "no such file or directory")
+    try:
+        found: Any = zarr.open_group(path, mode="r").attrs[KEY]
+        if found["kind"] == KIND:
+            return found
+        reason = f"it holds a {found['kind']}"
+    except Exception as error:  # whatever else stands there
+        reason = " ".join(f"{type(error).__name__} {error}".split())
+    raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it ({reason})")
+
+
+# ---- writing ----
 
 
 def create(
@@ -91,32 +280,34 @@ def create(
     shape: Sequence[int],
     chunk: Sequence[int],
     attributes: Mapping[str, Any],
-    numerical: bool,
 ) -> "Store":
     """Make an empty store, whole or not at all.
 
     Args:
-        names, units: of the parameters, at most 64 (the bits of ``at_bound``); "1" for plain ratios.
+        names, units: of the parameters, at most 32 (the bits of ``at_bound``); "1" for plain ratios.
         chunk: texels along each axis of what is written at once.
         attributes: what else the root says under the key "layerjax", such as how the map was fitted.
-        numerical: whether there is an array ``numerical_error``.
 
     Raises:
-        ValueError: there is something at `path`, or the names are too many.
+        ValueError: there is something at `path`.
     """
     if os.path.lexists(path):
         raise ValueError(f"{path}: exists already")
-    if len(names) > MOST_NAMES:
-        raise ValueError(f"names: {len(names)} parameters given, must be at most {MOST_NAMES}")
     about = {"kind": KIND, "format": FORMAT, "names": list(names), "units": {name: units[name] for name in names}}
-    about |= {"shape": list(shape), "chunk": list(chunk), "numerical_error": numerical}
+    about |= {"shape": list(shape), "chunk": list(chunk)}
+    described: dict[str, dict[str, Any]] = {  # by the CF conventions
+        "reduced_chi_square": {"long_name": "chi-square per degree of freedom"},
+        "start": {"long_name": f"start of the best fit; -1: a neighbour's values, -2: random ones, {NO_START}: none"},
+        "at_bound": {"long_name": "bit p: parameter p, in the order of the root's names, is at a bound"},
+        "measurements": {"long_name": "how many measurements entered"},
+        "flags": {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)},
+    }
     axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
     with named(path):
         new = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.resolve().parent))
-    try:
-        with named(path):
+        try:
             root = zarr.create_group(new, attributes={KEY: plain({**attributes, **about})})
-            for name, (dtype, fill) in arrays_of(names, numerical).items():
+            for name, (dtype, fill) in arrays_of(names).items():
                 root.create_array(
                     name,
                     shape=tuple(shape),
@@ -125,89 +316,21 @@ def create(
                     fill_value=fill,
                     compressors=CHECKSUM,
                     dimension_names=axes,
-                    attributes=_described(name, units),
+                    attributes=described.get(name) or {"units": units[name.partition("/")[2]]},
                 )
             os.chmod(new, permissions(0o777))  # mkdtemp makes what only its owner can read
             os.rename(new, path)
-    except BaseException:
-        shutil.rmtree(new, ignore_errors=True)
-        raise
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)
+            raise
     return Store(path)
 
 
-def _described(name: str, units: Mapping[str, str]) -> dict[str, Any]:
-    """Attributes of an array, by the CF conventions."""
-    if "/" in name:
-        return {"units": units[name.partition("/")[2]]}
-    if name == "flags":
-        return {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)}
-    words = {
-        "reduced_chi_square": "chi-square per degree of freedom",
-        "numerical_error": "numerical error of the model, in standard deviations of the data",
-        "start": f"start of the best fit; -1: a neighbour's values, -2: random ones, {NO_START}: none",
-        "at_bound": "bit p: parameter p, in the order of the root's names, is at a bound",
-        "measurements": "how many measurements entered",
-    }
-    return {"units": "1", "long_name": words[name]}
+class Store(FittedMap):
+    """A fitted map that is written; opened once in each process."""
 
-
-def is_store(path: str | Path) -> bool:
-    """Whether this is a directory of zarr, of whatever content."""
-    return (Path(path) / ROOT).is_file()
-
-
-def attributes_of(path: Path) -> dict[str, Any]:
-    """What the root of a store says under our key; ValueError that says what `path` is instead."""
-    must = f"must be the store of a {KIND}, as `layerjax fit-map` writes it"
-    require_there(path, "no such file or directory")
-    if not path.is_dir():
-        raise ValueError(f"{path}: is a file, {must}")
-    if not is_store(path):
-        raise ValueError(f"{path}: is a directory without {ROOT}, {must}")
-    try:
-        described = json.loads((path / ROOT).read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path / ROOT}: damaged, not valid JSON: {error}") from None
-    if not isinstance(described, dict) or described.get("node_type") != "group":
-        raise ValueError(f"{path}: is no group of zarr arrays, {must}")
-    attributes = described.get("attributes")
-    found = attributes.get(KEY) if isinstance(attributes, dict) else None
-    if not isinstance(found, dict):
-        raise ValueError(f"{path}: is a zarr group that is not ours, {must}")
-    if found.get("kind") != KIND:
-        raise ValueError(f"{path}: holds a {found.get('kind')}, must be a {KIND}")
-    return found
-
-
-# ---- reading and writing ----
-
-
-class Store:
-    """The arrays of a store, opened once in each process.
-
-    Raises:
-        ValueError: it is none, of another version, or its description is damaged.
-    """
-
-    def __init__(self, path: str | Path, mode: Any = "r+"):
-        self.path, self.about = Path(path), attributes_of(Path(path))
-        if self.about.get("format") != FORMAT:
-            raise ValueError(f"{path}: is version {self.about.get('format')} of the format, must be {FORMAT}")
-        try:
-            self.names, self.units = tuple(self.about["names"]), dict(self.about["units"])
-            self.shape, self.chunk = tuple(self.about["shape"]), tuple(self.about["chunk"])
-            self.types = arrays_of(self.names, self.about["numerical_error"])
-            self.root = zarr.open_group(self.path, mode=mode)
-            for name, array in self.arrays.items():
-                if array.shape != self.shape:
-                    raise ValueError(f"{name} has shape {array.shape}, must be {self.shape}")
-        except Exception as error:  # whatever a description that is none leads to
-            raise ValueError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())}") from None
-
-    @cached_property
-    def arrays(self) -> dict[str, Any]:
-        """Checksums by path."""
-        return {name: self.root[name] for name in self.types}
+    def __init__(self, path: str | Path):
+        super().__init__(path, "r+")
 
     def write(self, block: Block, results: Mapping[str, np.ndarray]) -> None:
         """Write one chunk, its flags last. OSError: it names the store.
@@ -216,41 +339,32 @@ class Store:
         """
 
         async def write(names: Iterable[str]) -> None:  # together, which takes half the time
-            parts = {name: np.asarray(results[name], self.types[name][0]) for name in names}
-            await asyncio.gather(*(self.arrays[name].async_array.setitem(block, part) for name, part in parts.items()))
+            parts = {name: np.asarray(results[name], array.dtype) for name, array in self.arrays.items()}
+            await asyncio.gather(*(self.arrays[name].async_array.setitem(block, parts[name]) for name in names))
 
         with named(self.path):
             os.stat(self.path)  # one that was removed is not made again
-            sync(write(self.types.keys() - {"flags"}))
+            sync(write(self.arrays.keys() - {"flags"}))
             sync(write(["flags"]))
 
-    def flags(self, block: Block) -> NDArray[np.uint16] | None:
+    def whole(self, block: Block = ()) -> NDArray[np.uint16] | None:
         """The flags of a part of the map; None if it is not whole: a flag is 0, an array is damaged or lacks values."""
         try:
-            flags = np.asarray(self.arrays["flags"][block])
-            if not flags.all():
-                return None
-            fitted = (flags & FLAGS["fitted"]) != 0
-            for name, array in self.arrays.items():
-                part = np.asarray(array[block])
-                if name.startswith("values/") and not np.isfinite(part[fitted]).all():
-                    return None
+            found = {name: np.asarray(array[block]) for name, array in self.arrays.items()}
         except Exception:  # codecs raise what they like
             return None
-        return flags
+        fitted = (found["flags"] & FLAGS["fitted"]) != 0
+        lacking = [name for name in self.names if not np.isfinite(found[f"values/{name}"][fitted]).all()]
+        return None if lacking or not found["flags"].all() else found["flags"]
 
     def unfinished(self) -> list[Block]:
         """The chunks that are not there whole, in their order."""
-        if self.flags(()) is not None:  # at once, much faster than one by one
+        if self.whole() is not None:  # at once, much faster than one by one
             return []
-        return [block for block in blocks_of(self.shape, self.chunk) if self.flags(block) is None]
+        return [block for block in blocks_of(self.shape, self.chunk) if self.whole(block) is None]
 
-    def clean(self, unfinished: Sequence[Block]) -> None:
-        """Remove what writers that were killed left of these chunks and of files; none may be writing."""
-        for block in unfinished:
-            place = tuple(one.start // side for one, side in zip(block, self.chunk, strict=True))
-            for name, array in self.arrays.items():
-                (self.path / name / array.metadata.encode_chunk_key(place)).unlink(missing_ok=True)
+    def clean(self) -> None:
+        """Remove what writers that were killed left of files; none may be writing."""
         for path in list(self.path.rglob(f"*{PARTIAL}")):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
@@ -262,22 +376,24 @@ class Store:
         attributes: Mapping[str, Mapping[str, Any]] | None = None,
         **options: Any,
     ) -> None:
-        """Write a group of arrays, in place of what is there, that is whole once its attributes are. OSError: named.
+        """Write a group of arrays, whole or not at all, in place of what is there. OSError: named.
 
         attributes: of the arrays. options: of all, as zarr takes them.
         """
+        place, new = self.path / name, self.path / f"{name}{PARTIAL}"
         with named(self.path):
-            shutil.rmtree(self.path / name, ignore_errors=True)
-            group = self.root.create_group(name)
-            for path, array in arrays.items():
-                group.create_array(
-                    path,
-                    data=np.ascontiguousarray(array),
-                    compressors=CHECKSUM,
-                    attributes=dict((attributes or {}).get(path, {})),
-                    **options,
-                )
-            group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
+            shutil.rmtree(new, ignore_errors=True)
+            try:
+                group = self.root.create_group(new.name)
+                for path, array in arrays.items():
+                    own, numbers = dict((attributes or {}).get(path, {})), np.ascontiguousarray(array)
+                    group.create_array(path, data=numbers, compressors=CHECKSUM, attributes=own, **options)
+                group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
+            except BaseException:
+                shutil.rmtree(new, ignore_errors=True)
+                raise
+            shutil.rmtree(place, ignore_errors=True)
+            os.rename(new, place)
 
     def load_group(self, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
         """The arrays of a group and what it says of itself; None where it is not there whole, or damaged."""
@@ -292,18 +408,13 @@ class Store:
 # ---- whose map it is ----
 
 
-def require_folder(path: Path) -> None:
-    """Refuse a place whose folder is not there, before any work."""
-    if not path.resolve().parent.is_dir():
-        raise ValueError(f"{path}: there is no directory {path.parent}")
-
-
-def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None:
+def resume(path: Path, identity: Mapping[str, str], measurements: Sequence[str], force: bool) -> Store | None:
     """The store that is there, if it is of the same fit, without what killed writers left; None: there is none, or one
     to `throw_away`.
 
     Args:
         identity: fingerprints of what makes this fit, by name.
+        measurements: those of the data, part by part.
         force: throw away a map of another fit, or a damaged one.
 
     Raises:
@@ -313,73 +424,28 @@ def resume(path: Path, identity: Mapping[str, str], force: bool) -> Store | None
         shutil.rmtree(unfinished, ignore_errors=True)
     if not os.path.lexists(path):
         return None
-    if not is_store(path):
-        raise ValueError(f"{path}: is there, and is no fitted map; it must be the store of one, or not be there")
-    attributes_of(path)  # what is not ours is never touched
+    _attributes(path)  # what is not ours is never touched
     try:
         store = Store(path)
-        stored = store.about.get("fingerprints", {})
-        changed = [
-            name
-            for name in {**stored, **identity}
-            if not same_but_numbers(stored.get(name, ""), identity.get(name, ""))
-        ]
-        if changed:
-            raise ValueError(
-                f"{path}: holds a map of another fit, different in {', '.join(changed)} "
-                "(--force, or force=True, throws it away and begins anew)"
-            )
+        stored = store.attributes["measurements"]
+        different = differences(store.attributes["fingerprints"], identity)
+        same = len(stored) == len(measurements) and all(
+            one == other or UNREADABLE in (one, other) for one, other in zip(stored, measurements, strict=True)
+        )
+        if different or not same:
+            words = ", ".join(filter(None, (different, "" if same else "measurements")))
+            raise ValueError(f"{another(path, words)}; --force, or force=True, throws it away and begins anew")
     except ValueError:
         if force:
             return None
         raise
-    store.clean(store.unfinished())
+    store.clean()
     return store
 
 
 def throw_away(path: Path) -> None:
     """Remove the map that is there, if there is one; what is left of it where that is stopped `resume` takes away."""
-    if is_store(path):
+    if os.path.lexists(path):
         old = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PARTIAL}")
         os.rename(path, old)
         shutil.rmtree(old)
-
-
-def same_but_numbers(one: str, other: str) -> bool:
-    """Whether two fingerprints are the same, of which parts may be "?": of what could not be read at the time."""
-    parts = [each.split(",") for each in (one, other)]
-    same = all(a == b or UNREADABLE in (a, b) for a, b in zip(*parts, strict=False))
-    return same and len(parts[0]) == len(parts[1])
-
-
-def described(tree: Any, within: tuple[Any, ...] = ()) -> list[Any]:
-    """A tree as `fits.store.fingerprint` tells it from others: its structure and its numbers, and of functions their
-    names, what they do and what they hold; not what they find in global variables.
-
-    within: functions that hold the tree, or may be in it themselves.
-    """
-    leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
-    return [repr(structure), *(_function(leaf, within) if callable(leaf) else leaf for leaf in leaves)]
-
-
-def _function(function: Any, within: tuple[Any, ...]) -> Any:
-    if any(function is one for one in within):
-        return "itself"
-    within = (*within, function)
-    if isinstance(function, functools.partial):
-        return ["partial", described([function.func, function.args, function.keywords], within)]
-    name = f"{getattr(function, '__module__', '')}.{getattr(function, '__qualname__', portable_repr(function))}"
-    if hasattr(function, "__code__"):
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-        held = [cells, function.__defaults__, function.__kwdefaults__, getattr(function, "__self__", None)]
-        return [name, _code(function.__code__), described(held, within)]
-    return [name, _function(function.__wrapped__, within)] if hasattr(function, "__wrapped__") else name  # of jax.jit
-
-
-def _code(code: CodeType) -> list[Any]:
-    """Its instructions, and the names and constants that they are about."""
-    constants = [
-        _code(one) if isinstance(one, CodeType) else sorted(map(repr, one)) if isinstance(one, frozenset) else repr(one)
-        for one in code.co_consts
-    ]
-    return [code.co_code, code.co_names, constants]

@@ -62,7 +62,8 @@ PER_PARAMETER = tuple(field for field in Box.__dataclass_fields__ if field != "b
 class Assembled(NamedTuple):
     """What follows from a problem as it was given.
 
-    start, low, high: (P,). places: where the parameters of each data set stand in the vector, by its name.
+    start, low, high: (P,). places: where the parameters of each data set stand in the vector, by its name. free: the
+    parameters as they were given.
     """
 
     names: tuple[str, ...]
@@ -71,6 +72,7 @@ class Assembled(NamedTuple):
     high: Floats
     model: Any
     places: dict[str, tuple[int, ...]]
+    free: tuple[Free, ...] = ()
 
 
 class FittingProblem(abc.ABC):
@@ -231,6 +233,12 @@ class Problem(FittingProblem):
     @cached_property
     def _assembled(self) -> Assembled:
         return _assemble(self)
+
+    @property
+    def common_names(self) -> tuple[str, ...]:
+        """Names of the parameters that are the same for all texels of a map, one a channel where numbers are."""
+        marks = [one.same_for_all_texels for one in self._assembled.free for _ in range(one.arrays()[0].size)]
+        return tuple(name for name, marked in zip(self.names, marks, strict=True) if marked)
 
     @property
     def noise_is_assumed(self) -> bool:
@@ -448,7 +456,7 @@ def _assemble(problem: Problem) -> Assembled:
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-    return Assembled(names, start, low, high, model, {"": tuple(range(len(names)))})
+    return Assembled(names, start, low, high, model, {"": tuple(range(len(names)))}, free)
 
 
 def _require_kinds(problem: Problem) -> None:

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fits.maps.fitted_map import FittedMap, open_map
-from fits.maps.store import FLAGS, NO_START, blocks_of, create
+from fits.maps.store import FLAGS, NO_START, FittedMap, blocks_of, create, open_map
 
 NAMES = ("layers[0].thickness", "layers[0].phase.alpha", "base.albedo")
 UNITS = dict(zip(NAMES, ("optical depth", "1", "1"), strict=True))
@@ -27,12 +26,12 @@ ATTRIBUTES = {
 }
 
 
-def numbers(shape: tuple[int, ...], numerical: bool = False, seed: int = 0) -> dict[str, np.ndarray]:
+def numbers(shape: tuple[int, ...], seed: int = 0) -> dict[str, np.ndarray]:
     """Every array of a store in which all texels are fitted, converged and as good as noise allows."""
     rng = np.random.default_rng(seed)
     where = np.meshgrid(*(np.linspace(0.0, 1.0, size) for size in shape), indexing="ij")
     slope = sum(where) / len(shape)
-    found = {
+    return {
         f"values/{NAMES[0]}": 0.3 + slope**2,
         f"values/{NAMES[1]}": 0.2 + 0.1 * np.sin(6.0 * slope),
         f"values/{NAMES[2]}": 0.5 + 0.2 * where[0] + 0.01 * rng.standard_normal(shape),
@@ -45,7 +44,6 @@ def numbers(shape: tuple[int, ...], numerical: bool = False, seed: int = 0) -> d
         "measurements": np.full(shape, 64, np.uint32),
         "flags": np.full(shape, GOOD, np.uint16),
     }
-    return found | ({"numerical_error": 0.02 + 0.01 * rng.random(shape)} if numerical else {})
 
 
 def without(found: dict[str, np.ndarray], where: np.ndarray, flag: str) -> None:
@@ -75,7 +73,6 @@ def stored(
         shape=shape,
         chunk=tuple(map(min, chunk, shape)),
         attributes=ATTRIBUTES | more,
-        numerical="numerical_error" in found,
     )
     for block in list(blocks_of(shape, store.chunk))[:chunks]:
         store.write(block, {name: values[block] for name, values in found.items()})

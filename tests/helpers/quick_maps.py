@@ -10,8 +10,8 @@ import numpy as np
 import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
-from fits.maps.fitted_map import FittedMap
 from fits.maps.options import MapOptions
+from fits.maps.store import FittedMap
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
 NAMES = ("layers[0].thickness", "base.albedo")
@@ -48,14 +48,19 @@ def truth(shape: tuple[int, ...]) -> np.ndarray:
     return np.stack([0.2 + 0.8 * along, 0.8 - 0.6 * along], axis=-1)
 
 
-def seen(numbers: np.ndarray, view: Geometry, seed: int = 0) -> np.ndarray:
-    """Values with noise of texels with these numbers (..., 2): (..., N, 1)."""
+def exact(numbers: np.ndarray, view: Geometry) -> np.ndarray:
+    """Values of texels with these numbers (..., 2): (..., N, 1)."""
 
     def one(pair):
         return lj.evaluate(coat(*pair), jnp.asarray(view.wi), jnp.asarray(view.wo), transport=TRANSPORT)
 
-    exact = np.asarray(jax.jit(jax.vmap(one))(numbers.reshape(-1, 2))).reshape(*numbers.shape[:-1], -1, 1)
-    return exact * (1.0 + NOISE.relative * np.random.default_rng(seed).standard_normal(exact.shape))
+    return np.asarray(jax.jit(jax.vmap(one))(numbers.reshape(-1, 2))).reshape(*numbers.shape[:-1], -1, 1)
+
+
+def seen(numbers: np.ndarray, view: Geometry, seed: int = 0) -> np.ndarray:
+    """The same with noise."""
+    values = exact(numbers, view)
+    return values * (1.0 + NOISE.relative * np.random.default_rng(seed).standard_normal(values.shape))
 
 
 def values(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:

@@ -14,10 +14,9 @@ import fits
 import layerjax as lj
 from benchmarks.measuring.writing import Bar
 from benchmarks.suite.maps import Material, painted
-from fits.maps.chunk import Job, Task
-from fits.maps.inputs import map_data
+from fits.maps.inputs import Block, map_data
 from fits.maps.options import MapOptions
-from fits.maps.pilot import load
+from fits.maps.pilot import Job, load
 from fits.maps.store import Store, blocks_of
 
 Floats = NDArray[np.float64]
@@ -83,11 +82,10 @@ def stored(
         yield Given(stack, geometry, noise, transport, truth, path, Path(folder) / "map.zarr")
 
 
-def job_of(one: Given, chunk: int) -> tuple[Job, list[Task]]:
+def job_of(one: Given, chunk: int) -> tuple[Job, list[Block]]:
     """The work of a map that has been fitted, as its workers had it, and the tasks of all chunks."""
     data, store, options = map_data(one.values, one.geometry), Store(one.store), MapOptions(chunk_size=chunk)
     pilot = load(store, data, one.stack, one.noise, one.transport, options)
     assert pilot is not None
-    error = pilot.numerical_error
-    job = Job(str(one.store), pilot.problem, pilot.starts, pilot.floor, options, error, data.portable)
-    return job, [Task(block) for block in blocks_of(store.shape, store.chunk)]
+    job = Job(str(one.store), pilot, options, data.portable)
+    return job, list(blocks_of(store.shape, store.chunk))

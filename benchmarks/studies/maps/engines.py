@@ -23,8 +23,8 @@ from benchmarks.suite.maps import readings
 from fits.engines import run as run_tasks
 from fits.engines.processes import run_processes
 from fits.engines.worker import configure
-from fits.maps import search
-from fits.maps.chunk import Task
+from fits.maps import texels
+from fits.maps.inputs import Block
 
 PAIR, CLUSTER = Bar(1.8, 1.95, rate=True), Bar(0.9, 0.97, rate=True)
 OVERHEAD, MEMORY = Bar(50.0, 10.0), Bar(1.5, 0.7)
@@ -95,7 +95,7 @@ def by_workers(one: Given, size: Size, report: Report) -> list[Figure]:
 
 
 @contextmanager
-def _meeting(tasks: list[Task], repeats: int, workers: int) -> Iterator[list[Task | Meeting]]:
+def _meeting(tasks: list[Block], repeats: int, workers: int) -> Iterator[list[Block | Meeting]]:
     """The chunks so many times, and before them one for each worker, after which they wait for each other."""
     with tempfile.TemporaryDirectory(prefix="layerjax-meeting-") as folder:
         yield [Meeting(task, folder, workers) for task in (tasks * workers)[:workers]] + tasks * repeats
@@ -184,14 +184,14 @@ def _solving() -> Iterator[list[float]]:
     """Seconds of each call that solves texels, as they come."""
     spent: list[float] = []
 
-    call = search._call
+    call = texels._call
 
     def measured(*given: Any, **options: Any) -> Any:
         found: list[Any] = []
         spent.append(once(lambda: found.append(call(*given, **options))))
         return found[0]
 
-    with patch.object(search, "_call", measured):
+    with patch.object(texels, "_call", measured):
         yield spent
 
 

@@ -17,9 +17,10 @@ from benchmarks.studies.maps.cases import Case, Given, given, job_of
 from benchmarks.studies.maps.work import Texelwise, Timed, costs_at, rows_of, timed
 from fits.engines import Failure
 from fits.engines import run as run_tasks
-from fits.maps.chunk import Job, Task
-from fits.maps.fitted_map import FittedMap
-from fits.maps.search import predict_all
+from fits.maps.inputs import Block
+from fits.maps.pilot import Job, predict_all
+from fits.maps.search import sigmas
+from fits.maps.store import FittedMap
 
 Floats = NDArray[np.float64]
 Report = Callable[[str], None]
@@ -134,7 +135,7 @@ def measure(case: Case, one: Given, size: Size, with_peers: bool, report: Report
     )
 
 
-def cold_peak(job: Job, tasks: Sequence[Task]) -> int:
+def cold_peak(job: Job, tasks: Sequence[Block]) -> int:
     """The most memory that a worker has had which compiles all programs and does a chunk, in bytes."""
     name = "jax_compilation_cache_dir"
     kept = jax.config.values[name]
@@ -181,14 +182,14 @@ def fitted(
     return told[0] - began, time.perf_counter() - told[0], found
 
 
-def by_turns(tasks: list[Task], size: Size) -> list[Task | Texelwise]:
+def by_turns(tasks: list[Block], size: Size) -> list[Block | Texelwise]:
     """Chunks of the map and texels for scipy, one after the other; of each kind what compiles stands in front."""
     generator = np.random.default_rng(5)
     texels, times = size.scipy
     chosen = np.linspace(0, len(tasks) - 1, times + PROCESSES).astype(int)
-    turns: list[Task | Texelwise] = []
+    turns: list[Block | Texelwise] = []
     for index in chosen:
-        block = tasks[index].block
+        block = tasks[index]
         count = int(np.prod([one.stop - one.start for one in block]))
         places = np.sort(generator.choice(count, min(texels, count), replace=False))
         turns.append(tasks[index])
@@ -223,7 +224,7 @@ def rate(tasks: Sequence[Timed]) -> float:
 
 
 def _differences(
-    job: Job, found: FittedMap, turns: Sequence[Task | Texelwise], done: Sequence[tuple[int, Timed]]
+    job: Job, found: FittedMap, turns: Sequence[Block | Texelwise], done: Sequence[tuple[int, Timed]]
 ) -> Floats:
     """Our costs less scipy's, of the texels that it fitted."""
     parts = []
@@ -237,7 +238,7 @@ def _differences(
 
 def vectors_of(found: FittedMap, task: Texelwise) -> Floats:
     """The fitted numbers of those texels, (M, P)."""
-    places, block = list(task.places), task.task.block
+    places, block = list(task.places), task.task
     return np.stack([np.asarray(found[f"values/{name}"][block]).ravel()[places] for name in found.names], axis=1)
 
 
@@ -257,15 +258,15 @@ def pull_width(found: FittedMap, one: Given) -> float:
 
 def emulator_error(job: Job, found: FittedMap, checked: int) -> float | None:
     """Of the model at the optimum, beside the transport at the next finer resolution, in standard deviations."""
-    transport = job.problem.transport
+    problem = job.pilot.problem
+    transport = problem.transport
     if not isinstance(transport, lj.AddingDoubling):
         return None
     at = np.linspace(0, found.flags.size - 1, checked).astype(int)
     vectors = np.stack([found.values[name].ravel()[at] for name in found.names], axis=1)
-    mine = predict_all(job.problem, vectors)
-    fine = predict_all(replace(job.problem, transport=transport.finer()), vectors)
-    noise = job.problem.noise
-    sigma = np.hypot(float(noise.relative or 0.0) * fine, job.floor)  # type: ignore[arg-type]
+    mine = predict_all(problem, vectors)
+    fine = predict_all(replace(problem, transport=transport.finer()), vectors)
+    sigma = sigmas(problem, vectors, fine)
     return float(np.max(np.abs(mine - fine) / sigma))
 
 

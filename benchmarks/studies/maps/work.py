@@ -16,10 +16,12 @@ from jax import Array
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from fits.maps.chunk import Job, Task, fit_chunk, read_part
-from fits.maps.descent import Texels, make_texels, model_of
+from fits.maps.fit_map import fit_chunk
+from fits.maps.inputs import Block
+from fits.maps.pilot import Job
 from fits.maps.search import likeliest
 from fits.maps.store import FLAGS
+from fits.maps.texels import Texels, model_of
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -52,19 +54,19 @@ class Timed(NamedTuple):
 class Texelwise(NamedTuple):
     """A task for scipy: a chunk, and places of texels in it."""
 
-    task: Task
+    task: Block
     places: tuple[int, ...]
 
 
 class Meeting(NamedTuple):
     """A chunk, after which a worker waits in this folder until so many have come."""
 
-    task: Task
+    task: Block
     folder: str
     workers: int
 
 
-def timed(job: Job, task: Task | Texelwise | Meeting) -> Timed:
+def timed(job: Job, task: Block | Texelwise | Meeting) -> Timed:
     """Fit a chunk of a map, or some texels by scipy."""
     began, costs = time.monotonic(), None
     if isinstance(task, Meeting):
@@ -80,14 +82,14 @@ def timed(job: Job, task: Task | Texelwise | Meeting) -> Timed:
     return Timed(kind, count, began, time.monotonic(), os.getpid(), peak(), costs)
 
 
-def redo(job: Job, task: Task) -> int:
-    """A chunk as `fits.maps.chunk.work` does it, also where it is done already; how many texels were fitted."""
-    results = fit_chunk(job, read_part(job.data, task.block))
-    job.store.write(task.block, results)
+def redo(job: Job, task: Block) -> int:
+    """A chunk as `fits.maps.fit_map.work` does it, also where it is done already; how many texels were fitted."""
+    results = fit_chunk(job, job.data.read(task))
+    job.store.write(task, results)
     return int(np.sum(results["flags"] & FLAGS["fitted"] > 0))
 
 
-def warm_up(job: Job, task: Task) -> None:
+def warm_up(job: Job, task: Block) -> None:
     """Compile the programs of a map in a worker of a cluster, which gives a task to whom it likes."""
     redo(job, task)
 
@@ -108,19 +110,18 @@ def empty(shared: Any, task: Any) -> Timed:
 
 def rows_of(job: Job, task: Texelwise) -> Texels:
     """The measurements of those texels."""
-    values = read_part(job.data, task.task.block).values
-    return make_texels(values.reshape(-1, *values.shape[-2:])[list(task.places)], None, job.floor)
+    return job.pilot.texels(job.data.read(task.task)).rows(list(task.places))
 
 
 def first_starts(job: Job, rows: Texels) -> Floats:
     """Where `fits.fit_map` begins, in the unit box."""
-    chosen = likeliest(job.problem, job.starts, rows, job.options.chunk_size, 1)[:, 0]
-    return np.clip(job.starts.units[chosen], INSIDE, 1.0 - INSIDE)
+    chosen = likeliest(job.pilot.problem, job.pilot.starts, rows, job.options.chunk_size, 1)[:, 0]
+    return np.clip(job.pilot.starts.units[chosen], INSIDE, 1.0 - INSIDE)
 
 
 def scipy_fit(job: Job, row: Texels, unit: Floats) -> float:
     """The cost of scipy's end, with compiled residuals and Jacobian, in the unit box, which suits it best."""
-    arrays, (residuals, jacobian) = jax.tree.map(jnp.asarray, row), _compiled(job.problem)
+    arrays, (residuals, jacobian) = jax.tree.map(jnp.asarray, row), _compiled(job.pilot.problem)
     return float(
         least_squares(
             lambda at: np.asarray(residuals(at, arrays)),
@@ -133,7 +134,7 @@ def scipy_fit(job: Job, row: Texels, unit: Floats) -> float:
 
 def costs_at(job: Job, rows: Texels, vectors: Floats) -> Floats:
     """Half sums of squared residuals of texels at their vectors (M, P)."""
-    return np.asarray(job.problem.call(_costs, vectors, rows), float)
+    return np.asarray(job.pilot.problem.call(_costs, vectors, rows), float)
 
 
 def _costs(model: Model, vectors: Array, rows: Texels) -> Array:

@@ -1,8 +1,7 @@
-"""Pictures of a fitted map: values, errors, chi-square and flags over the map, and their histograms.
+"""Pictures of a fitted map: values, errors, chi-square and flags over the map, and how often a chi-square occurs.
 
-A map of two axes is drawn as an image, row 0 on top; of one axis, or one texel wide, as a line against the index; of
-more axes the slice in the middle of the leading ones. Colours run over the middle 98 % of the values, and what lies
-beyond has the colour of the end.
+A map of two axes is drawn as an image, row 0 on top; of one axis as an image of one row; of more axes the slice in the
+middle of the leading ones. Colours run over the middle 98 % of the values, and what lies beyond has that of the end.
 """
 
 from collections.abc import Sequence
@@ -11,36 +10,21 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from scipy import stats
 
-from fits.maps.store import FLAGS
+from fits.maps.store import FLAGS, Floats
 from fits.reports.plots.data import CYCLE, GREY, INK, LOG_ABOVE, STYLE
-
-Floats = np.ndarray
 
 MOST = 2000
 """Texels a side of what is drawn of a map; of larger ones every second, third and so on."""
 
 INNER = (1.0, 99.0)  # percentiles between which colours and axes run
-LOW_END = 0.25  # of their span
 WIDTH = 4.8  # inches
 RATIO = "χ² / degree of freedom"
-ABSENT, NO_NUMBER = "#d4d4d4", "#ffffff"
-
-
-class Scale(NamedTuple):
-    """Limits of colours or of an axis."""
-
-    low: float
-    high: float
-    logarithmic: bool = False
-
-    @property
-    def norm(self) -> Normalize:
-        return LogNorm(self.low, self.high) if self.logarithmic else Normalize(self.low, self.high)
+ABSENT = "#d4d4d4"
 
 
 class State(NamedTuple):
@@ -67,93 +51,59 @@ STATES = (
 """The first that applies to a texel is shown."""
 
 
-class Face(NamedTuple):
-    """What is drawn of a map: the part of its arrays, how many texels one that is drawn stands for, that in words."""
-
-    part: tuple[int | slice, ...]
-    steps: tuple[int, ...]
-    words: str
-
-    def of(self, values: np.ndarray) -> np.ndarray:
-        """The part of an array of the map's shape, with one axis or two."""
-        return np.asarray(values[self.part])
+def shown_part(shape: Sequence[int]) -> tuple[tuple[Any, ...], str]:
+    """What is drawn of a map of this shape: the part of its arrays, (rows, columns), and that in words."""
+    leading, sides = tuple(length // 2 for length in shape[:-2]), shape[-2:]
+    step = -(-max(sides) // MOST)
+    words = [f"slice [{', '.join(map(str, leading))}] of {' x '.join(map(str, shape[:-2]))}"] if leading else []
+    words += [f"one texel in {step} x {step}"] if step > 1 else []
+    every = slice(None, None, step)
+    return (*leading, *((every, every) if len(sides) > 1 else (None, every))), ", ".join(words)
 
 
-def face(shape: Sequence[int]) -> Face:
-    """How maps of this shape are drawn."""
-    leading, ends = tuple(length // 2 for length in shape[:-2]), tuple(shape[-2:])
-    drawn = [axis for axis, length in enumerate(ends) if length > 1] or [len(ends) - 1]
-    steps = {axis: -(-ends[axis] // MOST) for axis in drawn}
-    trailing = (slice(None, None, steps[axis]) if axis in steps else 0 for axis in range(len(ends)))
-    words = []
-    if leading:
-        words.append(f"slice [{', '.join(map(str, leading))}] of {' x '.join(map(str, shape[:-2]))}")
-    if max(steps.values()) > 1:
-        words.append(f"one texel in {' x '.join(map(str, steps.values()))}")
-    return Face((*leading, *trailing), tuple(steps.values()), ", ".join(words))
-
-
-def scale_of(values: Floats) -> Scale:
+def norm_of(values: Floats) -> Normalize:
     """Over the middle 98 %; logarithmic where these span more than a factor of ten, most of them at its low end."""
     finite = values[np.isfinite(values)]
     if not finite.size:
-        return Scale(0.0, 1.0)
-    low, high = (float(end) for end in np.percentile(finite, INNER))
-    if not low < high:
-        low, high = float(finite.min()), float(finite.max())
-    if not low < high:  # one value everywhere
-        width = 0.01 * abs(low) or 0.01
-        return Scale(low - width, high + width)
-    skewed = float(np.median(finite)) - low < LOW_END * (high - low)
-    return Scale(low, high, logarithmic=low > 0.0 and high > LOG_ABOVE * low and skewed)
-
-
-# ---- over the map ----
+        return Normalize(0.0, 1.0)
+    low, middle, high = (float(end) for end in np.percentile(finite, (INNER[0], 50.0, INNER[1])))
+    if not low < high:  # one value nearly everywhere
+        low, high = low - (0.01 * abs(low) or 0.01), high + (0.01 * abs(high) or 0.01)
+    skewed = low > 0.0 and high > LOG_ABOVE * low and middle - low < 0.25 * (high - low)
+    return LogNorm(low, high) if skewed else Normalize(low, high)
 
 
 def value_picture(
-    values: Floats, fitted: np.ndarray, shown: Face, title: str, label: str, colours: str, scale: Scale | None = None
+    values: Floats, fitted: np.ndarray, title: str, label: str, colours: str, norm: Normalize | None = None
 ) -> Figure:
-    """One number of every texel, such as a parameter or its error.
+    """One number of every texel, such as a parameter or its error; white where it is not finite.
 
     Args:
         values: of the whole map.
-        fitted: texels that are fitted; the others are grey, and those without a finite number white.
-        shown: what is drawn of it.
+        fitted: texels that are fitted; the others are grey.
         title, label: what stands above, and what the numbers are, with their unit.
         colours: name of a colour map of matplotlib.
-        scale: of the colours; None: of the values.
+        norm: of the colours; None: of the values.
     """
-    scale = scale or scale_of(values[fitted])
-    drawn, there = shown.of(np.where(fitted, values, np.nan)), shown.of(fitted)
-    with mpl.rc_context(STYLE | {"axes.grid": drawn.ndim == 1}):
-        figure, axes = _figure(drawn.shape, title)
-        if drawn.ndim == 1:
-            _line(axes, drawn, there, shown.steps[0], scale, label)
-            return figure
-        missing = there & ~np.isfinite(drawn)
-        placed, ground = _placed(drawn.shape, shown.steps), mpl.colors.ListedColormap([ABSENT, NO_NUMBER])
-        axes.imshow(missing, cmap=ground, vmin=0, vmax=1, interpolation="nearest", **placed)
-        image = axes.imshow(drawn, cmap=colours, norm=scale.norm, **placed)
-        below, above = (bool(np.any(out)) for out in (drawn < scale.low, drawn > scale.high))
-        extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-        bar = figure.colorbar(image, ax=axes, label=label, extend=extend)
-        if scale.logarithmic:
-            _plain_ticks(bar.ax.yaxis, scale)
-        absent = [] if there.all() else [(ABSENT, "not fitted")]
-        _legend(figure, [*absent, *([(NO_NUMBER, "none: at a bound, or unidentified")] if missing.any() else [])])
+    part, _ = shown_part(values.shape)
+    ground = mpl.colors.ListedColormap(["#ffffff", ABSENT])
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
+        figure, axes = _figure(values.shape, title)
+        _draw(axes, values.shape, ~fitted[part], cmap=ground, vmin=0, vmax=1)
+        drawn = np.where(fitted, values, np.nan)[part]
+        image = _draw(axes, values.shape, drawn, cmap=colours, norm=norm or norm_of(values[fitted]))
+        figure.colorbar(image, ax=axes, label=label)
+        _legend(figure, [] if fitted.all() else [(ABSENT, "not fitted")])
     return figure
 
 
-def chi_square_picture(ratio: Floats, fitted: np.ndarray, shown: Face) -> Figure:
+def chi_square_picture(ratio: Floats, fitted: np.ndarray) -> Figure:
     """Chi-square per degree of freedom: white where it is 1, orange above and violet below, on a logarithmic scale."""
     positive = ratio[fitted & np.isfinite(ratio) & (ratio > 0.0)]
-    widest = 2.0
-    if positive.size:
-        widest = max(widest, float(np.exp(np.abs(np.log(np.percentile(positive, INNER))).max())))
-    scale = Scale(1.0 / widest, widest, logarithmic=True)
-    values = np.where(ratio > 0.0, ratio, np.nan)
-    return value_picture(values, fitted, shown, "chi-square per degree of freedom", RATIO, "PuOr_r", scale)
+    ends = np.percentile(positive, INNER) if positive.size else np.ones(2)
+    widest = max(2.0, float(np.exp(np.abs(np.log(ends)).max())))
+    values, norm = np.where(ratio > 0.0, ratio, np.nan), LogNorm(1.0 / widest, widest)
+    return value_picture(values, fitted, "chi-square per degree of freedom", RATIO, "PuOr_r", norm)
 
 
 def states_of(flags: np.ndarray) -> np.ndarray:
@@ -163,90 +113,17 @@ def states_of(flags: np.ndarray) -> np.ndarray:
     return np.argmax(applies, axis=0)
 
 
-def flag_picture(flags: np.ndarray, shown: Face) -> Figure:
+def flag_picture(flags: np.ndarray) -> Figure:
     """The gravest flag of every texel, with counts over the whole map."""
     states = states_of(flags)
     counts = np.bincount(states.ravel(), minlength=len(STATES))
-    drawn = shown.of(states)
-    image, steps = (drawn, shown.steps) if drawn.ndim == 2 else (drawn[None], (1, *shown.steps))
     colours = mpl.colors.ListedColormap([state.colour for state in STATES])
     with mpl.rc_context(STYLE | {"axes.grid": False}):
-        figure, axes = _figure(drawn.shape, "flags of the texels", legend=0.5)
-        ends: dict[str, Any] = {"vmin": -0.5, "vmax": len(STATES) - 0.5}
-        axes.imshow(image, cmap=colours, interpolation="nearest", **ends, **_placed(image.shape, steps))
-        if drawn.ndim == 1:
-            axes.set(xlabel="texel", ylabel="", yticks=[])
-        words = [f"{state.words}: {count:,}" for state, count in zip(STATES, counts, strict=True)]
-        _legend(figure, [(STATES[place].colour, words[place]) for place in np.flatnonzero(counts)])
-    return figure
-
-
-def _figure(shape: tuple[int, ...], title: str, legend: float = 0.0) -> tuple[Figure, Axes]:
-    """A figure for a map drawn true to its sides, or for a line."""
-    height = 2.4
-    if len(shape) == 2:
-        height = float(np.clip(0.78 * WIDTH * shape[0] / shape[1] + 0.7, 1.8, 7.0)) + legend
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    axes = figure.subplots()
-    axes.set(title=title, xlabel="column", ylabel="row")
-    if len(shape) == 2:
-        axes.yaxis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
-    axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
-    return figure, axes
-
-
-def _placed(shape: tuple[int, ...], steps: tuple[int, ...]) -> dict[str, Any]:
-    """Where an image lies, in texels of the map, and whether it is drawn true to its sides."""
-    rows, columns = (number * step for number, step in zip(shape, steps, strict=True))
-    true = 1 / 6 < rows / columns < 6
-    return {"extent": (-0.5, columns - 0.5, rows - 0.5, -0.5), "aspect": "equal" if true else "auto"}
-
-
-def _line(axes: Axes, values: Floats, fitted: np.ndarray, step: int, scale: Scale, label: str) -> None:
-    """Values against the index; what is not fitted is shaded."""
-    index, half = np.arange(len(values)) * step, 0.5 * step
-    axes.plot(index, values, "o-" if len(values) <= 200 else "-", markersize=2.5, linewidth=0.8, color=CYCLE[0])
-    if scale.logarithmic:
-        axes.set_yscale("log")
-        axes.set_ylim(scale.low / 1.1, scale.high * 1.1)
-        _plain_ticks(axes.yaxis, scale)
-    else:
-        margin = 0.05 * (scale.high - scale.low)
-        axes.set_ylim(scale.low - margin, scale.high + margin)
-    for place in index[~fitted]:
-        axes.axvspan(place - half, place + half, color=ABSENT, linewidth=0.0)
-    axes.set(xlabel="texel", ylabel=label, xlim=(-half, index[-1] + half))
-
-
-def _plain_ticks(axis: Axis, scale: Scale) -> None:
-    """Ticks of a logarithmic axis as plain numbers, and some on a short one."""
-    wide = scale.high > 1e3 * scale.low
-    axis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
-    axis.set_major_formatter(mpl.ticker.StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(mpl.ticker.NullFormatter())
-
-
-def _legend(figure: Figure, entries: Sequence[tuple[str, str]]) -> None:
-    """Patches of colour and what they mean, below the axes."""
-    if entries:
-        handles = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.5, label=words) for colour, words in entries]
-        figure.legend(handles=handles, loc="outside lower center", ncols=2 if len(entries) > 1 else 1)
-
-
-# ---- histograms ----
-
-
-def histogram_picture(values: Floats, title: str, label: str) -> Figure:
-    """How often which number occurs, over the middle 98 % and a tenth beyond; the title says how many lie outside."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 2.3), layout="constrained")
-        axes = figure.subplots()
-        finite = values[np.isfinite(values)]
-        if finite.size:
-            _bars(axes, finite, title)
-        else:
-            axes.set_title(f"{title}: no finite value")
-        axes.set(xlabel=label, ylabel="texels")
+        figure, axes = _figure(flags.shape, "flags of the texels", legend=0.5)
+        part, _ = shown_part(flags.shape)
+        _draw(axes, flags.shape, states[part], cmap=colours, vmin=-0.5, vmax=len(STATES) - 0.5)
+        some = [(state, count) for state, count in zip(STATES, counts, strict=True) if count]
+        _legend(figure, [(state.colour, f"{state.words}: {count:,}") for state, count in some])
     return figure
 
 
@@ -255,48 +132,44 @@ def chi_square_histogram(ratio: Floats, freedom: np.ndarray) -> Figure:
 
     freedom: degrees of freedom of each texel.
     """
-    finite = np.isfinite(ratio) & (ratio > 0.0) & (freedom > 0)
+    good = np.isfinite(ratio) & (ratio > 0.0) & (freedom > 0)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
         axes = figure.subplots()
-        if finite.any():
-            low, high = _bars(axes, ratio[finite], "over the texels", density=True)
-            grid = np.linspace(min(low, 0.3), max(high, 2.0), 400)
-            axes.plot(grid, expected_density(grid, freedom[finite]), color=CYCLE[1], linewidth=1.3, label="expected")
-            axes.legend(loc="upper right")
-        axes.set(xlabel=RATIO, ylabel="density")
+        if good.any():
+            low, high = np.percentile(ratio[good], INNER) * (0.8, 1.2)
+            counts, edges = np.histogram(ratio[good], np.linspace(low, high, 61))
+            axes.stairs(counts / (good.sum() * np.diff(edges)), edges, fill=True, color=CYCLE[5])
+            at, some = np.linspace(low, high, 400), np.quantile(freedom[good], np.linspace(0.0, 1.0, 50))
+            expected = np.mean([one * stats.chi2.pdf(one * at, one) for one in some], axis=0)
+            axes.plot(at, expected, color=CYCLE[4], label="of the stated noise")
+            axes.axvline(float(np.median(ratio[good])), color=INK, linewidth=1.0, label="median")
+            axes.legend()
+        axes.set(xlabel=RATIO, ylabel="density", title="chi-square per degree of freedom")
     return figure
 
 
-def expected_density(ratio: Floats, freedom: np.ndarray) -> Floats:
-    """Density of chi-square per degree of freedom of texels with these degrees of freedom, at each of `ratio`."""
-    from scipy import stats
+def _figure(shape: tuple[int, ...], title: str, legend: float = 0.0) -> tuple[Figure, Axes]:
+    rows, columns = shape[-2:] if len(shape) > 1 else (1, shape[0])
+    height = float(np.clip(0.78 * WIDTH * rows / columns + 0.7, 1.8, 7.0)) + legend
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    axes = figure.subplots()
+    axes.set(title=title, xlabel="column", ylabel="row")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(mpl.ticker.MaxNLocator(5, integer=True))
+    return figure, axes
 
-    if np.unique(freedom).size > 50:
-        freedom = np.quantile(freedom, np.linspace(0.01, 0.99, 50), method="nearest")
-    each, counts = np.unique(freedom, return_counts=True)
-    density = stats.chi2.pdf(ratio[:, None] * each, each) * each
-    return np.asarray(density @ (counts / counts.sum()))
+
+def _draw(axes: Axes, shape: tuple[int, ...], image: np.ndarray, **colours: Any) -> Any:
+    """An image with axes in texels of the map, true to its sides unless it is very long."""
+    rows, columns = shape[-2:] if len(shape) > 1 else (1, shape[0])
+    aspect: Any = "equal" if 1 / 6 < rows / columns < 6 else "auto"
+    ends = (-0.5, columns - 0.5, rows - 0.5, -0.5)
+    return axes.imshow(image, extent=ends, aspect=aspect, interpolation="nearest", **colours)
 
 
-def _bars(axes: Axes, finite: Floats, title: str, density: bool = False) -> tuple[float, float]:
-    """Bars over a range of values, and that range; shares are of all texels, also of those outside."""
-    scale, number = scale_of(finite), int(np.clip(np.sqrt(finite.size), 8, 60))
-    low, high = scale.low, scale.high
-    if scale.logarithmic:
-        low, high = low * (low / high) ** 0.1, high * (high / low) ** 0.1
-    else:
-        low, high = low - 0.1 * (high - low), high + 0.1 * (high - low)
-    if finite.min() < finite.max():
-        low, high = max(low, float(finite.min())), min(high, float(finite.max()))
-    edges = np.geomspace(low, high, number + 1) if scale.logarithmic else np.linspace(low, high, number + 1)
-    counts, _ = np.histogram(finite, edges)
-    outside, middle = finite.size - int(counts.sum()), float(np.median(finite))
-    axes.stairs(counts / (finite.size * np.diff(edges)) if density else counts, edges, fill=True, color=CYCLE[5])
-    axes.axvline(middle, color=INK, linewidth=1.0)
-    if scale.logarithmic:
-        axes.set_xscale("log")
-        _plain_ticks(axes.xaxis, scale)
-    axes.set_title(f"{title}: median {middle:.4g}" + (f"; {outside:,} outside" if outside else ""))
-    axes.margins(x=0.02)
-    return low, high
+def _legend(figure: Figure, entries: Sequence[tuple[str, str]]) -> None:
+    """Patches of colour and what they mean, below the axes."""
+    if entries:
+        handles = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.5, label=words) for colour, words in entries]
+        figure.legend(handles=handles, loc="outside lower center", ncols=2 if len(entries) > 1 else 1)

@@ -1,14 +1,14 @@
-"""Tables of a fitted map, for the terminal and the report."""
+"""What there is to say of a fitted map in a few numbers, and tables of them for the terminal and the report."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from fits.maps.fitted_map import FittedMap, Quartiles, Summary
-from fits.maps.store import FLAGS
+from fits.maps.store import FLAGS, FittedMap, Floats
 from fits.reports.tables import Table, with_error
+
+Quartiles = tuple[float, ...]
 
 WORST = 12
 """Texels that are shown of those with the largest chi-square."""
@@ -26,8 +26,63 @@ WORDS = {
 }
 """What is said of each flag."""
 
-ELSEWHERE = {"kind", "format", "names", "units", "shape", "chunk", "numerical_error", "common", "stack", "fingerprints"}
-"""What the root of a store says that stands elsewhere in a report, or is of no use there."""
+
+@dataclass(frozen=True)
+class Summary:
+    """Counts of texels, and quartiles over those that are fitted.
+
+    Attributes:
+        texels: of the map.
+        there: of them that have been dealt with.
+        counts: of each flag.
+        at_bound: of texels at which a parameter is at a bound, for each parameter.
+        values, errors: quartiles of each parameter and of its standard error, where they are finite; NaN if nowhere.
+        no_error: texels at which a parameter is fitted, and has no finite error.
+        reduced_chi_square, measurements: quartiles.
+    """
+
+    texels: int
+    there: int
+    counts: dict[str, int]
+    at_bound: dict[str, int]
+    values: dict[str, Quartiles]
+    errors: dict[str, Quartiles]
+    no_error: dict[str, int]
+    reduced_chi_square: Quartiles
+    measurements: Quartiles
+
+    @property
+    def fitted(self) -> int:
+        """Texels with values."""
+        return self.counts["fitted"]
+
+    @property
+    def converged(self) -> float:
+        """The share of the fitted texels that converged; NaN if none is fitted."""
+        return self.counts["converged"] / self.fitted if self.fitted else np.nan
+
+
+def summarise(map: FittedMap) -> Summary:
+    """The numbers of a map as far as it has got; arrays are read one after the other."""
+    flags = map.flags  # first: a texel that has them has everything
+    fitted = (flags & FLAGS["fitted"]) != 0
+    bounds, errors = map.at_bound[fitted], {name: map.errors[name][fitted] for name in map.names}
+    return Summary(
+        texels=flags.size,
+        there=int(np.count_nonzero(flags)),
+        counts={name: int(np.count_nonzero(flags & bit)) for name, bit in FLAGS.items()},
+        at_bound={name: int(np.count_nonzero(bounds & (1 << place))) for place, name in enumerate(map.names)},
+        values={name: _quartiles(map.values[name][fitted]) for name in map.names},
+        errors={name: _quartiles(error) for name, error in errors.items()},
+        no_error={name: int(np.count_nonzero(~np.isfinite(error))) for name, error in errors.items()},
+        reduced_chi_square=_quartiles(map.reduced_chi_square[fitted]),
+        measurements=_quartiles(map.measurements[fitted].astype(float)),
+    )
+
+
+def _quartiles(values: Floats) -> Quartiles:
+    finite = values[np.isfinite(values)]
+    return tuple(np.quantile(finite, (0.25, 0.5, 0.75)).tolist()) if finite.size else (np.nan,) * 3
 
 
 def count_table(found: Summary) -> Table:
@@ -48,17 +103,17 @@ def count_table(found: Summary) -> Table:
 
 def quartile_table(found: Summary, map: FittedMap) -> Table:
     """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
-    rows, notes, none = [], [], ("", "", "")
+
+    def words(quartiles: Quartiles) -> tuple[str, ...]:
+        return tuple(f"{value:.4g}" if math.isfinite(value) else "" for value in quartiles)
+
+    rows, notes = [], []
     for name in map.names:
-        rows.append((name, *_words(found.values[name]), *_words(found.errors[name]), map.units[name]))
+        rows.append((name, *words(found.values[name]), *words(found.errors[name]), map.units[name]))
         if missing := found.no_error[name]:
             notes.append(f"{name} has no error in {share(missing, found.fitted)} of them.")
-    rows.append(("chi2/dof", *_words(found.reduced_chi_square), *none, "1"))
-    rows.append(("measurements", *_words(found.measurements), *none, "1"))
-    if found.numerical_error is not None:
-        *quartiles, most = found.numerical_error
-        rows.append(("numerical error", *_words(quartiles), *none, "sigma"))
-        notes.append(f"The numerical error is below {most:.2g} sigma in 95 % of them.")
+    rows.append(("chi2/dof", *words(found.reduced_chi_square), "", "", "", "1"))
+    rows.append(("measurements", *words(found.measurements), "", "", "", "1"))
     columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
     return Table("Quartiles over the fitted texels", columns, tuple(rows), " ".join(notes))
 
@@ -74,18 +129,11 @@ def worst_table(map: FittedMap) -> Table:
     for row, (place, bits) in enumerate(zip(np.transpose(places), flags[places], strict=True)):
         pairs = (with_error(float(values[row]), float(errors[row])) for values, errors in columns)
         cells = (value if error == "unknown" else f"{value} ± {error}" for value, error in pairs)
-        rows.append(
-            (f"[{', '.join(_strings(place))}]", f"{ratio[tuple(place)]:.4g}", *cells, ", ".join(_flag_words(int(bits))))
-        )
+        said = [WORDS[flag].partition(":")[0] for flag, bit in FLAGS.items() if bits & bit and flag != "fitted"]
+        said = said[1:] if "converged" in said else ["not converged", *said]
+        rows.append((str(place.tolist()), f"{ratio[tuple(place)]:.4g}", *cells, ", ".join(said)))
     note = f"Counted from 0, by {'row and column' if len(map.shape) == 2 else 'index'}; value ± standard error."
     return Table("", ("texel", "chi2/dof", *map.names, "flags"), tuple(rows), note if rows else "")
-
-
-def _flag_words(bits: int) -> list[str]:
-    """Words for the flags of a texel that is fitted."""
-    usual = ("fitted", "converged")
-    found = [WORDS[flag].partition(":")[0] for flag, bit in FLAGS.items() if bits & bit and flag not in usual]
-    return found if bits & FLAGS["converged"] else ["not converged", *found]
 
 
 def common_table(map: FittedMap) -> Table:
@@ -101,41 +149,15 @@ def smoothing_words(map: FittedMap) -> str:
     said = map.smoothing
     if said is None:
         return ""
-    prior, (start, *_, end) = said["prior"], said["objective"]
-    scales = {f"{one:g}" for one in prior["scale"].values()}
-    one_scale = len(scales) == 1 and prior["scale"].keys() == set(map.names)
-    each = scales.pop() if one_scale else ", ".join(f"{name} {one:g}" for name, one in prior["scale"].items())
-    words = f"Smoothed beside the plain fit by block alternation ({prior['kind'].replace('_', ' ')}, of the bounds: "
-    words += f"{each}): {said['rounds']} rounds took {start - end:.4g} off minus the log-posterior. In the last one "
-    words += f"texels moved by at most {said['largest_moves'][-1]:.2g} standard errors"
-    if not said["settled"]:
-        left = float(said["left"])
-        words += f", by the last two about {left:.2g} more are left to go" if math.isfinite(left) else ""
-        words += ": it has not settled"
-    return f"{words}. Errors of the smoothed map hold with the neighbours where they are."
-
-
-def made_table(map: FittedMap) -> Table:
-    """What the store says of how it was made, a row for each of its attributes."""
-    shape, chunk = (" x ".join(_strings(sizes)) for sizes in (map.shape, map.chunk))
-    rows = [("store", str(map.path)), ("texels", f"{shape}, in chunks of {chunk}")]
-    rows += [("parameters", ", ".join(map.names))]
-    for name, value in map.attributes.items():
-        if name not in ELSEWHERE and value not in (None, "", {}, []):
-            rows.append((name.replace("_", " "), _in_words(value)))
-    return Table("", ("", ""), tuple(rows))
-
-
-def _strings(numbers: Sequence[int]) -> list[str]:
-    return [str(int(one)) for one in numbers]
-
-
-def _in_words(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{name.replace('_', ' ')} {_in_words(one)}" for name, one in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(_in_words(one) for one in value)
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    scales = said["prior"]["scale"]
+    one_scale = len(set(scales.values())) == 1 and scales.keys() == set(map.names)
+    each = f"{scales[map.names[0]]:g}" if one_scale else ", ".join(f"{name} {one:g}" for name, one in scales.items())
+    kind, settled = said["prior"]["kind"].replace("_", " "), "" if said["settled"] else ": it has not settled"
+    return (
+        f"Smoothed beside the plain fit by block alternation ({kind}, of the bounds: {each}), in {said['rounds']} "
+        f"rounds; in the last one texels moved by at most {said['largest_moves'][-1]:.2g} standard errors{settled}. "
+        "Errors of the smoothed map hold with the neighbours where they are."
+    )
 
 
 def share(part: float, whole: float) -> str:
@@ -146,7 +168,3 @@ def share(part: float, whole: float) -> str:
     if part not in (0, whole) and not 0.01 <= percent <= 99.99:
         return "> 99.99 %" if percent > 50.0 else "< 0.01 %"
     return f"{percent:.4g} %" if percent > 99.9 else f"{percent:.3g} %" if percent >= 1.0 else f"{percent:.2g} %"
-
-
-def _words(quartiles: Quartiles | list[float]) -> tuple[str, ...]:
-    return tuple(f"{value:.4g}" if math.isfinite(value) else "" for value in quartiles)

@@ -13,9 +13,8 @@ import pytest
 import layerjax as lj
 from fits.cli.parser import main
 from fits.data.geometry import slices
-from fits.maps.fitted_map import FittedMap, open_map
 from fits.maps.options import MapOptions, SpatialPrior
-from fits.maps.store import FLAGS
+from fits.maps.store import FLAGS, FittedMap, open_map
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
 from tests.helpers.commands import refused
@@ -181,7 +180,7 @@ def test_an_interrupt_says_that_the_store_is_good(
     [
         ({"map.npy": "nowhere.npy"}, "nowhere.npy: no such file"),
         ({"map.npy": "."}, "layerjax fit-many"),
-        ({"map.npy": "data.csv"}, "data.csv: ends in '.csv'"),
+        ({"map.npy": "data.csv"}, "data.csv: a map is one array"),
         ({"map.npy": "mask.npy"}, r"mask.npy has shape (5, 4), the geometry 6 pairs"),
         ({"view.csv": "nowhere.csv"}, "nowhere.csv: no such file"),
         ({"view.csv": "coat.toml"}, "coat.toml, line"),

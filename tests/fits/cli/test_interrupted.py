@@ -154,7 +154,7 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
     after.pop(str(work / ".result.starts"))
     assert len(Store.read(".result.starts").keys()) == 3
     assert after == before
-    monkeypatch.setattr(starts, "least_squares_descent", None)  # no start is run again
+    monkeypatch.setattr(starts, "rough_descent", None)  # no start is run again
     assert main(words) == 0
     assert not list(work.glob(".*"))
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from fits.cli.parser import main
-from fits.maps.fitted_map import FittedMap, open_map
+from fits.maps.store import FittedMap, open_map
 from tests.helpers.files import mounted
 from tests.helpers.places import ROOT
 from tests.helpers.quick_maps import assert_same, command, write_files
@@ -99,74 +99,51 @@ def wait_until(when: Callable[[], bool], seconds: float = PATIENCE) -> None:
         time.sleep(0.001)
 
 
-class Killer:
-    """Kills workers of a run, and every so many times the run itself, after a few chunks each, at any moment."""
-
-    def __init__(self, store: Path, kills: int, chunks: int, parents: int, seed: int):
-        self.store, self.left, self.random = store, kills, random.Random(seed)
-        self.pace, self.parents = 1.6 * chunks / kills, parents
-        self.killed: Counter[str] = Counter()
-
-    def watch(self, process: subprocess.Popen[str]) -> list[int]:
-        """Until the run ends; returns workers that it left behind."""
+def kill_at_random(place: Path, words: list[str], store: Path, kills: int, chunks: int, seed: int) -> Counter[str]:
+    """The same command again and again until it has been killed so many times, every fifth time as a whole and else one
+    of its workers, after a few chunks each, at any moment; what was killed how often."""
+    choice, killed = random.Random(seed), Counter[str]()
+    while killed.total() < kills:
         workers: list[int] = []
-        while process.poll() is None and self.left:
-            until = there(self.store) + int(self.pace * self.random.random())
-            late = time.monotonic() + 10.0 * self.random.random()  # as it starts, too
-            while process.poll() is None and there(self.store) < until and time.monotonic() < late:
-                time.sleep(0.002)
-            time.sleep(0.05 * self.random.random())
-            workers = children(process.pid, "spawn_main")
-            self._kill(process, workers)
-        process.wait(PATIENCE)
-        return workers
-
-    def _kill(self, process: subprocess.Popen[str], workers: list[int]) -> None:
-        parent = (self.killed.total() + 1) % self.parents == 0
-        if process.poll() is None and (parent or workers):
-            with suppress(ProcessLookupError):
-                os.kill(process.pid if parent else self.random.choice(workers), signal.SIGKILL)
-                self.left -= 1
-                self.killed["parent" if parent else "worker"] += 1
-
-
-def ordeal(place: Path, words: list[str], killer: Killer) -> None:
-    """The same command again and again until it has come to its end, or been killed for the last time."""
-    while True:
         with begun([CLI, *words], place) as process:
-            lingering = killer.watch(process)
+            while process.poll() is None and killed.total() < kills:
+                until = there(store) + int(1.6 * chunks / kills * choice.random())
+                late = time.monotonic() + 10.0 * choice.random()  # as it starts, too
+                while process.poll() is None and there(store) < until and time.monotonic() < late:
+                    time.sleep(0.002)
+                time.sleep(0.05 * choice.random())
+                workers = children(process.pid, "spawn_main")
+                whole = killed.total() % 5 == 4
+                if process.poll() is None and (whole or workers):
+                    with suppress(ProcessLookupError):
+                        os.kill(process.pid if whole else choice.choice(workers), signal.SIGKILL)
+                        killed["run" if whole else "worker"] += 1
+            process.wait(PATIENCE)
             error = "" if process.stderr is None else process.stderr.read()
-        wait_until(lambda lingering=lingering: not any(map(running, lingering)), 10.0)
-        if process.returncode == 0 or not killer.left:
-            return
+        wait_until(lambda workers=workers: not any(map(running, workers)), 10.0)  # none is left behind
+        if process.returncode == 0:
+            break
         if process.returncode != -signal.SIGKILL:  # one chunk has cost three workers
             assert process.returncode == 2
             assert "all other chunks are done, and another run does these" in error
+    return killed
 
 
-def test_killed_at_random_moments(place: Path, tmp_path: Path, whole: FittedMap) -> None:
-    out = tmp_path / "coat.zarr"
-    killer = Killer(out, kills=2, chunks=16, parents=2, seed=1)
-    ordeal(place, command(place, out, "--processes", "2"), killer)
-    assert killer.killed == {"worker": 1, "parent": 1}
-    assert main(command(place, out, "--processes", "1")) == 0
-    assert_same(open_map(out), whole)
-    assert os.listdir(tmp_path) == ["coat.zarr"]
-
-
-@pytest.mark.slow
-def test_killed_fifty_times_in_200_chunks(tmp_path: Path) -> None:
-    write_files(tmp_path, (80, 40))
+@pytest.mark.parametrize(
+    ("shape", "kills"), [((16, 16), 5), pytest.param((80, 40), 50, marks=pytest.mark.slow)], ids=["few", "fifty"]
+)
+def test_killed_at_random_moments(tmp_path: Path, shape: tuple[int, int], kills: int) -> None:
+    write_files(tmp_path, shape)
     (tmp_path / "sitecustomize.py").write_text(SLOW_DISK)
     assert main(command(tmp_path, tmp_path / "whole.zarr", "--processes", "1")) == 0
     (tmp_path / "many").mkdir()
-    out = tmp_path / "many" / "coat.zarr"
-    killer = Killer(out, kills=50, chunks=200, parents=5, seed=2)
-    ordeal(tmp_path, command(tmp_path, out, "--processes", "2"), killer)
-    assert main(command(tmp_path, out, "--processes", "2")) == 0
-    assert killer.left == 0
-    assert killer.killed == {"worker": 40, "parent": 10}
-    assert there(out) == 200
+    out, chunks = tmp_path / "many" / "coat.zarr", shape[0] * shape[1] // 16
+    words = command(tmp_path, out, "--processes", "2")
+    killed = kill_at_random(tmp_path, words, out, kills, chunks, seed=kills)
+    assert killed["run"] == kills // 5
+    assert killed["worker"] == kills - kills // 5
+    assert main(words) == 0
+    assert there(out) == chunks
     assert_same(open_map(out), open_map(tmp_path / "whole.zarr"))
     assert os.listdir(tmp_path / "many") == ["coat.zarr"]
 

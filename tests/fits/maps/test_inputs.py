@@ -1,6 +1,7 @@
 """Measurements of a map by blocks: every source gives the same numbers, and what is wrong is named."""
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,88 +15,57 @@ from fits.data.geometry import Geometry, direction
 from fits.maps.inputs import map_data
 from tests.helpers.map_files import ANGLES, BLOCK, MASK, SHAPE, SIGMA, VALUES, VIEW, C, N, hdf5_file, zarr_group
 
+DIMS = ("y", "x", "sample", "channel")
 
-def _source(kind: str, folder: Path) -> Any:
+
+def _sources(folder: Path) -> dict[str, Any]:
     """`VALUES` as each kind of source."""
     np.save(folder / "v.npy", VALUES)
-    if kind == "numpy":
-        return VALUES
-    if kind == "mapped":
-        return np.load(folder / "v.npy", mmap_mode="r")
-    if kind == "npy":
-        return str(folder / "v.npy")
-    if kind.startswith("hdf5"):
-        hdf5_file(folder / "v.h5", {"values": VALUES, "other": MASK}, chunks=True, compression="gzip")
-        hdf5_file(folder / "one.hdf5", {"anything": VALUES})
-        return {
-            "hdf5": folder / "v.h5",
-            "hdf5, name": f"{folder}/v.h5:/values",
-            "hdf5, one": folder / "one.hdf5",
-            "hdf5, object": h5py.File(folder / "v.h5")["values"],
-        }[kind]
-    if kind.startswith("zarr"):
-        group = zarr_group(folder / "v.zarr", {"values": VALUES, "other": MASK})
-        zarr.create_array(folder / "one.zarr", data=VALUES)
-        return {
-            "zarr": folder / "v.zarr",
-            "zarr, name": f"{folder}/v.zarr:/values",
-            "zarr, folder": folder / "v.zarr" / "values",
-            "zarr, one": folder / "one.zarr",
-            "zarr, object": group["values"],
-            "zarr, group": group,
-            "zarr, memory": zarr.array(VALUES),
-        }[kind]
-    turned = xarray.DataArray(VALUES, dims=("y", "x", "sample", "channel")).transpose("channel", "y", "sample", "x")
-    return {"xarray": turned, "xarray, dataset": xarray.Dataset({"values": turned})}[kind]
+    hdf5_file(folder / "v.h5", {"values": VALUES, "other": MASK}, chunks=True, compression="gzip")
+    hdf5_file(folder / "one.hdf5", {"anything": VALUES, "labels": np.array([b"gloss", b"matt"])})
+    group = zarr_group(folder / "v.zarr", {"values": VALUES, "other": MASK})
+    zarr.create_array(folder / "one.zarr", data=VALUES)
+    turned = xarray.DataArray(VALUES, dims=DIMS).transpose("channel", "y", "sample", "x")
+    return {
+        "npy": str(folder / "v.npy"),
+        "hdf5": folder / "v.h5",
+        "hdf5, name": f"{folder}/v.h5:/values",
+        "hdf5, one": folder / "one.hdf5",
+        "zarr": folder / "v.zarr",
+        "zarr, name": f"{folder}/v.zarr:/values",
+        "zarr, folder": folder / "v.zarr" / "values",
+        "zarr, one": folder / "one.zarr",
+        "numpy": VALUES,
+        "mapped": np.load(folder / "v.npy", mmap_mode="r"),
+        "masked": np.ma.masked_invalid(VALUES),
+        "hdf5, object": h5py.File(folder / "v.h5")["values"],
+        "zarr, object": group["values"],
+        "zarr, group": group,
+        "zarr, memory": zarr.array(VALUES),
+        "xarray": turned,
+        "xarray, dataset": xarray.Dataset({"values": turned}),
+    }
 
 
-BY_NAME = ["npy", "hdf5", "hdf5, name", "hdf5, one", "zarr", "zarr, name", "zarr, folder", "zarr, one"]
-OBJECTS = [
-    "numpy",
-    "mapped",
-    "hdf5, object",
-    "zarr, object",
-    "zarr, group",
-    "zarr, memory",
-    "xarray",
-    "xarray, dataset",
-]
-
-
-@pytest.mark.parametrize("kind", BY_NAME + OBJECTS)
-def test_each_source_gives_the_same_block(tmp_path: Path, kind: str) -> None:
-    found = map_data(_source(kind, tmp_path), VIEW)
-    assert (found.shape, found.samples, found.channels) == (SHAPE, N, C)
-    for block in (BLOCK, (slice(0, 1), slice(3, None)), (slice(2, 3),), ()):
-        np.testing.assert_array_equal(found.read(block), VALUES[block])
-    assert found.read(BLOCK).dtype == np.float64
-    assert found.fingerprint() == map_data(VALUES, VIEW).fingerprint()
-    assert (found.portable is not None) == (kind in BY_NAME)
-    if found.portable is not None:
-        small = pickle.dumps(found.portable)
-        assert len(small) < 2000
-        again = map_data(*pickle.loads(small))
-        np.testing.assert_array_equal(again.read(BLOCK), VALUES[BLOCK])
-        assert again.fingerprint() == found.fingerprint()
-
-
-def test_what_is_small_goes_to_other_processes_from_memory(tmp_path: Path) -> None:
-    np.save(tmp_path / "v.npy", VALUES)
-    sigma, mask = SIGMA[0, 0, :, 0], xarray.DataArray(MASK)
-    found = map_data(tmp_path / "v.npy", VIEW, sigma=sigma, mask=mask)
-    again = map_data(*pickle.loads(pickle.dumps(found.portable)))
-    assert again.fingerprint() == found.fingerprint()
-    np.testing.assert_array_equal(again.read_mask(BLOCK), MASK[BLOCK])
-    np.testing.assert_array_equal(again.read_sigma(BLOCK), found.read_sigma(BLOCK))
-    assert map_data(tmp_path / "v.npy", VIEW, sigma=SIGMA).portable is None
-
-
-def test_blocks_are_copies_and_are_asked_for_by_slices() -> None:
+def test_each_source_gives_the_same_blocks(tmp_path: Path) -> None:
+    expected = map_data(VALUES, VIEW).fingerprints()
+    for kind, source in _sources(tmp_path).items():
+        found = map_data(source, VIEW)
+        assert (found.shape, found.samples, found.channels) == (SHAPE, N, C)
+        for block in (BLOCK, (slice(0, 1), slice(3, None)), (slice(2, 3),), ()):
+            np.testing.assert_array_equal(found.read(block).values, VALUES[block], err_msg=kind)
+        assert found.fingerprints() == expected
+        assert (found.portable is not None) == isinstance(source, str | Path)
+        if found.portable is not None:
+            assert replace(map_data(source, VIEW, sigma=SIGMA), sigma=None).portable[2] is None
+            small = pickle.dumps(found.portable)
+            assert len(small) < 2000
+            again = map_data(*pickle.loads(small))
+            np.testing.assert_array_equal(again.read(BLOCK).values, VALUES[BLOCK])
+            assert again.fingerprints() == expected
     found = map_data(VALUES, VIEW)
-    found.read(BLOCK)[...] = 0.0
-    np.testing.assert_array_equal(found.read(BLOCK), VALUES[BLOCK])
-    with pytest.raises(ValueError, match="must be slices without a step along 2 axes"):
-        found.read((slice(0, 4, 2),))
+    found.read(BLOCK).values[...] = 0.0  # a copy
+    np.testing.assert_array_equal(found.read(BLOCK).values, VALUES[BLOCK])
 
 
 @pytest.mark.parametrize(
@@ -113,92 +83,88 @@ def test_channels_are_told_from_measurements(shape: tuple, leading: tuple, chann
     values = np.arange(float(np.prod(shape))).reshape(shape)
     found = map_data(values, VIEW)
     assert (found.shape, found.channels) == (leading, channels)
-    np.testing.assert_array_equal(found.read(()), values.reshape(*leading, N, channels))
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (
-            np.ones((N, 3)),
-            r"values has shape \(6, 3\), the geometry 6 pairs of directions: values must be \(..., 6, C\)",
-        ),
-        (np.ones((4, 5, 7, 3)), r"values has shape \(4, 5, 7, 3\), the geometry 6 pairs"),
-        (np.ones(N), r"values has shape \(6,\)"),
-        (np.ones((0, N)), r"values has shape \(0, 6\), must hold something"),
-        (np.ones((2, N), complex), "values holds complex128, must hold real numbers"),
-        ([["a"] * N], "values holds <U1, must hold real numbers"),
-        ("nowhere.npy", "no such file: 'nowhere.npy'"),
-        (".", "is a folder, .* layerjax fit-many"),
-        (__file__, r"test_inputs.py: ends in '.py', a map is read from .npy, .h5, .hdf5 or .zarr"),
-    ],
-)
-def test_values_that_are_none_are_named(values: Any, message: str) -> None:
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        map_data(values, VIEW)
+    np.testing.assert_array_equal(found.read().values, values.reshape(*leading, N, channels))
 
 
 def test_a_named_axis_decides() -> None:
     square = np.random.default_rng(0).uniform(size=(N, N, N))
     first = map_data(xarray.DataArray(square, dims=("sample", "a", "b")), VIEW)
     assert (first.shape, first.channels) == ((N, N), 1)
-    np.testing.assert_array_equal(first.read(())[..., 0], np.moveaxis(square, 0, -1))
+    np.testing.assert_array_equal(first.read().values[..., 0], np.moveaxis(square, 0, -1))
     other = map_data(xarray.DataArray(square, dims=("channel", "sample", "b")), VIEW)
     assert (other.shape, other.channels) == ((N,), N)
-    np.testing.assert_array_equal(other.read(()), square.transpose(2, 1, 0))
+    np.testing.assert_array_equal(other.read().values, square.transpose(2, 1, 0))
+    # and those of mask and sigma follow those of the values
+    mask, sigma = xarray.DataArray(MASK, dims=DIMS[:2]).transpose(), xarray.DataArray(SIGMA, dims=DIMS)
+    turned = sigma.transpose("channel", "x", "sample", "y")
+    found = map_data(xarray.DataArray(VALUES, dims=DIMS), VIEW, sigma=turned, mask=mask).read()
+    np.testing.assert_array_equal(found.mask, MASK)
+    np.testing.assert_array_equal(found.sigma, SIGMA)
 
 
 @pytest.mark.parametrize(
     "sigma", [SIGMA, SIGMA[..., 0], SIGMA[:1, :1], SIGMA[0, 0, :, 0]], ids=["full", "channels alike", "axes of 1", "N"]
 )
-def test_deviations_broadcast(tmp_path: Path, sigma: np.ndarray) -> None:
-    path = tmp_path / "sigma.npy"
-    np.save(path, sigma)
-    full = np.broadcast_to(sigma[..., None] if sigma.ndim in (1, 3) else sigma, VALUES.shape)
-    for given in (sigma, path):
-        found = map_data(VALUES, VIEW, sigma=given).read_sigma(BLOCK)
-        np.testing.assert_array_equal(found, full[BLOCK])
-    assert map_data(VALUES, VIEW).read_sigma(BLOCK) is None
-
-
-def test_a_mask_is_of_truth_values_or_whole_numbers(tmp_path: Path) -> None:
+def test_deviations_and_masks_are_of_the_block(tmp_path: Path, sigma: np.ndarray) -> None:
+    np.save(tmp_path / "sigma.npy", sigma)
     hdf5_file(tmp_path / "m.h5", {"mask": 255 * MASK.astype(np.uint8), "more": MASK})
-    for given in (MASK, tmp_path / "m.h5", xarray.DataArray(MASK)):
-        found = map_data(VALUES, VIEW, mask=given).read_mask(BLOCK)
-        np.testing.assert_array_equal(found, MASK[BLOCK])
-        assert found.dtype == bool
-    assert map_data(VALUES, VIEW).read_mask(BLOCK).all()
-
-
-def test_named_axes_of_mask_and_sigma_follow_those_of_the_values() -> None:
-    values = xarray.DataArray(VALUES, dims=("y", "x", "sample", "channel"))
-    mask, sigma = xarray.DataArray(MASK, dims=("y", "x")).transpose(), xarray.DataArray(SIGMA, dims=values.dims)
-    found = map_data(values, VIEW, sigma=sigma.transpose("channel", "x", "sample", "y"), mask=mask)
-    np.testing.assert_array_equal(found.read_mask(()), MASK)
-    np.testing.assert_array_equal(found.read_sigma(()), SIGMA)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sigma": SIGMA[1:]}, r"sigma has shape \(4, 4, 6, 2\), sigma must be \(5, 4, 6, 2\), \(5, 4, 6\)"),
-        ({"mask": MASK.T}, r"mask has shape \(4, 5\), a mask must have that of the map, \(5, 4\)"),
-        ({"mask": MASK.astype(float)}, "mask holds float64, a mask must hold truth values"),
-    ],
-)
-def test_what_does_not_fit_the_values_is_named(options: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        map_data(VALUES, VIEW, **options)
+    full = np.broadcast_to(sigma[..., None] if sigma.ndim in (1, 3) else sigma, VALUES.shape)
+    for given, mask in ((sigma, MASK), (tmp_path / "sigma.npy", tmp_path / "m.h5"), (sigma, xarray.DataArray(MASK))):
+        found = map_data(VALUES, VIEW, sigma=given, mask=mask).read(BLOCK)
+        np.testing.assert_array_equal(found.sigma, full[BLOCK])
+        np.testing.assert_array_equal(found.mask, MASK[BLOCK])
+    found = map_data(VALUES, VIEW).read(BLOCK)
+    assert found.sigma is None
+    assert found.mask.all()
 
 
 def test_a_deviation_of_zero_is_named_where_it_counts() -> None:
-    sigma = SIGMA.copy()
-    sigma[2, 3, 1, 0] = 0.0
+    sigma, mask = SIGMA.copy(), np.ones(SHAPE, bool)
+    sigma[2, 3, 1, 0], mask[2, 3] = 0.0, False
     with pytest.raises(ValueError, match=r"sigma: sigma is 0 in block \[1:4, 2:4\], must be above 0"):
-        map_data(VALUES, VIEW, sigma=sigma).read_sigma(BLOCK)
-    mask = np.ones(SHAPE, bool)
-    mask[2, 3] = False
-    assert map_data(VALUES, VIEW, sigma=sigma, mask=mask).read_sigma(BLOCK) is not None
+        map_data(VALUES, VIEW, sigma=sigma).read(BLOCK)
+    assert map_data(VALUES, VIEW, sigma=sigma, mask=mask).read(BLOCK).sigma is not None
+
+
+REFUSED = [
+    (np.ones((N, 3)), r"values has shape \(6, 3\), the geometry 6 pairs of directions: values must be \(..., 6, C\)"),
+    (np.ones((4, 5, 7, 3)), r"values has shape \(4, 5, 7, 3\), the geometry 6 pairs"),
+    (np.ones((0, N)), r"values has shape \(0, 6\), must hold something"),
+    (np.ones((2, N), complex), "values holds complex128, must hold real numbers"),
+    ([["a"] * N], "values holds <U1, must hold real numbers"),
+    ("nowhere.npy", "no such file: 'nowhere.npy'"),
+    (".", "a map is one array, in .npy, .*for layerjax fit and layerjax fit-many"),
+    (__file__, r"test_inputs.py: a map is one array, in .npy"),
+]
+PARTS = [
+    ({"sigma": SIGMA[1:]}, r"sigma has shape \(4, 4, 6, 2\), sigma must be \(5, 4, 6, 2\), \(5, 4, 6\)"),
+    ({"mask": MASK.T}, r"mask has shape \(4, 5\), a mask must have that of the map, \(5, 4\)"),
+    ({"mask": MASK.astype(float)}, "mask holds float64, a mask must hold truth values"),
+]
+DIRECTIONS = [
+    (None, "geometry is not given, and there is nothing beside the values"),
+    ((VIEW.wi, 2.0 * VIEW.wo), "geometry: wo is .* must be finite and of length 1"),
+    ((VIEW.wi, VIEW.wo[:3]), r"shapes wi \(6, 3\), wo \(3, 3\) do not fit together"),
+    ((VIEW.wi, VIEW.wo[:, :2]), r"\(wo\) has shape \(6, 2\), must be \(N, 3\) or \(..., N, 3\)"),
+    ((VIEW.wi,), "geometry has 1 entries, must be two"),
+    ({"wi": VIEW.wi}, "geometry has no directions, must hold wi and wo, or theta_i"),
+    (ANGLES | {"theta_o": VIEW.theta_o + 200.0}, r"theta_o is .*, must be in \[0, 180\] degrees"),
+    ((VIEW.wi, np.broadcast_to(VIEW.wo, (4, 5, N, 3))), r"for a map of \(4, 5\), the measurements are of \(5, 4\)"),
+    ("view.npy", "no such file: 'view.npy'"),
+]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        *(({"values": values}, message) for values, message in REFUSED),
+        *PARTS,
+        *(({"geometry": geometry}, message) for geometry, message in DIRECTIONS),
+    ],
+)
+def test_what_cannot_be_is_named(given: dict, message: str) -> None:
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        map_data(**{"values": VALUES, "geometry": VIEW} | given)
 
 
 def test_damaged_files_are_named(tmp_path: Path) -> None:
@@ -206,16 +172,10 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     damaged = tmp_path / "v.zarr" / "values" / "c" / "1" / "1" / "0" / "0"
     damaged.write_bytes(damaged.read_bytes()[:20])
     found = map_data(tmp_path / "v.zarr", VIEW)
-    np.testing.assert_array_equal(found.read((slice(0, 2),)), VALUES[:2])  # the rest is as good as it was
+    np.testing.assert_array_equal(found.read((slice(0, 2),)).values, VALUES[:2])  # the rest is as good as it was
     with pytest.raises(ValueError, match=r"v.zarr:/values: block \[1:4, 2:4\] cannot be read: \S"):
         found.read(BLOCK)
-
-    path = hdf5_file(tmp_path / "v.h5", {"values": VALUES}, chunks=(5, 4, N, C), compression="gzip")
-    content = bytearray(path.read_bytes())
-    content[-200:] = bytes(200)
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"v\.h5"):
-        map_data(path, VIEW).read(BLOCK)
+    assert "?" in found.fingerprints()
 
     np.save(tmp_path / "v.npy", VALUES)
     later = map_data(tmp_path / "v.npy", VIEW)
@@ -231,75 +191,72 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
 
 def test_a_group_with_several_arrays_says_which(tmp_path: Path) -> None:
     zarr_group(tmp_path / "v.zarr", {"first": VALUES, "second": VALUES})
-    with pytest.raises(ValueError, match=r"v.zarr: no array 'values', there are first, second; PATH:/NAME chooses"):
-        map_data(tmp_path / "v.zarr", VIEW)
-    with pytest.raises(ValueError, match=r"v.zarr: holds no 'third'"):
-        map_data(f"{tmp_path}/v.zarr:/third", VIEW)
-    labels = np.array([b"gloss", b"matt"])
-    hdf5_file(tmp_path / "v.h5", {"anything": VALUES, "labels": labels})  # words count for nothing
-    np.testing.assert_array_equal(map_data(tmp_path / "v.h5", VIEW).read(()), VALUES)
-    with pytest.raises(ValueError, match=r"v.h5:/labels holds \|S5, must hold real numbers"):
-        map_data(f"{tmp_path}/v.h5:/labels", VIEW)
+    hdf5_file(tmp_path / "v.h5", {"labels": np.array([b"gloss", b"matt"])})
+    for path, message in (
+        ("v.zarr", r"v.zarr: no array 'values', there are first, second; PATH:/NAME chooses"),
+        ("v.zarr:/third", r"v.zarr: holds no 'third'"),
+        ("v.h5:/labels", r"v.h5:/labels holds \|S5, must hold real numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            map_data(f"{tmp_path}/{path}", VIEW)
 
 
-def test_numbers_that_stand_for_nothing_are_nan(tmp_path: Path) -> None:
-    filled = xarray.Dataset({"values": (("y", "x", "sample", "channel"), VALUES)})
+def test_numbers_that_stand_for_nothing_are_nan_and_packed_ones_unpacked(tmp_path: Path) -> None:
+    filled = xarray.Dataset({"values": (DIMS, VALUES)})
     encoding = {"values": {"_FillValue": -999.0}}
     filled.to_zarr(tmp_path / "v2.zarr", zarr_format=2, encoding=encoding)
     filled.to_netcdf(tmp_path / "v.h5", engine="h5netcdf", encoding=encoding)
     filled.to_zarr(tmp_path / "v3.zarr", zarr_format=3, consolidated=False, encoding=encoding)
     for name in ("v2.zarr", "v.h5", "v3.zarr"):
-        np.testing.assert_array_equal(map_data(tmp_path / name, VIEW).read(()), VALUES)
+        np.testing.assert_array_equal(map_data(tmp_path / name, VIEW).read().values, VALUES)
     packed = {"values": {"dtype": "i2", "scale_factor": 0.001, "_FillValue": -1}}
     filled.to_netcdf(tmp_path / "packed.h5", engine="h5netcdf", encoding=packed)
-    np.testing.assert_allclose(map_data(tmp_path / "packed.h5", VIEW).read(()), VALUES, atol=5e-4)
-    hidden = np.ma.masked_invalid(VALUES)
-    np.testing.assert_array_equal(map_data(hidden, VIEW).read(()), VALUES)
+    np.testing.assert_allclose(map_data(tmp_path / "packed.h5", VIEW).read().values, VALUES, atol=5e-4)
 
 
-def test_the_digest_is_of_the_content(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = map_data(VALUES, VIEW, sigma=SIGMA, mask=MASK)
-    seen = {plain.fingerprint()}
-    for place in ((0, 0, 0, 0), (4, 3, 5, 1), (2, 1, 0, 0)):
-        other = VALUES.copy()
-        other[place] += 1e-9
-        seen |= {map_data(other, VIEW, sigma=SIGMA, mask=MASK).fingerprint()}
-        more = SIGMA.copy()
-        more[place] *= 1.5
-        seen |= {map_data(VALUES, VIEW, sigma=more, mask=MASK).fingerprint()}
-    flipped = MASK.copy()
+def test_fingerprints_are_of_the_content(monkeypatch: pytest.MonkeyPatch) -> None:
+    def of(*given: Any, **more: Any) -> tuple[str, ...]:
+        return tuple(map_data(*given, **more).fingerprints())
+
+    plain, flipped = of(VALUES, VIEW, sigma=SIGMA, mask=MASK), MASK.copy()
     flipped[2, 2] ^= True
-    turned = Geometry(VIEW.wo, VIEW.wi)
-    seen |= {map_data(VALUES, VIEW, sigma=SIGMA, mask=flipped).fingerprint(), map_data(VALUES, turned).fingerprint()}
-    seen |= {map_data(VALUES, VIEW).fingerprint(), map_data(VALUES.astype(np.float32), VIEW).fingerprint()}
-    assert len(seen) == 1 + 6 + 4
-    assert map_data(VALUES.copy(), VIEW, sigma=SIGMA, mask=MASK).fingerprint() == plain.fingerprint()
+    seen = {
+        plain,
+        of(VALUES, VIEW, sigma=SIGMA, mask=flipped),
+        of(VALUES, Geometry(VIEW.wo, VIEW.wi)),
+        of(VALUES, VIEW),
+    }
+    for place in ((0, 0, 0, 0), (4, 3, 5, 1), (2, 1, 0, 0)):
+        other, more = VALUES.copy(), SIGMA.copy()
+        other[place] += 1e-9
+        more[place] *= 1.5
+        seen |= {of(other, VIEW, sigma=SIGMA, mask=MASK), of(VALUES, VIEW, sigma=more, mask=MASK)}
+    assert len(seen) == 4 + 6
+    assert of(VALUES.copy(), VIEW, sigma=SIGMA, mask=MASK) == plain
 
     monkeypatch.setattr("fits.maps.inputs.WHOLE", 0)  # now some texels alone enter, the first and the last among them
     long = np.random.default_rng(3).uniform(size=(40, 1000, N))
-    first = map_data(long, VIEW).fingerprint()
-    assert map_data(long.copy(), VIEW).fingerprint() == first
+    first = of(long, VIEW)
+    assert of(long.copy(), VIEW) == first
     for place in ((0, 0, 0), (39, 999, 5)):
         other = long.copy()
         other[place] += 1.0
-        assert map_data(other, VIEW).fingerprint() != first
+        assert of(other, VIEW) != first
 
 
 def test_only_blocks_are_read(tmp_path: Path) -> None:
     """A map far beyond memory is opened, and a block of it read: the file is a hole of 400 GB."""
-    shape = (2**17, 2**17, N)
-    path = tmp_path / "v.npy"
+    shape, path = (2**17, 2**17, N), tmp_path / "v.npy"
     with path.open("wb") as file:
-        header = {"shape": shape, "fortran_order": False, "descr": "<f4"}
-        np.lib.format.write_array_header_2_0(file, header)
+        np.lib.format.write_array_header_2_0(file, {"shape": shape, "fortran_order": False, "descr": "<f4"})
         try:
             file.truncate(file.tell() + 4 * int(np.prod(shape)))
         except OSError:
             pytest.skip("no such long files here")
     found = map_data(path, VIEW)
     assert found.shape == shape[:2]
-    np.testing.assert_array_equal(found.read((slice(7, 9), slice(5, 8))), np.zeros((2, 3, N, 1)))
-    assert found.fingerprint().count(",") > 60  # of blocks from all over it
+    np.testing.assert_array_equal(found.read((slice(7, 9), slice(5, 8))).values, np.zeros((2, 3, N, 1)))
+    assert len(found.fingerprints()) > 60  # of blocks from all over it
 
 
 # ---- directions ----
@@ -315,27 +272,27 @@ def test_directions_may_stand_beside_the_values(tmp_path: Path, kind: str, own: 
         zarr_group(tmp_path / "v.zarr", {"values": VALUES, "wi": wi, "wo": wo})
         found = map_data(tmp_path / "v.zarr")
     elif kind == "hdf5":
-        hdf5_file(
-            tmp_path / "v.h5", {"scan/values": VALUES} | {f"scan/{name}": given for name, given in angles.items()}
-        )
-        found = map_data(f"{tmp_path}/v.h5:/scan/values")
+        arrays = {"scan/values": VALUES} | {f"scan/{name}": given for name, given in angles.items()}
+        found = map_data(f"{hdf5_file(tmp_path / 'v.h5', arrays)}:/scan/values")
     else:
-        dims = ("y", "x", "sample")
+        dims = DIMS[:3]
         named = {name: (dims[-np.ndim(given) :], given) for name, given in angles.items()}
         if kind == "xarray":
             vectors = {"wi": (("sample", "xyz"), wi), "wo": ((*dims[-wo.ndim + 1 :], "xyz"), wo)}
-            found = map_data(xarray.Dataset(vectors | {"values": ((*dims, "channel"), VALUES)}).transpose())
+            found = map_data(xarray.Dataset(vectors | {"values": (DIMS, VALUES)}).transpose())
         else:
-            found = map_data(xarray.DataArray(VALUES, dims=(*dims, "channel"), coords=named).transpose("x", ...))
+            found = map_data(xarray.DataArray(VALUES, dims=DIMS, coords=named).transpose("x", ...))
         wo = np.swapaxes(wo, 0, 1) if own else wo
     assert (found.geometry is None) == own
+    if found.geometry is not None:
+        np.testing.assert_allclose((found.geometry.wi, found.geometry.wo), (wi, wo), atol=1e-12)
+        return
     block = (slice(1, 3), slice(0, 2))
-    seen = found.read_directions(block)
-    for one, expected in zip(seen, (wi, wo), strict=True):
-        expected = expected[block] if expected.ndim == 4 else expected
-        np.testing.assert_allclose(one, np.broadcast_to(expected, one.shape), atol=1e-12)
+    seen = found.read(block)
+    np.testing.assert_allclose(seen.wi, np.broadcast_to(wi, seen.wi.shape), atol=1e-12)
+    np.testing.assert_allclose(seen.wo, wo[block], atol=1e-12)
     if found.portable is not None:
-        np.testing.assert_array_equal(map_data(*found.portable).read_directions(block)[1], seen[1])
+        np.testing.assert_array_equal(map_data(*found.portable).read(block).wo, seen.wo)
 
 
 def test_directions_come_from_elsewhere(tmp_path: Path) -> None:
@@ -343,50 +300,22 @@ def test_directions_come_from_elsewhere(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "view.csv", table, delimiter=",", header=",".join(ANGLES), comments="")
     hdf5_file(tmp_path / "view.h5", {"wi": VIEW.wi, "wo": VIEW.wo})
     for given in (tmp_path / "view.csv", tmp_path / "view.h5", (VIEW.wi, VIEW.wo), {"wi": VIEW.wi, "wo": VIEW.wo}):
-        found = map_data(VALUES, given).read_directions(BLOCK)
-        np.testing.assert_allclose(found, (VIEW.wi, VIEW.wo), atol=1e-9)
+        found = map_data(VALUES, given).geometry
+        np.testing.assert_allclose((found.wi, found.wo), (VIEW.wi, VIEW.wo), atol=1e-9)
 
 
 def test_directions_of_masked_texels_are_not_looked_at() -> None:
     own = np.broadcast_to(VIEW.wo, (*SHAPE, N, 3)).copy()
     own[~MASK] = np.nan
-    found = map_data(VALUES, Geometry(VIEW.wi, own), mask=MASK)
-    wi, wo = found.read_directions(())
-    assert wi.shape == wo.shape == (*SHAPE, N, 3)
-    np.testing.assert_array_equal(wo[MASK], own[MASK])
-    np.testing.assert_array_equal(wo[~MASK], np.broadcast_to([0.0, 0.0, 1.0], (int((~MASK).sum()), N, 3)))
-    with pytest.raises(
-        ValueError, match=r"geometry: wo is \[nan, nan, nan\] in block .*must be finite and of length 1"
+    theta = np.broadcast_to(VIEW.theta_o, (*SHAPE, N)).copy()
+    theta[~MASK] = -999.0  # whatever stands for nothing there, beside angles that all texels share
+    for given, words in (
+        ((VIEW.wi, own), r"geometry: wo is \[nan, nan, nan\] in block .*must be finite and of length 1"),
+        (ANGLES | {"theta_o": theta}, r"theta_o is -999, must be in \[0, 180\] degrees"),
     ):
-        map_data(VALUES, (VIEW.wi, own))
-
-
-def test_angles_of_masked_texels_are_not_looked_at() -> None:
-    """Whatever stands for nothing there, beside angles that all texels share."""
-    own = np.broadcast_to(VIEW.theta_o, (*SHAPE, N)).copy()
-    own[~MASK] = -999.0
-    wi, wo = map_data(VALUES, ANGLES | {"theta_o": own}, mask=MASK).read_directions(())
-    np.testing.assert_allclose(wo[MASK], np.broadcast_to(VIEW.wo, (int(MASK.sum()), N, 3)), atol=1e-12)
-    np.testing.assert_array_equal(wo[~MASK], np.broadcast_to([0.0, 0.0, 1.0], (int((~MASK).sum()), N, 3)))
-    np.testing.assert_allclose(wi, np.broadcast_to(VIEW.wi, wi.shape), atol=1e-12)
-    with pytest.raises(ValueError, match=r"theta_o is -999, must be in \[0, 180\] degrees"):
-        map_data(VALUES, ANGLES | {"theta_o": own})
-
-
-@pytest.mark.parametrize(
-    ("geometry", "message"),
-    [
-        (None, "geometry is not given, and there is nothing beside the values"),
-        ((VIEW.wi, 2.0 * VIEW.wo), "geometry: wo is .* must be finite and of length 1"),
-        ((VIEW.wi, VIEW.wo[:3]), r"shapes wi \(6, 3\), wo \(3, 3\) do not fit together"),
-        ((VIEW.wi, VIEW.wo[:, :2]), r"\(wo\) has shape \(6, 2\), must be \(N, 3\) or \(..., N, 3\)"),
-        ((VIEW.wi,), "geometry has 1 entries, must be two"),
-        ({"wi": VIEW.wi}, "geometry has no directions, must hold wi and wo, or theta_i"),
-        (ANGLES | {"theta_o": VIEW.theta_o + 200.0}, r"theta_o is .*, must be in \[0, 180\] degrees"),
-        ((VIEW.wi, np.broadcast_to(VIEW.wo, (4, 5, N, 3))), r"for a map of \(4, 5\), the measurements are of \(5, 4\)"),
-        ("view.npy", "no such file: 'view.npy'"),
-    ],
-)
-def test_directions_that_are_none_are_named(geometry: Any, message: str) -> None:
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        map_data(VALUES, geometry)
+        found = map_data(VALUES, given, mask=MASK).read()
+        assert found.wi.shape == found.wo.shape == (*SHAPE, N, 3)
+        np.testing.assert_allclose(found.wo[MASK], np.broadcast_to(VIEW.wo, (int(MASK.sum()), N, 3)), atol=1e-12)
+        assert (found.wo[~MASK] == [0.0, 0.0, 1.0]).all()
+        with pytest.raises(ValueError, match=words):
+            map_data(VALUES, given)

@@ -1,4 +1,4 @@
-"""Descents of many texels in turns: each against one of its own, and what is known where they begin."""
+"""Fits of many texels in turns: each against one of its own, and what is known where they begin."""
 
 import jax
 import jax.numpy as jnp
@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 
 import fits
-import layerjax as lj
-from fits.maps import descent
-from fits.maps.descent import blank_texel, make_texels, with_own_directions
+from fits.maps import texels
 from fits.maps.options import USUAL
-from fits.maps.search import _program, linearise_all, search, solve, starts_at
+from fits.maps.search import search, starts_at
+from fits.maps.texels import fit_texels, linearise_at, make_texels, standard_errors, to_units, with_own_directions
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
 from fits.problem.compilation import _run
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps
-from tests.helpers.quick_maps import FREE, TRANSPORT, coat
+from tests.helpers.quick_maps import FREE, TRANSPORT
 
 SIZE, TEXELS = 16, 21
 LEVEL = 0.02
+FIXED = fits.Noise(relative=LEVEL, floor=1e-4)
+LEVELS = fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +32,7 @@ def measured(geometry):
     """Of texels with numbers of their own, the last at a bound: (M, N, 1)."""
     rng = np.random.default_rng(4)
     truth = np.append(rng.uniform((0.2, 0.2), (2.0, 0.9), (TEXELS - 1, 2)), [[0.4, 1.0]], axis=0)
-
-    def one(numbers):
-        return lj.evaluate(coat(*numbers), jnp.asarray(geometry.wi), jnp.asarray(geometry.wo), transport=TRANSPORT)
-
-    exact = np.asarray(jax.vmap(one)(truth))
+    exact = quick_maps.exact(truth, geometry)
     return exact * (1.0 + LEVEL * rng.standard_normal(exact.shape))
 
 
@@ -43,10 +40,6 @@ def problem_of(geometry, noise, values=None, objective="likelihood"):
     values = np.ones((len(geometry.wi), 1)) if values is None else values
     data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(values), bool), ("bsdf",))
     return Problem(FREE, data, transport=TRANSPORT, noise=noise, objective=objective)
-
-
-FIXED = fits.Noise(relative=LEVEL, floor=1e-4)
-LEVELS = fits.Noise(relative=fits.Free(0.05, 1e-3, 0.5), floor=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -66,76 +59,60 @@ def test_each_ends_where_a_descent_of_its_own_does(geometry, measured, noise, ob
     rows = make_texels(measured, least=1e-4)
     units = rng.uniform(0.2, 0.8, (5, len(problem.names)))[np.arange(TEXELS) % 5]
     for fresh in (True, False):
-        found = solve(problem, units, rows, SIZE, fresh)
+        found = fit_texels(problem, units, rows, SIZE, fresh=fresh)
+        errors, at_bound, _ = standard_errors(problem, found, rows)
         for place in range(TEXELS):
             own = problem_of(geometry, noise, measured[place], objective)
             alone = own.call(descend, units[place], fresh, 200, COST_TOLERANCE)
             assert bool(alone.converged)
             assert bool(found.converged[place])
             assert found.cost[place] == pytest.approx(float(alone.cost), abs=cost, rel=2e-10 if not cost else 0.0)
-            error = np.where(np.isfinite(found.errors[place]), found.errors[place], 1e-3)
+            error = np.where(np.isfinite(errors[place]), errors[place], 1e-3)
             assert np.all(np.abs(found.vector[place] - np.asarray(alone.vector)) < apart * error)
-        ends = np.asarray(jax.vmap(problem.model.box.to_unit)(jnp.asarray(found.vector)))
-        units = np.clip(ends + rng.uniform(-0.02, 0.02, ends.shape), 0.0, 1.0)
-
-
-def test_a_start_at_the_minimum_ends_there(geometry, measured):
-    problem, rows = problem_of(geometry, FIXED), make_texels(measured, least=1e-4)
-    first = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
-    units = np.clip(np.asarray(jax.vmap(problem.model.box.to_unit)(first.vector)), 0.0, 1.0)
-    again = solve(problem, units, rows, SIZE, fresh=False)
+        assert np.isnan(errors[at_bound]).all()
+        units = np.clip(found.unit + rng.uniform(-0.02, 0.02, found.unit.shape), 0.0, 1.0)
+    again = fit_texels(problem, found.unit, rows, SIZE, fresh=False)  # at the minimum
     assert np.all(again.converged)
-    np.testing.assert_allclose(again.cost, first.cost, rtol=1e-12, atol=1e-8)
+    np.testing.assert_allclose(again.cost, found.cost, rtol=1e-9, atol=1e-7)
 
 
-@pytest.mark.parametrize("count", [1, 40, 70])
-def test_what_is_known_is_what_the_model_says(geometry, measured, count):
-    """Values and derivatives of few points, and of more than a program takes at once; whatever the measured."""
-    problem = problem_of(geometry, LEVELS)
-    units = np.random.default_rng(count).random((count, 3))
-    rows = make_texels(np.full_like(measured, np.nan), least=1e-4).rows(np.arange(3))
-    for asked in (blank_texel((16, 1)), rows):
-        known = linearise_all(problem, units, asked, SIZE)
-        assert known.values.shape == (count, 16, 1)
-        assert known.slopes.shape == (count, 3, 16, 1)
-        for place in (0, count - 1):
-            vector = problem.model.box.from_unit(jnp.asarray(units[place]))
-            np.testing.assert_allclose(known.values[place], problem.model.predict(vector), rtol=1e-12)
-            slopes = jax.jacrev(problem.model.predict)(vector)
-            np.testing.assert_allclose(known.slopes[place], np.moveaxis(slopes, -1, 0), rtol=1e-9, atol=1e-12)
+@pytest.mark.parametrize("count", [1, 70])
+def test_what_is_known_at_starts_is_what_the_model_says(geometry, count):
+    """Values and derivatives of few points, and of more than a program takes at once."""
+    problem, units = problem_of(geometry, LEVELS), np.random.default_rng(count).random((count, 3))
+    known = linearise_at(problem, units, SIZE)
+    assert known.values.shape == (count, 16, 1)
+    for place in (0, count - 1):
+        vector = problem.model.box.from_unit(jnp.asarray(units[place]))
+        np.testing.assert_allclose(known.values[place], problem.model.predict(vector), rtol=1e-12)
+        slopes = np.moveaxis(np.asarray(jax.jacrev(problem.model.predict)(vector)), -1, 0)
+        np.testing.assert_allclose(known.slopes[place], slopes, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(to_units(problem, np.asarray(vector)), units[place], rtol=1e-12)
 
 
 def test_the_model_stands_in_the_program_once(geometry, measured, monkeypatch):
     """It takes most of the time and the memory that compiling takes."""
     traced = []
-    original = descent.linearise
-    monkeypatch.setattr(descent, "linearise", lambda *given: traced.append(given) or original(*given))
+    original = texels._linearise
+    monkeypatch.setattr(texels, "_linearise", lambda *given: traced.append(given) or original(*given))
     model, rows = problem_of(geometry, FIXED).model, make_texels(measured, least=1e-4).rows(np.arange(SIZE))
-    known = descent.Linearisation(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
-    given = np.full((64, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, False, False))
-    jax.make_jaxpr(lambda *given: _program(model, *given))(*given)
+    known = texels.Linearisation(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
+    given = np.full((SIZE, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, 0, False, 200))
+    jax.make_jaxpr(lambda *given: texels._program(model, *given))(*jax.tree.map(jnp.asarray, given))
     assert len(traced) == 1
-
-
-def test_own_directions_begin_with_nothing_known(geometry, measured):
-    """By a program of its own, to the same ends."""
-    problem, rows = problem_of(geometry, FIXED), make_texels(measured, least=1e-4)
-    common = solve(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
-    wi, wo = (np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo))
-    own = solve(
-        with_own_directions(problem), np.full((TEXELS, 2), 0.5), make_texels(measured, None, 1e-4, wi, wo), SIZE
-    )
-    np.testing.assert_allclose(own.cost, common.cost, rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["common directions", "own directions"])
 def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, measured, own):
     problem = problem_of(geometry, FIXED)
+    plain = fit_texels(problem, np.full((TEXELS, 2), 0.5), make_texels(measured, least=1e-4), SIZE)
     problem = with_own_directions(problem) if own else problem
     sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if own else []
     rows, vectors = make_texels(measured, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
     starts = starts_at(problem, vectors, np.zeros((0, 2)), own, SIZE)
     whole = search(problem, starts, rows, SIZE, USUAL)
+    found = fit_texels(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
+    np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-9, atol=1e-6)
     before = _run._cache_size()
     for count in (1, 6, SIZE, SIZE + 1):
         some = search(problem, starts, rows.rows(np.arange(count)), SIZE, USUAL)

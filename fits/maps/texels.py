@@ -1,0 +1,494 @@
+"""Texels side by side, and the best fits of many of them from a start each: the optimiser of `fits.fit`, batched.
+
+One compiled program takes a few lanes through their steps together, and a texel that has ended makes room for the next.
+Values and derivatives of the model are computed once for every trial and carried from step to step: residuals, sigma
+and all that follows from them see the model as linear there. Otherwise the program would compute the model again for
+each of these, which takes several times as long. At a start whose linearisation is known the model is not evaluated.
+"""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax import Array
+from jax.flatten_util import ravel_pytree
+from numpy.typing import NDArray
+
+from fits.optimise.levenberg_marquardt import COST_TOLERANCE, FIRST_DAMPING, NEARBY, BoxLevenbergMarquardt
+from fits.optimise.multi_start import MOST_STEPS
+from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNIDENTIFIED_BEYOND, UNKNOWN_BEYOND
+from fits.problem.model import Model
+from fits.problem.problem import Problem
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Truths = NDArray[np.bool_]
+
+OMITTED = 1e9
+"""Standard deviation of a value that is omitted, in units of the largest: it weighs less than rounding."""
+
+LANES = 4
+"""Texels that take their steps side by side: more do not make the arithmetic of each cheaper."""
+
+LAST = 0.01
+"""Of the decrease that a full step may have left at the end: so much is left after a last step, not evaluated."""
+
+KNOWN = 64
+"""Starts whose linearisation a program takes, or a multiple of that, so that there are few programs."""
+
+_SOLVER = BoxLevenbergMarquardt()
+
+
+# ---- measurements of texels ----
+
+
+class Texels(NamedTuple):
+    """Measurements of M texels.
+
+    values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is omitted,
+    and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
+    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the coordinate of
+    `Box.centre`; None where there are none.
+    """
+
+    values: Any
+    variance: Any
+    lowest: Any
+    used: Any
+    wi: Any = None
+    wo: Any = None
+    centre: Any = None
+    inverse_sd: Any = None
+
+    @property
+    def number(self) -> int:
+        """How many there are, M."""
+        return len(self.values)
+
+    def rows(self, places: Any) -> "Texels":
+        """Some of the texels."""
+        return Texels(*(None if part is None else part[places] for part in self))
+
+    @property
+    def measurements(self) -> NDArray[np.int64]:
+        """How many of each texel count, (M,)."""
+        return np.sum(self.used, axis=(1, 2))
+
+    def with_floor(self, least: float) -> "Texels":
+        """The same with noise whose floor is at least so much, in 1/sr."""
+        return self._replace(lowest=np.sqrt(self.variance + least**2))
+
+
+def make_texels(
+    values: Floats,
+    sigma: Floats | None = None,
+    least: float = 0.0,
+    wi: Floats | None = None,
+    wo: Floats | None = None,
+) -> Texels:
+    """Values (M, N, C), with their standard deviations of that shape; what is not finite is omitted, in single
+    precision also what is finite only in double. least: of the noise's floor.
+    """
+    largest_number = float(jnp.finfo(jnp.result_type(float)).max)
+    used, variance = np.abs(values) <= largest_number, np.zeros(values.shape)
+    with np.errstate(over="ignore"):  # squares that can still be added to others
+        if sigma is not None:
+            used &= np.isfinite(sigma)
+            variance = np.minimum(np.square(np.where(used, sigma, 0.0)), 0.25 * largest_number)
+        largest = np.max(np.abs(values), initial=0.0, where=used, axis=(1, 2), keepdims=True)
+        ignored = np.minimum(np.square(OMITTED * np.where(largest > 0.0, largest, 1.0)), 0.25 * largest_number)
+    variance = np.where(used, variance, ignored)
+    return Texels(np.where(used, values, 0.0), variance, variance, used, wi, wo).with_floor(least)
+
+
+def model_of(model: Model, row: Texels) -> Model:
+    """The model with the measurements of one texel, (N, C), and the priors that it has beside those of the problem."""
+    model = eqx.tree_at(lambda m: (m.values, m.variance, m.lowest), model, (row.values, row.variance, row.lowest))
+    if row.wi is not None:
+        model = eqx.tree_at(lambda m: (m.wi, m.wo), model, (row.wi, row.wo))
+    if row.centre is None:
+        return model
+    # the product of two Gaussians, up to a constant
+    box, own, other = model.box, jnp.square(model.box.inverse_sd), jnp.square(row.inverse_sd)
+    mean = (own * box.centre + other * row.centre) / jnp.where(own + other > 0.0, own + other, 1.0)
+    box = replace(box, centre=mean, inverse_sd=jnp.sqrt(own + other))
+    return eqx.tree_at(lambda m: m.box, model, box)
+
+
+def with_own_directions(problem: Problem) -> Problem:
+    """The problem for texels that have directions of their own, of which nothing is known beforehand."""
+    return problem.with_model(replace(problem.model, known=None, side="all"))
+
+
+# ---- fits from a start each ----
+
+
+class Linearisation(NamedTuple):
+    """What a model says at a vector: values (N, C) in 1/sr, and derivatives (P, N, C) by the physical parameters."""
+
+    values: Any
+    slopes: Any
+
+
+class Fits(NamedTuple):
+    """What is found of M texels with P parameters.
+
+    vector, unit: physical and in the unit box, (M, P). cost, chi_square: (M,); an infinite cost where there is no
+    finite value. converged: (M,) bool. gradient: of the cost in the unit box, (M, P). root: (M, P, P), its root' root
+    is the information in the data, in boxes^-2. predicted: (M, N, C), in 1/sr.
+    """
+
+    vector: Any
+    unit: Any
+    cost: Any
+    chi_square: Any
+    converged: Any
+    gradient: Any
+    root: Any
+    predicted: Any
+
+    @property
+    def finite(self) -> Truths:
+        """Which have a value."""
+        return np.isfinite(self.cost) & np.all(np.isfinite(self.vector), axis=1)
+
+    def rows(self, places: Any) -> "Fits":
+        """Some of the texels."""
+        return Fits(*(part[places] for part in self))
+
+    def distinct(self) -> Floats:
+        """Where they ended that can be begun from, (K, P): converged ones, or if there are none all that are finite."""
+        good = self.finite & self.converged
+        vectors = self.vector[good if good.any() else self.finite]
+        if not len(vectors):
+            raise ValueError("values: no texel of the pilot has a finite fit; are they in 1/sr?")
+        return np.unique(vectors, axis=0)
+
+    def better(self, other: "Fits", rows: Any) -> Truths:
+        """Where another one, of these rows, is lower by more than is left to gain, (len(rows),) bool."""
+        return np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
+
+    def put(self, rows: Any, other: "Fits") -> None:
+        """Take over another one at these rows."""
+        for mine, theirs in zip(self, other, strict=True):
+            mine[rows] = theirs
+
+
+def fit_texels(
+    problem: Problem,
+    units: Floats,
+    texels: Texels,
+    size: int,
+    *,
+    known: Linearisation | None = None,
+    which: Integers | None = None,
+    fresh: bool = True,
+    most_steps: int = MOST_STEPS,
+) -> Fits:
+    """Fits of M texels by a program for up to `size` of them at a time.
+
+    Args:
+        units: where each starts, (M, P), in the unit box.
+        known: what the model says at K starts, (K, ...). which: of these, for each texel, (M,).
+        fresh: whether starts are far from minima.
+        most_steps: with 1 each ends where it begins, and what is known there is found.
+    """
+    parts = []
+    for first in range(0, texels.number, size):
+        rows = np.arange(first, min(first + size, texels.number))
+        of = None if which is None else which[rows]
+        parts.append(_call(problem, units[rows], texels.rows(rows), size, known, of, fresh, most_steps)[0])
+    return Fits(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def linearise_at(problem: Problem, units: Floats, size: int) -> Linearisation:
+    """What the model says at K points (K, P) of the unit box, by the program that fits: it is compiled already."""
+    parts, nothing = [], make_texels(np.full((1, *problem.model.values.shape), np.nan))
+    for first in range(0, len(units), min(KNOWN, size)):
+        some = units[first : first + min(KNOWN, size)]
+        rows = nothing.rows(np.zeros(len(some), int))
+        parts.append(_call(problem, some, rows, size, None, None, False, 1)[1])
+    return Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def natural(problem: Problem, vectors: Floats) -> Floats:
+    """Vectors (..., P) in the coordinate where the box is even: logarithms for some priors."""
+    logarithmic = np.asarray(problem.model.box.logarithmic)
+    return np.where(logarithmic, np.log(np.where(logarithmic, vectors, 1.0)), vectors)
+
+
+def to_units(problem: Problem, vectors: Floats) -> Floats:
+    """Vectors (..., P) in the unit box."""
+    low, high = natural(problem, problem.low), natural(problem, problem.high)
+    return np.clip((natural(problem, vectors) - low) / (high - low), 0.0, 1.0)
+
+
+def widths(problem: Problem, vectors: Floats) -> Floats:
+    """Of the box in physical units at vectors (..., P)."""
+    even = natural(problem, problem.high) - natural(problem, problem.low)
+    return even * np.where(np.asarray(problem.model.box.logarithmic), vectors, 1.0)
+
+
+def standard_errors(problem: Problem, found: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
+    """As `fits.optimise.uncertainty`, of M fits: standard errors (M, P), NaN where a bound holds the parameter and
+    infinite where nothing does; which are at a bound, (M, P); in which texels the data leave a parameter unidentified,
+    (M,)."""
+    count = found.unit.shape[1]
+    scatter = np.ones((len(found.cost), 1))  # what a difference in cost is measured in
+    if problem.objective != "likelihood":
+        freedom = np.maximum(texels.measurements - count, 1)
+        scatter = np.maximum(2.0 * found.cost / freedom, np.finfo(float).tiny)[:, None]
+    root, known = found.root / np.sqrt(scatter)[..., None], found.finite & np.isfinite(found.root).all((1, 2))
+    root = np.where(known[:, None, None], root, 0.0)
+    insensitive = np.linalg.norm(root, axis=1) * UNKNOWN_BEYOND < 1.0
+    up, down = found.gradient < -LEAST_GRADIENT * scatter, found.gradient > LEAST_GRADIENT * scatter
+    at_bound = ((found.unit <= ON_BOUND) & down) | ((found.unit >= 1.0 - ON_BOUND) & up)
+    at_bound &= ~insensitive & known[:, None]
+    unidentified = (np.linalg.svd(root, compute_uv=False)[:, -1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
+    prior = np.asarray(problem.model.box.prior_slopes())
+    prior = prior[prior.any(axis=1)]
+    prior = np.broadcast_to(prior, (len(root), *prior.shape))
+    if texels.inverse_sd is not None:
+        even = natural(problem, problem.high) - natural(problem, problem.low)
+        prior = np.concatenate([prior, (texels.inverse_sd * even)[:, :, None] * np.eye(count)], axis=1)
+    rows = np.where(at_bound[:, None], 0.0, np.concatenate([root, prior], axis=1))
+    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
+    least = np.maximum(np.finfo(found.root.dtype).eps * count * sizes[:, :1], 1.0 / LARGEST_ERROR)
+    spread = np.linalg.norm(directions / np.maximum(sizes, least)[..., None], axis=1)
+    errors = spread * widths(problem, found.vector)
+    errors = np.where((spread > UNKNOWN_BEYOND) | ~known[:, None], np.inf, errors)
+    return np.where(at_bound, np.nan, errors), at_bound, unidentified
+
+
+# ---- the program ----
+
+
+def _call(
+    problem: Problem,
+    units: Floats,
+    texels: Texels,
+    size: int,
+    known: Linearisation | None,
+    which: Integers | None,
+    fresh: bool,
+    most_steps: int,
+) -> tuple[Fits, Linearisation]:
+    """Fits of at most `size` texels, and the model where the first `KNOWN` of them ended."""
+    count, shape = texels.number, problem.model.values.shape
+    rows = np.minimum(np.arange(-(-size // LANES) * LANES), count - 1)  # padded by the last, which is not computed
+    number_known, of = (0, np.zeros_like(rows)) if which is None else (count, which[rows])
+    if known is None and texels.wi is None:
+        known = Linearisation(np.zeros((1, *shape)), np.zeros((1, units.shape[1], *shape)))
+    if known is not None:  # few numbers of starts, and of programs for them
+        known = Linearisation(*(np.concatenate([one, np.repeat(one[-1:], -len(one) % KNOWN, axis=0)]) for one in known))
+    numbers = (np.asarray(one) for one in (count, number_known, fresh, most_steps))
+    found, said = problem.call(_program, units[rows], known, of, texels.rows(rows), *numbers)
+    return (
+        Fits(*(np.asarray(part)[:count] for part in found)),
+        Linearisation(*(np.asarray(part)[:count] for part in said)),
+    )
+
+
+class _Run(NamedTuple):
+    """A texel on its way.
+
+    rough: whether it goes by `sigma`, (N, C), which is held, as far from the data where levels of noise are free.
+    unit: (P,), and the solver's state, whose auxiliary output is the linearisation at `unit`. stopped, converged: bool.
+    """
+
+    rough: Any
+    sigma: Any
+    unit: Any
+    state: Any
+    stopped: Any
+    converged: Any
+
+
+def _program(
+    model: Model,
+    units: Array,
+    known: Linearisation | None,
+    which: Array,
+    texels: Texels,
+    number: Array,
+    number_known: Array,
+    fresh: Array,
+    most_steps: Array,
+) -> tuple[Fits, Linearisation]:
+    """Fits of the first `number` of M texels, from starts (M, P), of which so many are known at `which` of `known`."""
+    begin, step = partial(_begin, model, fresh), partial(_step, model, fresh, most_steps)
+    one = jax.eval_shape(begin, (units[0], texels.rows(0)))
+    _, unravel = ravel_pytree(jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), one))
+
+    def flat(run: _Run) -> Array:
+        return ravel_pytree(run)[0]
+
+    # a row a texel: its start, after the first step where the model is known there
+    rows = jax.vmap(lambda row: flat(begin(row)))((units, texels))
+    if known is not None:
+
+        def first(row: tuple[Array, Array, Texels]) -> Array:
+            there = jax.tree.map(lambda part: part[row[1]], known)
+            return flat(step(unravel(row[0]), row[2], there))
+
+        rows = first_mapped(first, (rows, which, texels), number_known, rows)
+    rows = jnp.concatenate([rows, rows[-1:]])  # the last is of lanes that have no texel
+
+    # lanes take their steps, and one whose texel has ended the next texel
+    def tried(run: _Run, row: Texels) -> Linearisation:
+        return _linearise(model_of(model, row), model.box.from_unit(run.state.trial))
+
+    def body(carry: tuple[Any, ...]) -> tuple[Any, ...]:
+        following, lanes, runs, rows = carry
+        own = texels_at(lanes)
+        # as a loop of one turn: all that follows would else compute the model again where it needs a part of it
+        said = jax.lax.fori_loop(0, jnp.minimum(number, 1), lambda *_: jax.vmap(tried)(runs, own), nothing)
+        runs = jax.vmap(step)(runs, own, said)
+        new = jax.vmap(flat)(runs)
+        for lane in range(LANES):
+            rows = jax.lax.dynamic_update_slice(rows, new[lane][None], (lanes[lane], jnp.zeros_like(lanes[lane])))
+        after = following + jnp.cumsum(runs.stopped) - 1
+        lanes = jnp.where(runs.stopped, jnp.where(after < number, after, len(units)), lanes)
+        next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane goes on, what it has just written
+        return following + jnp.sum(runs.stopped), lanes, next_runs, rows
+
+    def texels_at(lanes: Array) -> Texels:
+        return jax.tree.map(lambda part: part[jnp.minimum(lanes, len(units) - 1)], texels)
+
+    lanes = jnp.where(jnp.arange(LANES) < number, jnp.arange(LANES), len(units))
+    runs = jax.vmap(unravel)(rows[lanes])
+    nothing = jax.tree.map(jnp.zeros_like, runs.state.auxiliary)
+    carry = jnp.asarray(LANES), lanes, runs, rows
+    *_, rows = jax.lax.while_loop(lambda carry: jnp.any(carry[1] < number), body, carry)
+
+    # what is known where they ended
+    ends = (rows[:-1], texels)
+    shapes = jax.eval_shape(
+        lambda row: _found(model, unravel(row[0]), row[1]), jax.tree.map(lambda part: part[0], ends)
+    )
+    empty = jax.tree.map(lambda part: jnp.zeros((len(units), *part.shape), part.dtype), shapes)
+    found = first_mapped(lambda row: _found(model, unravel(row[0]), row[1]), ends, number, empty)
+    return found, jax.vmap(lambda row: unravel(row).state.auxiliary)(rows[: min(KNOWN, len(units))])
+
+
+def first_mapped(one: Callable[[Any], Any], rows: Any, number: Array, otherwise: Any) -> Any:
+    """What becomes of the first `number` of M rows, (M, ...), `LANES` at a time, and what is `otherwise`, (M, ...)."""
+    blocks, out = (jax.tree.map(lambda part: part.reshape(-1, LANES, *part.shape[1:]), of) for of in (rows, otherwise))
+
+    def filled(index: Array, out: Any) -> Any:
+        new = jax.vmap(one)(jax.tree.map(lambda part: part[index], blocks))
+        return jax.tree.map(lambda whole, part: whole.at[index].set(part), out, new)
+
+    found = jax.lax.fori_loop(0, -(-number // LANES), filled, out)
+    return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
+
+
+class Linear(Model):
+    """A model near a vector `at` (P,), by what is known there."""
+
+    near: Linearisation
+    at: Array
+
+    def predict(self, vector: Array) -> Array:
+        """Scaled BSDF, (N, C), in 1/sr."""
+        return self.near.values + jnp.tensordot(vector - self.at, self.near.slopes, 1)
+
+
+def _linear(model: Model, known: Linearisation, vector: Array) -> Linear:
+    return Linear(**{one.name: getattr(model, one.name) for one in fields(Model)}, near=known, at=vector)
+
+
+def _linearise(model: Model, vector: Array) -> Linearisation:
+    """Values and derivatives at a vector (P,)."""
+    steps = jnp.eye(vector.size, dtype=vector.dtype)[: model.moving]
+    values, slopes = jax.vmap(lambda step: jax.jvp(model.predict, (vector,), (step,)), out_axes=(None, 0))(steps)
+    rest = jnp.zeros((vector.size - model.moving, *values.shape), values.dtype)
+    return Linearisation(values, jnp.concatenate([slopes, rest]))
+
+
+def _options(model: Model, fresh: Array, most_steps: Array) -> dict[str, Any]:
+    """Of the solver."""
+    options: dict[str, Any] = {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY), "most_steps": most_steps}
+    if model.objective == "likelihood":
+        options |= {"tolerance": COST_TOLERANCE} | ({"logarithmic": model.logarithmic} if model.varying else {})
+    return options
+
+
+def _begin(model: Model, fresh: Array, start: tuple[Array, Texels]) -> _Run:
+    """A texel at its start (P,), before the first step."""
+    unit, own = start[0], model_of(model, start[1])
+    levels = model.objective == "likelihood" and model.varying
+    nothing = jnp.zeros((unit.size, *own.values.shape), unit.dtype)
+    state = _initial(model, fresh, unit, Linearisation(nothing[0], nothing))
+    sigma, no = own.initial_sigma(model.box.from_unit(unit)) if levels else jnp.zeros(0), jnp.asarray(False)
+    return _Run(fresh & levels, sigma, unit, state, no, no)
+
+
+def _initial(model: Model, fresh: Array, unit: Array, known: Linearisation) -> Any:
+    state = _SOLVER.init(None, unit, None, _options(model, fresh, jnp.asarray(0)), None, known, frozenset())
+    return _with_auxiliary(state, known)
+
+
+def _with_auxiliary(state: Any, auxiliary: Linearisation) -> Any:
+    return eqx.tree_at(lambda s: s.auxiliary, state, auxiliary, is_leaf=lambda part: part is None)
+
+
+def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels, trial: Linearisation) -> _Run:
+    """A texel after a step by what is known of its trial."""
+    own = _linear(model_of(model, row), trial, model.box.from_unit(run.state.trial))
+    options = _options(model, fresh, most_steps)
+    levels = model.objective == "likelihood" and model.varying
+    first_step = (jnp.where(run.rough, run.sigma, jnp.nan), jnp.ones(())) if levels else None
+
+    def residuals(unit: Array, _: None) -> tuple[Any, Linearisation]:
+        return own.linear_parts(model.box.from_unit(unit), first_step)[0], trial
+
+    first = run.state.steps == 0
+    unit, state, _ = _SOLVER.step(residuals, run.unit, None, options, run.state, frozenset())
+    state = _with_auxiliary(state, jax.tree.map(partial(jnp.where, first), trial, state.auxiliary))
+    stop, result = _SOLVER.terminate(residuals, unit, None, options, state, frozenset())
+
+    # the next step is the last if it is a full one, and the decrease of another is too small where decreases go on to
+    # shrink as they did (after Hairer and Wanner 1996, IV.8): all is linear on such a short way
+    followed = state.full_decrease**2 <= LAST * COST_TOLERANCE * run.state.full_decrease
+    full = state.full_decrease - state.predicted <= LAST * COST_TOLERANCE
+    last = ~stop & ~run.rough & followed & full & jnp.isfinite(run.state.full_decrease)
+    last &= model.objective == "likelihood"
+    moved = model.box.from_unit(state.trial) - model.box.from_unit(unit)
+    near = state.auxiliary._replace(values=state.auxiliary.values + jnp.tensordot(moved, state.auxiliary.slopes, 1))
+    gradient = state.gradient + state.normal @ (state.trial - unit)
+    after = _with_auxiliary(replace(state, cost=state.cost - state.predicted, gradient=gradient), near)
+    unit, state = jax.tree.map(partial(jnp.where, last), (state.trial, after), (unit, state))
+    stop |= last
+
+    if levels:  # near the data with sigma held: the same again with the levels of noise free
+        begun = _initial(model, fresh, unit, state.auxiliary)
+        state = jax.tree.map(partial(jnp.where, stop & run.rough), begun, state)
+    converged = (result == optx.RESULTS.successful) & jnp.isfinite(state.cost)
+    return _Run(run.rough & ~stop, run.sigma, unit, state, stop & ~run.rough, converged)
+
+
+def _found(model: Model, run: _Run, row: Texels) -> Fits:
+    """What is known where a texel ended."""
+    own, unit, cost = model_of(model, row), run.unit, run.state.cost
+    vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)
+    near = _linear(own, run.state.auxiliary, vector)
+    rows = jax.jacfwd(lambda unit: near.linear_parts(model.box.from_unit(unit))[1][1])(unit)
+    misfit = jnp.where(row.used, own.standardised_at(vector, predicted), 0.0)
+    return Fits(
+        vector=vector,
+        unit=unit,
+        cost=jnp.where(finite, cost, jnp.inf),
+        chi_square=jnp.sum(misfit**2),
+        converged=run.converged & finite,
+        gradient=run.state.gradient,
+        # R of the QR decomposition has its singular values without squaring its condition number
+        root=jnp.linalg.qr(rows, mode="r"),
+        predicted=jnp.where(finite, predicted, jnp.nan),
+    )
