@@ -65,12 +65,12 @@ def read_file(path: Path, options: "ReadOptions") -> Measurements:
         ("merl",): {"lookup": "centre", "strata": "bins"},
         ("rxt",): {"wavelengths": None, "corrected": None},
     }
-    if options.strata != "bins" and options.bins in (None, "all"):
-        raise ValueError(f"{path}: strata is given without a number of bins")
     for kinds, defaults in applying.items():
         if kind not in kinds and any(getattr(options, name) != default for name, default in defaults.items()):
             files = " and ".join(one if one == "rxt" else one.upper() for one in kinds)
             raise ValueError(f"{path}: {' and '.join(defaults)} apply to {files} files only, this is a {kind} file")
+    if options.strata != "bins" and options.bins in (None, "all"):
+        raise ValueError(f"{path}: strata is given without a number of bins")
     try:
         return _read_as(kind, path, quantity, options)
     except ValueError as error:
