@@ -1,6 +1,7 @@
 """layerjax: evaluate, sample and differentiate the BSDF of layered materials as pure JAX functions."""
 
 from layerjax._parameters import RANGES as RANGES
+from layerjax.compiling import compiler_options as compiler_options
 from layerjax.directions import angles as angles
 from layerjax.directions import direction as direction
 from layerjax.evaluate import albedo as albedo

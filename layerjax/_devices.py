@@ -9,12 +9,13 @@ from contextvars import ContextVar
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, PartitionSpec
+
+from layerjax.compiling import filter_jit
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -35,9 +36,9 @@ def exact_products(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def compiled(function: Callable[P, T]) -> Callable[P, T]:
-    """The function compiled, as by `eqx.filter_jit`, with what it hands to `over_devices` split over all of them."""
+    """The function compiled, as by `filter_jit`, with what it hands to `over_devices` split over all of them."""
 
-    @eqx.filter_jit
+    @filter_jit
     @exact_products
     def program(devices: int, *arguments: P.args, **options: P.kwargs) -> T:
         before = _in_use.set(devices)

@@ -3,16 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 
-from fits.data.formats import read_file
-from fits.data.geometry import Geometry
+from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
 from fits.data.selection import select
 from fits.data.totals import Totals
-from fits.names import FORMATS, QUANTITIES, STRATA, Strata
+from fits.names import FORMATS, QUANTITIES, STRATA
 
 CHANNEL = "channel="
 
@@ -34,7 +33,7 @@ def read(path: str | Path, format: str | None = None, quantity: str | None = Non
 
 
 @dataclass(frozen=True, eq=False)
-class ReadOptions:
+class ReadOptions(FileOptions):
     """How files are read, of `fits.read`, `fits.fit_files` and the command line, whose options have these names.
 
     Args:
@@ -59,15 +58,6 @@ class ReadOptions:
         hold_out: hold these data out of the fit, so that their prediction can be scored.
     """
 
-    format: str | None = None
-    quantity: str | None = None
-    geometry: Geometry | None = None
-    lookup: str = "centre"
-    bins: int | Literal["all"] | None = None
-    strata: Strata = "bins"
-    seed: int = 0
-    wavelengths: tuple[float, float] | None = None
-    corrected: bool | None = None
     min_retro_angle: float | None = None
     max_polar_angle: float | None = None
     select: Sequence[str] = ()

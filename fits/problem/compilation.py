@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from threading import Lock
 from typing import Any
 
@@ -13,6 +13,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, ThreadpoolController
+
+from layerjax.compiling import compiler_options, is_traced
 
 FULL = 0.5
 """Share of the maps that a process may have."""
@@ -36,10 +38,16 @@ class Static:
 def run(function: Callable[..., Any], split_model: tuple[Any, Static], *arguments: Any) -> Any:
     """`function(model, *arguments)` compiled, and done; see `Problem.call`."""
     with one_thread():
-        return jax.block_until_ready(_run(function, split_model[1], split_model[0], *arguments))
+        program = _program(not is_traced(split_model[0], arguments))
+        return jax.block_until_ready(program(function, split_model[1], split_model[0], *arguments))
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@cache
+def _program(outermost: bool) -> Callable[..., Any]:
+    options = compiler_options() if outermost else {}
+    return jax.jit(_run, static_argnums=(0, 1), compiler_options=options or None)
+
+
 def _run(function: Callable[..., Any], static: Static, arrays: Any, *arguments: Any) -> Any:
     return function(eqx.combine(arrays, static.tree), *arguments)
 

@@ -4,8 +4,9 @@
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 from fits._files import require_file
 from fits.data.formats import (
@@ -26,11 +27,9 @@ from fits.data.formats import (
 )
 from fits.data.formats._text import without_mark
 from fits.data.formats.csv import write_csv as write_csv
+from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, check_quantity
-from fits.names import FORMATS, Quantity
-
-if TYPE_CHECKING:
-    from fits.data.reading import ReadOptions
+from fits.names import FORMATS, Quantity, Strata
 
 _QUANTITY_GIVEN: dict[
     str, Callable[[Path, Quantity], Measurements]
@@ -55,7 +54,22 @@ _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but hav
 }
 
 
-def read_file(path: Path, options: "ReadOptions") -> Measurements:
+@dataclass(frozen=True, eq=False)
+class FileOptions:
+    """What readers of files are told; `fits.ReadOptions` says what each field means."""
+
+    format: str | None = None
+    quantity: str | None = None
+    geometry: Geometry | None = None
+    lookup: str = "centre"
+    bins: int | Literal["all"] | None = None
+    strata: Strata = "bins"
+    seed: int = 0
+    wavelengths: tuple[float, float] | None = None
+    corrected: bool | None = None
+
+
+def read_file(path: Path, options: FileOptions) -> Measurements:
     """All that a file holds; errors as of `fits.read`."""
     quantity = check_quantity(options.quantity)
     require_file(path)
@@ -79,7 +93,7 @@ def read_file(path: Path, options: "ReadOptions") -> Measurements:
         raise ValueError(f"{path}: {error}") from None  # of numbers that do not go together
 
 
-def _read_as(kind: str, path: Path, quantity: Quantity | None, options: "ReadOptions") -> Measurements:
+def _read_as(kind: str, path: Path, quantity: Quantity | None, options: FileOptions) -> Measurements:
     always: dict[str, str | None] = {"totals": None, "rxt": None, "merl": "brdf", "rgl": "brdf_cos"}
     if quantity is not None and quantity != always.get(kind, quantity):
         held = "holds shares of the light" if always[kind] is None else f"always holds {always[kind]!r}"

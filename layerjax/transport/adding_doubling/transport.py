@@ -25,6 +25,7 @@ from layerjax._devices import exact_products
 from layerjax._numerics import not_negative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
+from layerjax.compiling import filter_jit
 from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
@@ -382,7 +383,7 @@ def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
     return carried, once if media else None
 
 
-@eqx.filter_jit
+@filter_jit
 @exact_products
 def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
     grid, whole, rest, faces = solve(stack, plan)
@@ -392,7 +393,7 @@ def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan)
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-@eqx.filter_jit
+@filter_jit
 @exact_products
 def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
     grid, _, rest, _ = solve(stack, plan, known)

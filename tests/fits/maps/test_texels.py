@@ -11,7 +11,7 @@ from fits.maps.options import USUAL
 from fits.maps.search import search, starts_at
 from fits.maps.texels import fit_texels, linearise_at, make_texels, standard_errors, to_units, with_own_directions
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE, descend
-from fits.problem.compilation import _run
+from fits.problem.compilation import _program
 from fits.problem.problem import Problem
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, TRANSPORT
@@ -113,9 +113,9 @@ def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, measure
     whole = search(problem, starts, rows, SIZE, USUAL)
     found = fit_texels(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
     np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-9, atol=1e-6)
-    before = _run._cache_size()
+    before = _program(True)._cache_size()
     for count in (1, 6, SIZE, SIZE + 1):
         some = search(problem, starts, rows.rows(np.arange(count)), SIZE, USUAL)
         np.testing.assert_array_equal(some.start, whole.start[:count])
         np.testing.assert_allclose(some.fits.cost, whole.fits.cost[:count], rtol=1e-9)
-    assert _run._cache_size() == before
+    assert _program(True)._cache_size() == before

@@ -16,7 +16,7 @@ from fits.optimise.fit import fit, start_points
 from fits.optimise.levenberg_marquardt import COST_TOLERANCE
 from fits.optimise.options import FitOptions, options_from
 from fits.optimise.uncertainty import Direction
-from fits.problem.compilation import _run
+from fits.problem.compilation import _program
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal
 from fits.problem.problem import Problem
@@ -73,9 +73,9 @@ def test_the_lobe_fit_is_scipys(lobe_fit) -> None:
 
 
 def test_new_data_do_not_recompile(lobe_fit) -> None:
-    before = _run._cache_size()
+    before = _program(True)._cache_size()
     other = fit(LOBE_STACK, noisy_lobe(1), transport=lobe, starts=16, seed=3)
-    assert _run._cache_size() == before
+    assert _program(True)._cache_size() == before
     assert other.values != lobe_fit.values
 
 
