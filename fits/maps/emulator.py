@@ -157,7 +157,7 @@ class _Space:
     logarithmic: Truths
 
     def ends(self) -> tuple[Floats, Floats]:
-        """Of the coordinates, (D,) each."""
+        """Scale and offset of the coordinates, (D,) each."""
         safe = (np.where(self.logarithmic, end, 1.0) for end in (self.low, self.high))
         logs = map(np.log, safe)
         low, high = (np.where(self.logarithmic, log, end) for log, end in zip(logs, (self.low, self.high), strict=True))

@@ -107,7 +107,7 @@ def _packing(array: Any) -> dict[str, float]:
     return {name: np.ravel(said[name])[0] for name in names if said.get(name) is not None}
 
 
-class _Found(NamedTuple):
+class _Source(NamedTuple):
     """Arrays by name, which of them was given (None: that is to be chosen), and what errors call them together."""
 
     arrays: dict[str, xr.DataArray]
@@ -123,14 +123,14 @@ class _Found(NamedTuple):
         return self.arrays[name if name in self.arrays else next(iter(self.arrays))]
 
 
-def _find(given: Any, wanted: str) -> _Found:
+def _find(given: Any, wanted: str) -> _Source:
     """The arrays of a file, a group, a Dataset or a mapping; or one array, with those that stand beside it."""
     if isinstance(given, str | os.PathLike):
         return _in_file(str(given))
     beside = _members(given.coords, f"{wanted}/") if isinstance(given, xr.Dataset | xr.DataArray) else {}
     if isinstance(given, Mapping) or hasattr(given, "array_keys"):  # Datasets of xarray and groups are such
-        return _Found(beside | _members(given, f"{wanted}/"), None, wanted)
-    return _Found(beside | {wanted: _array(given, wanted)}, wanted, wanted)
+        return _Source(beside | _members(given, f"{wanted}/"), None, wanted)
+    return _Source(beside | {wanted: _array(given, wanted)}, wanted, wanted)
 
 
 def _members(group: Any, where: str) -> dict[str, xr.DataArray]:
@@ -143,7 +143,7 @@ def _members(group: Any, where: str) -> dict[str, xr.DataArray]:
     }
 
 
-def _in_file(given: str) -> _Found:
+def _in_file(given: str) -> _Source:
     """What a file holds, or the group in which an array lies that is named as ``file.h5:/name``."""
     inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", given, re.IGNORECASE)
     path, name = (inside[1], inside[2].strip("/")) if inside else (given, "")
@@ -163,9 +163,9 @@ def _in_file(given: str) -> _Found:
     except Exception as error:  # codecs raise what they like
         raise ValueError(f"{path}: cannot be read: {_reason(error)}") from None
     if not hasattr(found, "dtype"):
-        return _Found(_members(found, f"{path}:/{name}/" if name else f"{path}:/"), None, given)
+        return _Source(_members(found, f"{path}:/{name}/" if name else f"{path}:/"), None, given)
     beside = _members(parent, f"{path}:/{folder}/" if folder else f"{path}:/") if name else {}
-    return _Found(beside | {last: _array(found, given)}, last, given)
+    return _Source(beside | {last: _array(found, given)}, last, given)
 
 
 def _open(path: str, suffix: str) -> Any:
@@ -288,7 +288,7 @@ class MapData:
         if not isinstance(values, str | os.PathLike):
             return None
         geometry = geometry if self.geometry is None else (self.geometry.wi, self.geometry.wo)
-        sigma = None if self.sigma is None else sigma  # which a noise model may leave out
+        sigma = None if self.sigma is None else sigma  # a noise model need not have it
         values, geometry, sigma, mask = (
             os.path.abspath(one) if isinstance(one, str | os.PathLike) else one
             for one in (values, geometry, sigma, mask)

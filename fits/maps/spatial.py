@@ -45,7 +45,7 @@ class Edges:
     kind: Kind
     scales: Floats
 
-    def pull(self, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:
+    def prior_pull(self, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:
         """The Gaussian by which the neighbours of each texel draw it: its centre in the unit box and its precision, 0
         where no edge ends, (map shape, P) each.
 
@@ -133,7 +133,7 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
         before, errors_before = units_now(), errors.copy()
         for colour in (0, 1):
             units = units_now()
-            centre, precision = edges.pull(units, fitted)
+            centre, precision = edges.prior_pull(units, fitted)
             centre, inverse_sd = low + centre * (high - low), np.sqrt(precision) / (high - low)
             coloured = fitted & (np.indices(fitted.shape).sum(axis=0) % 2 == colour)
             tasks = []

@@ -355,7 +355,7 @@ def _program(
             rows = jax.lax.dynamic_update_slice(rows, new[lane][None], (lanes[lane], jnp.zeros_like(lanes[lane])))
         after = following + jnp.cumsum(runs.stopped) - 1
         lanes = jnp.where(runs.stopped, jnp.where(after < number, after, len(units)), lanes)
-        next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane goes on, what it has just written
+        next_runs = jax.vmap(unravel)(rows[lanes])  # where a lane resumes, what it has just written
         return following + jnp.sum(runs.stopped), lanes, next_runs, rows
 
     def texels_at(lanes: Array) -> Texels:
@@ -370,10 +370,10 @@ def _program(
     # what is known where they ended
     ends = (rows[:-1], texels)
     shapes = jax.eval_shape(
-        lambda row: _found(model, unravel(row[0]), row[1]), jax.tree.map(lambda part: part[0], ends)
+        lambda row: _results(model, unravel(row[0]), row[1]), jax.tree.map(lambda part: part[0], ends)
     )
     empty = jax.tree.map(lambda part: jnp.zeros((len(units), *part.shape), part.dtype), shapes)
-    found = first_mapped(lambda row: _found(model, unravel(row[0]), row[1]), ends, number, empty)
+    found = first_mapped(lambda row: _results(model, unravel(row[0]), row[1]), ends, number, empty)
     return found, jax.vmap(lambda row: unravel(row).state.auxiliary)(rows[: min(KNOWN, len(units))])
 
 
@@ -474,7 +474,7 @@ def _step(model: Model, fresh: Array, most_steps: Array, run: _Run, row: Texels,
     return _Run(run.rough & ~stop, run.sigma, unit, state, stop & ~run.rough, converged)
 
 
-def _found(model: Model, run: _Run, row: Texels) -> Fits:
+def _results(model: Model, run: _Run, row: Texels) -> Fits:
     """What is known where a texel ended."""
     own, unit, cost = model_of(model, row), run.unit, run.state.cost
     vector, predicted, finite = model.box.from_unit(unit), run.state.auxiliary.values, jnp.isfinite(cost)

@@ -33,7 +33,7 @@ class Chain(Backend):
         self.reset(walkers, count)
         self.moves: dict[str, Any] = {}
         self.options: dict[str, Any] = {}
-        self._store, self._kept, self._written = store, 0, time.monotonic()
+        self._store, self._stored, self._written = store, 0, time.monotonic()
         blocks = [] if store is None else store.all("steps")
         if store is not None:
             self.moves, self.options = store.get("moves") or {}, store.get("options") or {}
@@ -42,7 +42,7 @@ class Chain(Backend):
                 np.concatenate([block[name] for block in blocks]) for name in ("coords", "log_prob")
             )
             self.accepted, self.random_state = blocks[-1]["accepted"], tuple(blocks[-1]["random_state"])
-            self.iteration = self._kept = len(self.chain)
+            self.iteration = self._stored = len(self.chain)
 
     def decide(self, moves: Mapping[str, Any]) -> None:
         """How the chain is moved from its first step on."""
@@ -51,7 +51,7 @@ class Chain(Backend):
             self._store.put("moves", self.moves)
 
     def keep_options(self, options: Mapping[str, Any]) -> None:
-        """With which options the chain goes on."""
+        """Store the options that the next steps are made with."""
         if self._store is not None and self.options != options:
             self._store.put("options", options)
         self.options = dict(options)
@@ -73,11 +73,11 @@ class Chain(Backend):
 
     def write(self) -> None:
         """Keep what is new in the store, if there is one."""
-        if self._store is not None and self._kept < self.iteration:
-            new = slice(self._kept, self.iteration)
+        if self._store is not None and self._stored < self.iteration:
+            new = slice(self._stored, self.iteration)
             block = {"coords": self.chain[new], "log_prob": self.log_prob[new], "accepted": self.accepted}
             self._store.append("steps", block | {"random_state": list(self.random_state)})
-            self._kept = self.iteration
+            self._stored = self.iteration
         self._written = time.monotonic()
 
 

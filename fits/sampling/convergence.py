@@ -1,4 +1,4 @@
-"""When a chain ends: 50 autocorrelation times, the effective samples that were asked for, and R-hat near 1.
+"""When a chain ends: 50 autocorrelation times, the effective samples that are requested, and R-hat near 1.
 
 R-hat compares draws between and within four groups of walkers, each split into halves in time: that of single walkers
 exceeds 1.01 by chance alone until each has some hundred independent draws (nested R-hat: Margossian, Hoffman, Sountsov,
@@ -45,7 +45,7 @@ class Convergence:
 
     @classmethod
     def of(cls, chain: Floats, options: SamplerOptions) -> "Convergence":
-        """Of a chain (steps, walkers, P) from its start on."""
+        """Convergence of a chain (steps, walkers, P), its burn-in included."""
         import arviz
 
         kept = after_burn_in(chain, options)
@@ -73,11 +73,11 @@ class Convergence:
         return bool(long_enough and np.max(self.r_hat) <= options.r_hat)
 
     def is_finished(self, options: SamplerOptions) -> bool:
-        """Whether it is converged, and has the effective samples that were asked for."""
+        """Whether it is converged, and has the effective samples that are requested."""
         return self.is_converged(options) and float(np.min(self.ess)) >= options.ess
 
     def note(self, options: SamplerOptions) -> str:
-        """What is there, and what is asked for, in words."""
+        """What the chain has and what is requested, in words."""
         return (
             f"{np.min(self.ess):.0f} of {options.ess:g} effective samples, autocorrelation time "
             f"{np.max(self.autocorrelation_time):.0f} steps, R-hat {np.max(self.r_hat):.3f}"

@@ -38,8 +38,8 @@ class Ensemble:
         if not chain.moves:
             chain.decide({"initial": initial_mixture(fit, options.smallest_mode).record()})
 
-    def advance(self, step: int, tell: Callable[[], None]) -> None:
-        """Append steps to the chain until it has `step` of them, and `tell` of each."""
+    def advance(self, step: int, show: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `show` each."""
         while (begin := self.chain.iteration) < step:
             proposals = proposals_of(self.chain)
             state = self.chain.get_last_sample() if begin else self._first_state()
@@ -55,7 +55,7 @@ class Ensemble:
             count = min(step, next_fit(begin)) - begin
             # walkers are drawn from a density of full rank: emcee need not look whether they are
             for _ in sampler.sample(state, iterations=count, skip_initial_state_check=True):
-                tell()
+                show()
 
     def log_posteriors(self, positions: Floats) -> Floats:
         """At positions (count, P), on all cores: half of the walkers, which move together, are a share for each."""

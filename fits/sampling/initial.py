@@ -1,7 +1,7 @@
 """Where chains begin: Laplace's approximations of the posterior about the minima of a fit, and along their ridges.
 
 A parameter at a bound lies at an exponentially distributed distance from it, by the slope of the posterior there; the
-others follow the information at the minimum. Where that leaves a direction open, the approximation goes on along the
+others follow the information at the minimum. Where a direction is unidentified, the approximation follows the
 ridge, however it bends.
 """
 
@@ -41,7 +41,7 @@ def initial_mixture(
 ) -> Mixture:
     """About those minima of a fit that hold a share of its posterior, in whose modes its components are.
 
-    along_ridges: which takes some hundred Jacobians where the data leave a direction open.
+    along_ridges: which takes some hundred Jacobians where a direction is unidentified.
     """
     problem = fit.problem
     found = [_about(problem, fit.vector, np.isin(problem.names, fit.at_bound), along_ridges)]
@@ -61,7 +61,7 @@ def initial_mixture(
 def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_ridges: bool) -> Mixture:
     """About the points of the ridge of a minimum (P,), or that alone; weights are logarithms of masses of posterior.
 
-    By the information there: the covariance of a fit has lost what data know where they leave something else open.
+    By the information at the minimum: where a direction is unidentified, the covariance of a fit has lost the others.
     """
     unit = unit_of(problem, vector)
     rows, gradient, _ = local_information(problem, unit)
@@ -91,9 +91,9 @@ def _about(problem: Problem, vector: Floats, at_bound: NDArray[np.bool_], along_
         log_weight=np.zeros(count),
         mode=np.zeros(count, int),
     )
-    heights = np.asarray(problem.call(log_posteriors, mixture.centre), float)
+    log_posterior_there = np.asarray(problem.call(log_posteriors, mixture.centre), float)
     own = np.diagonal(mixture.log_parts(mixture.centre))
-    return replace(mixture, log_weight=np.where(np.isfinite(heights), heights, -np.inf) - own)
+    return replace(mixture, log_weight=np.where(np.isfinite(log_posterior_there), log_posterior_there, -np.inf) - own)
 
 
 def normal_draws(fit: Fit, count: int, generator: np.random.RandomState) -> Floats:

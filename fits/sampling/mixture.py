@@ -63,7 +63,7 @@ class Mixture:
 
         Each component counts as a few samples of its own, so that it keeps its full rank.
         """
-        samples = positions[generator.permutation(len(positions))[:MOST_SAMPLES]]  # of all walkers alike
+        samples = positions[generator.permutation(len(positions))[:MOST_SAMPLES]]  # of all walkers
         dimension = samples.shape[1]
         values, directions = np.linalg.eigh(np.atleast_2d(np.cov(samples.T)))
         whole = directions * np.sqrt(np.maximum(values, NARROWEST**2))
@@ -127,7 +127,7 @@ class Mixture:
         return found
 
     def squared_distance(self, positions: Floats) -> Floats:
-        """From every centre in units of its scale matrix, (M, count); parameters at a bound do not count."""
+        """Squared distance from every centre by its scale matrix, (M, count), without parameters at a bound."""
         away = np.where(self.at_bound[:, None], 0.0, positions - self.centre[:, None])
         return np.sum((away @ np.swapaxes(self._inverse, 1, 2)) ** 2, axis=-1)
 

@@ -64,8 +64,8 @@ class Nuts:
         moves = {"initial": initial.record(), "positions": positions, "step_sizes": step_sizes, "metrics": metrics}
         self.chain.decide(moves)
 
-    def advance(self, step: int, tell: Callable[[], None]) -> None:
-        """Append steps to the chain until it has `step` of them, and `tell` of each."""
+    def advance(self, step: int, show: Callable[[], None]) -> None:
+        """Append steps to the chain until it has `step` of them, and `show` each."""
         chain, moves, proposals = self.chain, self.chain.moves, proposals_of(self.chain)
         positions = chain.get_last_sample().coords if chain.iteration else moves["positions"]
         chain.grow(step - chain.iteration, None)
@@ -76,17 +76,19 @@ class Nuts:
             drawn, log_ratio = propose(proposals, positions, generator)
             gain = log_ratio + self._log_posteriors(drawn) - self._log_posteriors(positions)
             positions = np.where((np.log(generator.random_sample(len(drawn))) < gain)[:, None], drawn, positions)
-            positions, heights, divergent = self._on_all_cores(
+            positions, log_posterior, divergent = self._on_all_cores(
                 _step, positions, number=chain.iteration + 1, step_sizes=moves["step_sizes"], metrics=moves["metrics"]
             )
-            chain.save_step(emcee.State(positions, log_prob=heights, random_state=generator.get_state()), ~divergent)
-            tell()
+            chain.save_step(
+                emcee.State(positions, log_prob=log_posterior, random_state=generator.get_state()), ~divergent
+            )
+            show()
 
-    def _on_all_cores(self, function: Callable[..., Any], positions: Floats, **given: Any) -> list[Any]:
+    def _on_all_cores(self, function: Callable[..., Any], positions: Floats, **settings: Any) -> list[Any]:
         """What a function of the model gives of each chain: they take as many gradients as each trajectory needs."""
 
         def call(rows: Floats) -> tuple[Array, ...]:
-            return self.problem.call(function, self.seed, rows[:, 0].astype(int), rows[:, 1:], given)
+            return self.problem.call(function, self.seed, rows[:, 0].astype(int), rows[:, 1:], settings)
 
         rows = np.column_stack([np.arange(len(positions)), positions])
         found = in_shares(call, rows, -(-len(rows) // cores()), function in self._compiled)
@@ -103,14 +105,16 @@ def _adaptation(steps: int, target: float) -> Callable[..., Any]:
     import blackjax
     from blackjax.adaptation.base import get_filter_adapt_info_fn
 
-    def adapt(model: Model, seed: Array, chains: Array, positions: Array, given: dict[str, Array]) -> tuple[Array, ...]:
+    def adapt(
+        model: Model, seed: Array, chains: Array, positions: Array, settings: dict[str, Array]
+    ) -> tuple[Array, ...]:
         def one(place: tuple[Array, Array]) -> tuple[Array, Array, Array]:
             chain, position = place
             adaptation = blackjax.window_adaptation(
                 blackjax.nuts,
                 model.log_posterior_unconstrained,
                 is_mass_matrix_diagonal=False,
-                initial_inverse_mass_matrix=given["metric"],
+                initial_inverse_mass_matrix=settings["metric"],
                 initial_step_size=0.5,
                 target_acceptance_rate=target,
                 adaptation_info_fn=get_filter_adapt_info_fn(),
@@ -124,22 +128,22 @@ def _adaptation(steps: int, target: float) -> Callable[..., Any]:
     return adapt
 
 
-def _step(model: Model, seed: Array, chains: Array, positions: Array, given: dict[str, Array]) -> tuple[Array, ...]:
+def _step(model: Model, seed: Array, chains: Array, positions: Array, settings: dict[str, Array]) -> tuple[Array, ...]:
     """Where a step takes chains (n, P) of these numbers, the log-posteriors there, and whether they diverged."""
     from blackjax.mcmc import nuts
 
     kernel, height = nuts.build_kernel(), model.log_posterior_unconstrained
-    key = jax.random.fold_in(jax.random.key(seed), given["number"])
+    key = jax.random.fold_in(jax.random.key(seed), settings["number"])
 
     def one(place: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         chain, position = place
-        # the state made anew: a chain that goes on from its file is the same to the last bit
+        # the state made anew: a chain that is resumed from its file is the same to the last bit
         state, info = kernel(
             jax.random.fold_in(key, chain),
             nuts.init(position, height),
             height,
-            given["step_sizes"][chain],
-            given["metrics"][chain],
+            settings["step_sizes"][chain],
+            settings["metrics"][chain],
         )
         return state.position, state.logdensity, info.is_divergent
 

@@ -100,7 +100,7 @@ class Posterior:
 
     @property
     def burn_in(self) -> int:
-        """Steps left out at the start."""
+        """Steps at the start that no estimate uses."""
         return len(self.chain) - len(after_burn_in(self.chain, self.options))
 
     @property
@@ -149,7 +149,7 @@ class Posterior:
         """ArviZ data: posterior, log_likelihood of each datum, posterior_predictive with noise, observed_data.
 
         A walker is a chain. Draws are thinned so that about 2,000 remain: they serve predictions and model comparison.
-        Simulated readings share errors that are drawn anew, where `predict` has those that the data tell of.
+        The discrepancy of simulated measurements is drawn anew, where `predict` has that of the data.
         ValueError for a fit of several measurements: ask `part`.
         """
         self.fit.require_one("inference_data")
@@ -235,8 +235,8 @@ def _modes(fit: Fit, initial: Mixture, positions: Floats, values: Floats, option
 
 
 def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Array, Array]:
-    """Of each vector, with white numbers (C, R) of its own for what readings share: log-densities of the data, and
-    what readings scatter about, by how much; (N, C) each."""
+    """Of each vector, with white numbers (C, R) of its own for the discrepancy: log-densities of the data, and
+    what measurements scatter about, by how much; (N, C) each."""
 
     def one(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
         vector, numbers = given
@@ -245,8 +245,8 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
             at = model.build(vector).correlation
             assert at is not None
             assert model.softness is not None
-            lack = model.process.sample(numbers, at)
-            expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + lack)
+            discrepancy = model.process.sample(numbers, at)
+            expected = model.softness * jnp.sinh(logarithm(predicted, model.softness) + discrepancy)
         return model.log_likelihood_per_datum_at(vector, predicted), expected, model.sigma_at(vector, expected)
 
     return jax.lax.map(one, (vectors, white))

@@ -1,4 +1,4 @@
-"""The ridge of a posterior along which the data leave parameters open: points all along it, however it bends.
+"""The ridge of a posterior along which parameters are unidentified: points all along it, however it bends.
 
 Points are compared in log-odds of the box, which run on linearly next to a bound, so that there is a slope on it.
 """
@@ -16,7 +16,7 @@ OPEN = 0.1  # boxes: a posterior that is wider may bend
 STEP = 0.5  # along a ridge, for every direction that is open
 CLOSE = 0.5  # of a step: points that lie closer are the same
 MOST_POINTS = 64
-AS_HIGH = 12.0  # in the log-posterior: points that lie lower are left out
+AS_HIGH = 12.0  # in the log-posterior: points that lie lower are omitted
 NEXT_TO_BOUND = 0.02  # of the box
 ROUNDS = 5
 ON_RIDGE = 0.1  # standard deviations

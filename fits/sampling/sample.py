@@ -46,7 +46,7 @@ def sample(
     allow_unconverged: bool = False,
     progress: Progress | None = None,
 ) -> Posterior:
-    """Sample the posterior of a fit until its chain has converged and has the effective samples that are asked for.
+    """Sample the posterior of a fit until its chain has converged and has the effective samples that are requested.
 
     Args:
         fit: made with a likelihood.
@@ -55,7 +55,7 @@ def sample(
             for many parameters: it needs the extra `layerjax[nuts]`.
         options: when sampling ends, and how; a chain may be gone on with for more effective samples.
         seed: random seed; the same seed gives the same chain.
-        path: file that the chain is kept in as it grows: a killed run that is started again goes on, and ends as it
+        path: file that the chain is kept in as it grows: a killed run that is started again resumes, and ends as it
             would have. One process at a time writes it, any number may read it. None keeps it in memory.
         resume: False replaces what `path` holds.
         allow_unconverged: let the result report estimates though the chain has not converged.
@@ -91,7 +91,7 @@ def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress
     found, looked = Convergence.of(chain.steps(), options), time.monotonic()
     total: int | None = None
 
-    def look() -> None:
+    def check() -> None:
         nonlocal found, total, looked
         found = Convergence.of(chain.steps(), options)
         total = None if progress is None else expected_steps(chain.steps(), options)
@@ -101,7 +101,7 @@ def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress
         if progress is None:
             return
         if time.monotonic() - looked > PATIENCE:
-            look()
+            check()
         progress("sample", chain.iteration, total, found.note(options) if np.any(found.ess > 0.0) else "")
 
     while chain.iteration < options.max_steps:
@@ -109,7 +109,7 @@ def _run(moved: Nuts | Ensemble, chain: Chain, options: SamplerOptions, progress
             break
         moved.advance(min(next_check(chain.iteration), options.max_steps), show)
         chain.write()
-        look()
+        check()
     total = chain.iteration
     show()
 
@@ -172,12 +172,12 @@ def identity_of(problem: Problem, walkers: int, seed: int, sampler: str = "emcee
     Of numbers the first digits, which are the same wherever they are computed.
     """
     points = 0.01 + 0.98 * qmc.Sobol(len(problem.names), scramble=False).random_base2(2)  # in the unit box
-    heights = np.asarray(problem.call(log_posteriors, logit(points)), float)
+    log_posterior = np.asarray(problem.call(log_posteriors, logit(points)), float)
     return fingerprint(
         sampler=sampler,
         walkers=walkers,
         seed=seed,
         names=list(problem.names),
         bounds=[f"{bound:.9g}" for bound in np.concatenate([problem.low, problem.high])],
-        posterior=[f"{height:.6g}" for height in heights],
+        posterior=[f"{height:.6g}" for height in log_posterior],
     )

@@ -56,7 +56,7 @@ _KNOWN_ELSEWHERE = {  # first bytes of formats that share our file names but hav
 
 @dataclass(frozen=True, eq=False)
 class FileOptions:
-    """What readers of files are told; `fits.ReadOptions` says what each field means."""
+    """Options of the readers of files; `fits.ReadOptions` says what each field means."""
 
     format: str | None = None
     quantity: str | None = None

@@ -24,9 +24,9 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
     Raises:
         ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
     """
-    found = summarise(map)
-    write_text(path, page(map, found, draw(map, progress or silent)), force=force)
-    return found
+    summary = summarise(map)
+    write_text(path, page(map, summary, draw(map, progress or silent)), force=force)
+    return summary
 
 
 def draw(map: FittedMap, progress: Progress) -> dict[str, bytes]:
@@ -54,10 +54,10 @@ def draw(map: FittedMap, progress: Progress) -> dict[str, bytes]:
     return {name: as_png(figure, trimmed=False) for name, figure in figures.items()}  # of one size, side by side
 
 
-def page(map: FittedMap, found: Summary, images: Pictures) -> str:
+def page(map: FittedMap, summary: Summary, images: Pictures) -> str:
     """The HTML text of the report, with the pictures inside."""
     title = f"Map of {map.path.resolve().name}"
-    words, fine = verdict(found, map)
+    words, fine = verdict(summary, map)
     _, shown = pictures.shown_part(map.shape)
     part = f" Shown: {shown}." if shown else ""
 
@@ -68,10 +68,10 @@ def page(map: FittedMap, found: Summary, images: Pictures) -> str:
     sections = [
         f"<h1>{html.escape(title)}</h1>",
         f'<p class="verdict{" fine" if fine else ""}">{html.escape(" ".join(words))}</p>',
-        section("Texels", counted, html_table(tables.count_table(found))),
+        section("Texels", counted, html_table(tables.count_table(summary))),
     ]
-    if found.fitted:
-        sections.append(section("Values in short", html_table(tables.quartile_table(found, map))))
+    if summary.fitted:
+        sections.append(section("Values in short", html_table(tables.quartile_table(summary, map))))
         if (common := tables.common_table(map)).rows:
             note = "<p>One value for all texels, from the pilot that was fitted first.</p>"
             sections.append(section("Common parameters", note, html_table(common)))

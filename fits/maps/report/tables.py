@@ -85,23 +85,23 @@ def _quartiles(values: Floats) -> Quartiles:
     return tuple(np.quantile(finite, (0.25, 0.5, 0.75)).tolist()) if finite.size else (np.nan,) * 3
 
 
-def count_table(found: Summary) -> Table:
+def count_table(summary: Summary) -> Table:
     """How many texels have each flag, and which share of the map."""
-    rows = [("of the map", found.texels, "")]
-    if found.there < found.texels:
-        rows.append(("there so far", found.there, share(found.there, found.texels)))
-    for flag, count in found.counts.items():
-        if count or flag == "fitted" or (flag == "converged" and found.fitted):
-            whole = found.texels if flag in ("fitted", "masked", "too_few_measurements", "failed") else found.fitted
-            of = "" if whole == found.texels else " of the fitted"
+    rows = [("of the map", summary.texels, "")]
+    if summary.there < summary.texels:
+        rows.append(("there so far", summary.there, share(summary.there, summary.texels)))
+    for flag, count in summary.counts.items():
+        if count or flag == "fitted" or (flag == "converged" and summary.fitted):
+            whole = summary.texels if flag in ("fitted", "masked", "too_few_measurements", "failed") else summary.fitted
+            of = "" if whole == summary.texels else " of the fitted"
             rows.append((WORDS[flag], count, f"{share(count, whole)}{of}"))
-    for name, count in found.at_bound.items():
+    for name, count in summary.at_bound.items():
         if count:
-            rows.append((f"at a bound: {name}", count, f"{share(count, found.fitted)} of the fitted"))
+            rows.append((f"at a bound: {name}", count, f"{share(count, summary.fitted)} of the fitted"))
     return Table("Texels", ("", "texels", "share"), tuple((words, f"{count:,}", part) for words, count, part in rows))
 
 
-def quartile_table(found: Summary, map: FittedMap) -> Table:
+def quartile_table(summary: Summary, map: FittedMap) -> Table:
     """Quartiles over the fitted texels: of each parameter, of its standard error, and of how well texels are fitted."""
 
     def words(quartiles: Quartiles) -> tuple[str, ...]:
@@ -109,11 +109,11 @@ def quartile_table(found: Summary, map: FittedMap) -> Table:
 
     rows, notes = [], []
     for name in map.names:
-        rows.append((name, *words(found.values[name]), *words(found.errors[name]), map.units[name]))
-        if missing := found.no_error[name]:
-            notes.append(f"{name} has no error in {share(missing, found.fitted)} of them.")
-    rows.append(("chi2/dof", *words(found.reduced_chi_square), "", "", "", "1"))
-    rows.append(("measurements", *words(found.measurements), "", "", "", "1"))
+        rows.append((name, *words(summary.values[name]), *words(summary.errors[name]), map.units[name]))
+        if missing := summary.no_error[name]:
+            notes.append(f"{name} has no error in {share(missing, summary.fitted)} of them.")
+    rows.append(("chi2/dof", *words(summary.reduced_chi_square), "", "", "", "1"))
+    rows.append(("measurements", *words(summary.measurements), "", "", "", "1"))
     columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
     return Table("Quartiles over the fitted texels", columns, tuple(rows), " ".join(notes))
 

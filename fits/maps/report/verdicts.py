@@ -10,47 +10,47 @@ from fits.reports.tables import html_table
 from fits.reports.verdicts import listed
 
 
-def verdict(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
+def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     """A few sentences, and whether they are without reservation."""
-    counts, some = found.counts, map.option("flagged_share") * found.fitted
+    counts, some = summary.counts, map.option("flagged_share") * summary.fitted
 
     # how much of the map there is, and why the rest is not
     reasons = {"masked": "masked", "too_few_measurements": "with too few measurements", "failed": "failed"}
     rest = [f"{counts[flag]:,} {said}" for flag, said in reasons.items() if counts[flag]]
-    fitted, fine = ", ".join([f"{found.fitted:,} are fitted", *rest]), found.there == found.texels
+    fitted, fine = ", ".join([f"{summary.fitted:,} are fitted", *rest]), summary.there == summary.texels
     if fine:
-        words = [f"A map of {found.texels:,} texels: {fitted}."]
+        words = [f"A map of {summary.texels:,} texels: {fitted}."]
     else:
-        there = f"{found.there:,} of {found.texels:,} texels ({share(found.there, found.texels)}) are there"
+        there = f"{summary.there:,} of {summary.texels:,} texels ({share(summary.there, summary.texels)}) are there"
         words = [f"The map is not finished: {there}, and the same command resumes it.", f"Of what is there, {fitted}."]
-    if not found.fitted:
+    if not summary.fitted:
         return [*words, "No texel is fitted."], False
-    fine &= counts["converged"] >= map.option("converged_share") * (found.fitted + counts["failed"])
-    words.append(f"{share(counts['converged'], found.fitted)} of the fitted texels converged.")
+    fine &= counts["converged"] >= map.option("converged_share") * (summary.fitted + counts["failed"])
+    words.append(f"{share(counts['converged'], summary.fitted)} of the fitted texels converged.")
 
-    said, explains = _chi_square(found, map)
+    said, explains = _chi_square(summary, map)
     words += said
 
     # flags
     if counts["at_bound"]:
-        most = sorted(((count, name) for name, count in found.at_bound.items() if count), reverse=True)[:3]
-        which = f" ({', '.join(f'{name} in {share(count, found.fitted)}' for count, name in most)})" if most else ""
-        words.append(f"At a bound: {share(counts['at_bound'], found.fitted)} of the fitted texels{which}.")
+        most = sorted(((count, name) for name, count in summary.at_bound.items() if count), reverse=True)[:3]
+        which = f" ({', '.join(f'{name} in {share(count, summary.fitted)}' for count, name in most)})" if most else ""
+        words.append(f"At a bound: {share(counts['at_bound'], summary.fitted)} of the fitted texels{which}.")
     else:
         words.append("No texel is at a bound.")
     above = (map.attributes.get("pilot") or {}).get("poor_above")
     limit = "" if above is None else f"above {float(above):.3g}, "
     if counts["poor"]:
-        poor = share(counts["poor"], found.fitted)
+        poor = share(counts["poor"], summary.fitted)
         words.append(f"Poor: {poor} of the fitted texels: chi-square is {limit}more than noise and the pilot explain.")
     elif (
-        not explains and found.reduced_chi_square[1] > 1.0
+        not explains and summary.reduced_chi_square[1] > 1.0
     ):  # nor then does the model explain the pilot, by which the flag is set
         words.append(f"No texel stands out: chi-square is nowhere {limit}more than in the pilot.")
     else:
         words.append("No texel is poor: chi-square is nowhere above what noise and the pilot explain.")
     if counts["unidentified"]:
-        unidentified = share(counts["unidentified"], found.fitted)
+        unidentified = share(counts["unidentified"], summary.fitted)
         words.append(f"In {unidentified} of the fitted texels the data leave a parameter unidentified.")
     fine &= explains and all(counts[flag] <= some for flag in ("at_bound", "poor", "unidentified"))
 
@@ -70,10 +70,10 @@ def verdict(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
     return words, fine
 
 
-def _chi_square(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
+def _chi_square(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     """Whether chi-square is what noise makes of it."""
-    low, middle, high = found.reduced_chi_square
-    freedom = degrees_of_freedom(found.measurements[1], map)
+    low, middle, high = summary.reduced_chi_square
+    freedom = degrees_of_freedom(summary.measurements[1], map)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
     far = map.option("chi_square_sigmas") * spread
     if not math.isfinite(middle):
@@ -91,9 +91,9 @@ def _chi_square(found: Summary, map: FittedMap) -> tuple[list[str], bool]:
 
 def fragment(map: FittedMap) -> str:
     """What a notebook shows, as HTML: the verdict, and the median of every parameter."""
-    found = summarise(map)
-    table = html_table(quartile_table(found, map)) if found.fitted else ""
-    return f"<p>{html.escape(' '.join(verdict(found, map)[0]))}</p>{table}"
+    summary = summarise(map)
+    table = html_table(quartile_table(summary, map)) if summary.fitted else ""
+    return f"<p>{html.escape(' '.join(verdict(summary, map)[0]))}</p>{table}"
 
 
 def degrees_of_freedom(measurements: Any, map: FittedMap) -> Any:
