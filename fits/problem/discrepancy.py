@@ -288,13 +288,19 @@ def _vector_of(at: Correlation, channels: int) -> Array:
     return jnp.stack([jnp.asarray(number, float) for number in (at if channels > 1 else at[:4])])
 
 
+def _with_jitter(matrix: Array) -> Array:
+    """A matrix of correlations with what rounding leaves of its smallest eigenvalues on its diagonal."""
+    rounding = 4.0 * len(matrix) * float(jnp.finfo(matrix.dtype).eps)  # above `JITTER` in single precision alone
+    return matrix + max(JITTER, rounding) * jnp.eye(len(matrix), dtype=matrix.dtype)
+
+
 def _roots_of(numbers: Array, where: Array, channels: int) -> Roots:
     """The roots of a process on inducing points `where`, (R, 4)."""
     _, half, difference, growth = numbers[:4]
-    own = correlation(where, where, half, difference) + JITTER * jnp.eye(len(where))
+    own = _with_jitter(correlation(where, where, half, difference))
     between = numbers[4] + (1.0 - numbers[4]) * jnp.eye(channels) if channels > 1 else jnp.ones((1, 1))
     sizes = jnp.exp(growth * log_scales(where))
-    return Roots(jnp.linalg.cholesky(between + JITTER * jnp.eye(channels)), sizes[:, None] * jnp.linalg.cholesky(own))
+    return Roots(jnp.linalg.cholesky(_with_jitter(between)), sizes[:, None] * jnp.linalg.cholesky(own))
 
 
 def _moves_of(numbers: Array, where: Array, roots: Roots) -> list[Move]:

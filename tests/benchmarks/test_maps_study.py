@@ -112,4 +112,4 @@ def test_scipy_begins_where_fits_of_the_map_do_and_ends_as_low() -> None:
         truth = np.stack([one.truth[name].ravel()[[3, 60]] for name in found.names], axis=1)
         assert np.all(ours < fitting.costs_at(job, rows, truth))
         begun = found.start.ravel()[[3, 60]]
-        np.testing.assert_allclose(units, job.starts.units[begun], atol=1e-6)
+        np.testing.assert_allclose(units, job.pilot.starts.units[begun], atol=1e-6)

@@ -69,7 +69,7 @@ def test_a_folder_is_fitted_and_told_of(folder: Path, capsys: pytest.CaptureFixt
         ("scans", "neither a stack nor a search is given"),
         ("scans/broken.csv --stacks bare.toml", "'twenty'"),
         ("scans --stacks bare.toml --select everything", "'everything' is no selection"),
-        ("scans --stacks bare.toml --read strata=flux", "strata is given without a number of bins"),
+        ("scans --stacks bare.toml --read strata=flux", "lookup and strata apply to MERL files only"),
         ("scans --stacks bare.toml --noise 0.1", "--noise is given without --search"),
         ("scans --stacks bare.toml --scale-sd 0", "--scale-sd is given without --search"),
     ],

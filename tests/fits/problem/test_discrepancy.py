@@ -9,7 +9,7 @@ from scipy import stats
 from fits.data.geometry import slices
 from fits.data.measurements import Measurements, channel_names
 from fits.optimise.levenberg_marquardt import evaluate_at
-from fits.problem.discrepancy import Correlation, Discrepancy, make_process, places
+from fits.problem.discrepancy import Correlation, Discrepancy, _roots_of, make_process, places
 from fits.problem.model import Model
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
@@ -346,3 +346,13 @@ def test_readings_all_over_the_hemisphere_are_carried() -> None:
 def test_refused(call, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_a_smooth_process_has_a_root_in_single_precision() -> None:
+    """Without room for its rounding on the diagonal the root was NaN, and with it every prediction."""
+    numbers, where = [0.1, 40.0, 40.0, 1.0], places(MANY["six incidences"].wi, MANY["six incidences"].wo)[::4]
+    double, single = (
+        _roots_of(jnp.asarray(numbers, kind), jnp.asarray(where, kind), 1).inducing_points
+        for kind in (jnp.float64, jnp.float32)
+    )
+    np.testing.assert_allclose(single @ single.T, double @ double.T, atol=1e-3 * float(jnp.max(double) ** 2))
