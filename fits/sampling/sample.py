@@ -124,6 +124,7 @@ def settings(
     max_steps: int | None = None,
 ) -> SamplerOptions:
     """The options that so many parameters are sampled with. ValueError for those by which they cannot be."""
+    require_kind("options", options, SamplerOptions, None)
     given: dict[str, Any] = {"ess": ess, "walkers": walkers, "max_steps": max_steps}
     options = replace(options or SamplerOptions(), **{name: one for name, one in given.items() if one is not None})
     if sampler not in get_args(Sampler):
