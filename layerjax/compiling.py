@@ -16,7 +16,7 @@ OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_prefer
 
 
 def compiler_options() -> dict[str, Any]:
-    """Options for `jax.jit` by which programs of this library compile in two thirds of the time and run 3 to 5 % slower.
+    """Options for `jax.jit` by which this library compiles in two thirds of the time, and runs 3 to 5 % slower.
 
     They belong to one program and change nothing global. JAX takes them at the outermost `jit` only, and gradients of
     `Statistical` over large batches run a quarter slower with them.
