@@ -62,9 +62,14 @@ def filter_jit(function: Callable[P, T]) -> Callable[P, T]:
 
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:
-        return (inner if is_traced(arguments, options) else outermost())(*arguments, **options)
+        return (outermost() if is_outermost(arguments, options) else inner)(*arguments, **options)
 
     return call
+
+
+def is_outermost(*inputs: Any) -> bool:
+    """Whether a program of these inputs would be the outermost: not within one that is traced, even if all is known."""
+    return not is_traced(*inputs, jax.lax.full((), 0.0))
 
 
 def is_traced(*inputs: Any) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
-from layerjax.compiling import compiler_options, is_traced
+from layerjax.compiling import compiler_options, is_outermost
 
 FULL = 0.5
 """Share of the maps that a process may have."""
@@ -38,7 +38,7 @@ class Static:
 def run(function: Callable[..., Any], split_model: tuple[Any, Static], *arguments: Any) -> Any:
     """`function(model, *arguments)` compiled, and done; see `Problem.call`."""
     with one_thread():
-        program = _program(not is_traced(split_model[0], arguments))
+        program = _program(is_outermost(split_model[0], arguments))
         return jax.block_until_ready(program(function, split_model[1], split_model[0], *arguments))
 
 

@@ -152,3 +152,11 @@ def test_one_program_serves_all_values_of_a_structure():
 def test_wrong_shapes_are_refused_by_name():
     with pytest.raises(ValueError, match=r"wo: shape \(2,\) given, \(\.\.\., 3\) needed"):
         lj.evaluate(OPEN, jnp.ones(3), jnp.ones(2), SINGLE)
+
+
+def test_a_program_may_hold_a_call_of_which_all_is_known():
+    """Its own compiler options, which JAX takes at the outermost program only, are of no harm there."""
+    stack = lj.Stack([], lj.Lambertian(0.5))
+    wi, wo = lj.direction(0.5, 0.0), lj.direction(0.6, 3.1)
+    found = jax.jit(lambda x: x + lj.evaluate(stack, wi, wo, lj.SingleScattering()))(1.0)
+    assert float(found[0]) == pytest.approx(1.0 + 0.5 / np.pi)

@@ -14,11 +14,6 @@ MOST = 2
 """Media that a network is trained for, as in Sec. 5."""
 
 
-def is_traced(media: tuple[Medium, ...]) -> bool:
-    """Whether a number is not known yet that decides which media are put together."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(media))
-
-
 def pair_of(media: tuple[Medium, ...]) -> tuple[Medium, ...]:
     """Neighbours are put together until two are left, those first whose weaker one scatters least.
 

@@ -10,13 +10,14 @@ from jax import Array
 
 from layerjax._shapes import map_shape
 from layerjax.channels import Channels, total
+from layerjax.compiling import is_traced
 from layerjax.directions import Vector
 from layerjax.stack import Interface, Stack, is_known, media_of
 from layerjax.tables import load
 from layerjax.transport.contract import TEXELS, DeterministicTransport, Side
 from layerjax.transport.single_scattering import Media, SingleScattering, choices, density, draw
 from layerjax.transport.spongecake.bending import bend_network
-from layerjax.transport.spongecake.layers import MOST, is_traced, pair_of
+from layerjax.transport.spongecake.layers import MOST, pair_of
 from layerjax.transport.spongecake.lobes import (
     Hemisphere,
     SecondLobe,
