@@ -307,7 +307,7 @@ def test_edges_are_those_of_a_loop_over_all_pairs(kind):
     shape, scales = (3, 4, 2), np.array([0.2, np.inf, 0.05])
     units, there = rng.random((*shape, 3)), rng.random(shape) < 0.8
     units[~there] = np.nan
-    centre, precision = Edges(kind, scales).pull(units, there)
+    centre, precision = Edges(kind, scales).prior_pull(units, there)
     for place in np.ndindex(shape):
         beside = [
             other for other in np.ndindex(shape) if np.abs(np.subtract(place, other)).sum() == 1 and there[other]
