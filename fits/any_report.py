@@ -12,8 +12,10 @@ from fits.reports import html
 from fits.reports.verdicts import DEFAULT, ReportOptions
 from fits.sampling.posterior import Posterior
 from layerjax._checks import require_kind
+from layerjax.compiling import programs_kept
 
 
+@programs_kept()
 def report(
     fit: Fit | FittedMap,
     posterior: Posterior | None = None,

@@ -2,6 +2,7 @@
 
 from layerjax._parameters import RANGES as RANGES
 from layerjax.compiling import compiler_options as compiler_options
+from layerjax.compiling import keep_programs as keep_programs
 from layerjax.directions import angles as angles
 from layerjax.directions import direction as direction
 from layerjax.evaluate import albedo as albedo

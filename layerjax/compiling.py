@@ -1,7 +1,14 @@
-"""Options of the compiler by which programs of this library compile faster."""
+"""Compilation made cheaper: options of the compiler, and a cache of compiled programs in the user's cache folder."""
 
-from collections.abc import Callable
+import hashlib
+import os
+import platform
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, wraps
+from importlib import metadata
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
@@ -10,6 +17,12 @@ from jax.core import Tracer
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+FOLDER, LEAST = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+"""JAX's settings of its persistent compilation cache."""
+
+LEAST_COMPILE = 0.1
+"""Seconds of compilation from which a program is cached."""
 
 OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_prefer_vector_width": 512}
 """Of XLA on a CPU: kernels go to LLVM without MLIR's passes before it, in vectors as wide as the processor has."""
@@ -75,3 +88,62 @@ def is_outermost(*inputs: Any) -> bool:
 def is_traced(*inputs: Any) -> bool:
     """Whether any leaf of these is traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(inputs))
+
+
+def keep_programs() -> str | None:
+    """Cache compiled programs on disk, for later processes: call it once, at the top of a notebook.
+
+    This turns on JAX's persistent compilation cache for the process, in the user's cache folder (``XDG_CACHE_HOME``,
+    else ``~/.cache``), apart for every host, processor and version of jaxlib. All programs of JAX that take a tenth of
+    a second or longer to compile are cached, until the folder is deleted. If a cache is set already, nothing changes.
+
+    Returns:
+        The folder of the cache. None: there is none that may be written to, and nothing is cached.
+
+    Example:
+        >>> import layerjax as lj
+        >>> folder = lj.keep_programs()
+    """
+    if jax.config.values[FOLDER] or not (folder := compile_cache()):
+        return jax.config.values[FOLDER]
+    jax.config.update(FOLDER, folder)
+    jax.config.update(LEAST, LEAST_COMPILE)
+    return folder
+
+
+@contextmanager
+def programs_kept() -> Iterator[None]:
+    """`keep_programs` within the block alone."""
+    from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
+    before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}
+    if before[FOLDER] or not keep_programs():
+        yield
+        return
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+        reset_cache()
+
+
+def compile_cache() -> str | None:
+    """Folder of programs that this JAX compiled for this processor, on this host only; None: there can be none."""
+    try:
+        key = "\n".join((metadata.version("jaxlib"), socket.gethostname(), _processor()))
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = home / "layerjax" / "compiled" / hashlib.sha256(key.encode()).hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError, metadata.PackageNotFoundError):  # no home, or one that may not be written to
+        return None
+    return str(folder) if os.access(folder, os.W_OK) else None
+
+
+def _processor() -> str:
+    """Kind and features of the processor."""
+    with suppress(OSError), open("/proc/cpuinfo") as file:
+        for line in file:
+            if line.startswith(("flags", "Features")):
+                return line
+    return f"{platform.machine()} {platform.processor()}"

@@ -2,9 +2,6 @@
 
 import os
 
-LEAST_COMPILE = 0.2
-"""Programs that took so many seconds to compile are kept."""
-
 
 def use_jax() -> None:
     """Double precision, all cores, and compiled programs kept in the user's cache folder from one run to the next."""
@@ -13,11 +10,11 @@ def use_jax() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
-    from fits.engines.compile_cache import keep_programs
     from fits.engines.worker import quieten
     from fits.problem.compilation import devices_of_cores
+    from layerjax.compiling import keep_programs
 
     quieten()
     jax.config.update("jax_enable_x64", True)
     devices_of_cores()
-    keep_programs(LEAST_COMPILE)
+    keep_programs()

@@ -16,7 +16,6 @@ from contextlib import suppress
 from multiprocessing import connection, parent_process
 from typing import Any, NamedTuple
 
-from fits.engines.compile_cache import FOLDER, LEAST, LEAST_COMPILE, compile_cache, keep_programs
 from fits.engines.failures import attempt
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -43,6 +42,8 @@ def environment() -> dict[str, str]:
     if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
         variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     jax = sys.modules.get("jax")
+    from layerjax.compiling import FOLDER, LEAST, LEAST_COMPILE, compile_cache  # imports JAX: not before it is needed
+
     directory: str | None = os.environ.get(FOLDER.upper())
     if jax is not None:
         variables["JAX_ENABLE_X64"] = str(int(jax.config.jax_enable_x64))
@@ -64,6 +65,8 @@ def configure(double: bool | None, threads: int) -> None:
     """Configure a worker that has imported JAX: precision of the caller, a compilation cache, and this number of
     threads, unless it has computed before."""
     import jax
+
+    from layerjax.compiling import keep_programs
 
     quieten()
     _keep_memory()

@@ -19,6 +19,7 @@ from fits.names import EXPORTS, To
 from fits.optimise.result import Fit
 from fits.progress import Progress, silent
 from layerjax._checks import in_short
+from layerjax.compiling import programs_kept
 
 _WRITERS: dict[str, Callable[[Material, Floats | None], Contents]] = {
     "rgl": rgl.contents,
@@ -49,6 +50,7 @@ class ExportReport:
     notes: tuple[str, ...]
 
 
+@programs_kept()
 def export(
     material: "lj.Stack | lj.Mixture | Fit",
     path: str | Path,

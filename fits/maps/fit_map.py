@@ -6,7 +6,6 @@ the likeliest of the pilot's ended, and is begun again only where its chi-square
 """
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,6 @@ import layerjax as lj
 from fits._files import locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, run
-from fits.engines.compile_cache import programs_kept
 from fits.engines.processes import end_if_again
 from fits.maps.inputs import Block, MapData, Measured, map_data, words
 from fits.maps.options import USUAL, VERDICTS, MapOptions
@@ -35,6 +33,7 @@ from fits.problem.parameters import is_free, with_values
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
 from layerjax._checks import require_kind
+from layerjax.compiling import programs_kept
 
 if TYPE_CHECKING:
     from fits.data.geometry import Geometry
@@ -43,6 +42,7 @@ NAMED = 8
 """Chunks that an error names of those that could not be done."""
 
 
+@programs_kept()
 def fit_map(
     stack: Any,
     geometry: "Geometry | Any",
@@ -76,7 +76,7 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    if several := options.processes > 1 and client is None:
+    if options.processes > 1 and client is None:
         end_if_again()
     data = map_data(values, geometry, sigma, mask)
     require_kind("noise", noise, Noise, None)
@@ -88,8 +88,7 @@ def fit_map(
     path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    kept = programs_kept() if several else nullcontext()  # workers run the program that has fitted the pilot
-    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached, kept:
+    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached:
         return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), reached)
 
 

@@ -43,6 +43,7 @@ from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, silent
 from layerjax._checks import require_kind
+from layerjax.compiling import programs_kept
 
 Floats = NDArray[np.float64]
 
@@ -53,6 +54,7 @@ MOST_STARTS = 8
 """Minima without model discrepancy that the fit with it starts from; of its other starts half as many."""
 
 
+@programs_kept()
 def fit(
     stack: Any,
     data: Measurements | None = None,

@@ -13,6 +13,7 @@ from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import DRAWS, LEVELS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
+from layerjax.compiling import programs_kept
 
 LINEAR = 1e6
 """Softness that makes the logarithm linear, in units of the largest value: asinh(x / s) is x / s there."""
@@ -61,6 +62,7 @@ class Average:
         )
 
 
+@programs_kept()
 def average(
     candidates: Mapping[str, Fit | Posterior],
     weights: Mapping[str, float] | None = None,

@@ -14,6 +14,7 @@ from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
+from layerjax.compiling import programs_kept
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ class Comparison:
         return str(shown_by("fits.reports.html:comparison_fragment", self))
 
 
+@programs_kept()
 def compare(
     candidates: Mapping[str, Fit | Posterior],
     *,

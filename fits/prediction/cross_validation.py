@@ -28,6 +28,7 @@ from fits.problem.problem import Problem
 from fits.progress import Progress, named, silent
 from fits.sampling.initial import other_minima, vector_of
 from layerjax._checks import require_kind
+from layerjax.compiling import programs_kept
 
 DRAWS = 128
 
@@ -70,6 +71,7 @@ class CrossValidation:
         return np.array([self.log_density[rows].size for rows in self.rows])
 
 
+@programs_kept()
 def cross_validate(
     fit: Fit,
     *,

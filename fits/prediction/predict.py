@@ -33,6 +33,7 @@ from fits.problem.problem import polar_angles
 from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_kind
+from layerjax.compiling import programs_kept
 from layerjax.mixture import stacks_of
 
 if TYPE_CHECKING:
@@ -266,6 +267,7 @@ class Predictor(Protocol):
     ) -> Prediction: ...
 
 
+@programs_kept()
 def predict(
     fitted: Fit | Posterior | Predictor,
     at: Geometry | Measurements,

@@ -10,8 +10,10 @@ from fits.data.geometry import slices as slices
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import in_short, require_kind
+from layerjax.compiling import programs_kept
 
 
+@programs_kept()
 def simulate(
     stack: lj.Stack | lj.Mixture,
     geometry: Geometry,

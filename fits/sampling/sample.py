@@ -24,6 +24,7 @@ from fits.sampling.options import SamplerOptions
 from fits.sampling.posterior import Posterior, posterior_of
 from fits.store import Store, another, differences, fingerprint
 from layerjax._checks import require_kind
+from layerjax.compiling import programs_kept
 
 WALKERS = 32
 PATIENCE = 10.0
@@ -32,6 +33,7 @@ PATIENCE = 10.0
 Sampler = Literal["emcee", "nuts"]
 
 
+@programs_kept()
 def sample(
     fit: Fit,
     *,

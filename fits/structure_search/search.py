@@ -39,6 +39,7 @@ from fits.reports.results import load_fit, save_fit
 from fits.store import Store, fingerprint, holds_other_files
 from fits.structure_search.library import Library, Structure, default_library
 from layerjax._checks import in_short, require_kind
+from layerjax.compiling import programs_kept
 
 STORE = "search.store"
 TOGETHER = 8
@@ -144,6 +145,7 @@ def named(structure: Structure) -> str:
     return " / ".join(structure)
 
 
+@programs_kept()
 def search(
     data: Measurements,
     library: Library | None = None,

@@ -8,7 +8,8 @@ import jax
 import pytest
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
-from fits.engines.compile_cache import FOLDER, LEAST, compile_cache, keep_programs, programs_kept
+import layerjax as lj
+from layerjax.compiling import FOLDER, LEAST, LEAST_COMPILE, compile_cache, programs_kept
 
 
 @pytest.fixture
@@ -25,7 +26,7 @@ def without(monkeypatch, tmp_path):
 
 
 def test_programs_are_kept_within_the_block_alone(without, monkeypatch):
-    monkeypatch.setattr("fits.engines.compile_cache.LEAST_COMPILE", 0.0)
+    monkeypatch.setattr("layerjax.compiling.LEAST_COMPILE", 0.0)
     least = jax.config.values[LEAST]
     with programs_kept():
         folder = Path(jax.config.values[FOLDER])
@@ -45,7 +46,19 @@ def test_a_user_who_keeps_programs_keeps_the_same_place(without, tmp_path):
     with programs_kept():
         assert jax.config.values[FOLDER] == str(tmp_path / "own")
     assert jax.config.values[FOLDER] == str(tmp_path / "own")
-    assert not keep_programs()
+    assert lj.keep_programs() == str(tmp_path / "own")
+
+
+def test_a_notebook_keeps_its_programs(without):
+    jax.block_until_ready(jax.jit(lambda x: x * 5.5 + 1.25)(2.0))  # what was compiled before does not matter
+    folder = lj.keep_programs()
+    assert without in Path(folder).parents
+    assert jax.config.values[FOLDER] == folder
+    assert jax.config.values[LEAST] == LEAST_COMPILE
+    jax.config.update(LEAST, 0.0)
+    jax.block_until_ready(jax.jit(lambda x: x * 6.5 + 1.25)(2.0))
+    assert list(Path(folder).iterdir())
+    assert lj.keep_programs() == folder
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
