@@ -18,10 +18,12 @@ from layerjax import maps
 from layerjax._batching import in_chunks
 from layerjax._checks import require_choice, require_count, require_key
 from layerjax._devices import compiled
+from layerjax._jacobian import by_parameters, few_parameters
 from layerjax._numerics import broadcasting, horizon, safe_div
 from layerjax._parameters import in_precision
 from layerjax._shapes import Shape, channel_count, map_shape, require_single
 from layerjax.channels import pick
+from layerjax.compiling import is_traced
 from layerjax.directions import Vector, horizontal, read_directions, split
 from layerjax.mixture import Mixture, require_material
 from layerjax.numerical_error import neighbours, numerical_error
@@ -101,7 +103,18 @@ def evaluate_known(
     shape = _shape_of(stack)
     if shape:
         return _evaluate_map(stack, wi, wo, transport, side, key, shape)
-    prepared = prepared_at(stack, transport, wi.dtype, lambda: known_directions(wi, wo) if known is None else known)
+    looked = cache(lambda: known_directions(wi, wo) if known is None else known)
+    if not isinstance(stack, Prepared) and not is_traced(wi, wo):
+        values = math.prod(jnp.broadcast_shapes(wi.shape, wo.shape)[:-1]) * channel_count(stack)
+        if few_parameters(stack, values):
+            require_numbers(stack)
+            chosen, simplified = chosen_for(stack, transport, looked)
+            traced = chosen.when_traced(simplified)
+            if traced is not None:
+                chosen.needed(key, "evaluate")
+                directions = looked() if chosen.uses_known else None
+                return by_parameters(_solved, (simplified, traced, directions, wi, wo, side, channel_count(stack)))
+    prepared = prepared_at(stack, transport, wi.dtype, looked)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
 
@@ -227,6 +240,12 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     if shape:
         return maps.of_directions(_unscattered, slim, maps.layout(shape, wi), wi, channels)
     return _unscattered(slim, wi, channels)
+
+
+def _solved(given: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:
+    stack, transport, known, wi, wo, side, channels = given
+    prepared = Prepared(transport.prepare_for(stack, lambda: known), transport, channels)
+    return _evaluate(in_precision(prepared, wi.dtype), wi, wo, side, None)[0]
 
 
 @compiled

@@ -76,6 +76,11 @@ class Transport(eqx.Module):
         """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 
+    def when_traced(self, stack: Stack) -> "Transport | None":
+        """What gives, within a program where all numbers of the simplified stack are traced, just what this one gives
+        outside, and can be differentiated forward; None: nothing does."""
+        return None
+
     def prepare_energies(self, stack: Stack) -> Any:
         """`prepare` for `energies` alone, for transports that need less for these."""
         return self.prepare(stack)

@@ -16,7 +16,9 @@ import numpy as np
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
+from layerjax._devices import exact_products
 from layerjax._numerics import broadcasting
+from layerjax.compiling import filter_jit
 
 Scalars = tuple[Array, ...]
 
@@ -51,6 +53,19 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
         return _tied(function(jax.tree.unflatten(structure, filled), constants), scalars)
 
     return _of_scalars(of_scalars, scalars, constants)
+
+
+Make = Callable[..., Any]
+"""Gives the element of a function of options, parameters and constants: `made` or `compiled`."""
+
+
+def made(function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any) -> Any:
+    """The `element` of function(*options, parameters, constants)."""
+    return element(partial(function, *options), parameters, constants, dtype)
+
+
+compiled = filter_jit(exact_products(made))
+"""`made` by a program of its own, outside of ``jit``: other stacks that hold such a layer find it compiled."""
 
 
 def _by_itself(function: Callable[[Array], Any], scalars: Scalars, given: Array) -> Any:

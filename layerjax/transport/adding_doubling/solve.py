@@ -17,11 +17,11 @@ from jax import Array
 
 from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
-from layerjax.stack import Interface, Stack
+from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
-from layerjax.transport.adding_doubling.elements import Scalars, element
+from layerjax.transport.adding_doubling.elements import Make, Scalars, element, made
 from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
@@ -51,8 +51,8 @@ def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) ->
     """The plan for a simplified stack."""
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, _ranks(stack), microfacets)
-    return Plan(resolution.nodes, resolution.modes, None, _ranks(stack), microfacets)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), microfacets)
+    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), microfacets)
 
 
 def solve(
@@ -64,25 +64,39 @@ def solve(
     asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
     light passes it, ends) with an interface.
     """
-    interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    dtype = _dtype(stack)
-    indices = tuple(jnp.asarray(n, dtype) for n in (1.0, *(layer.ior for layer in interfaces)))
-    grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
-    faces = _interfaces(stack, plan, indices, asked)
-    solved: list[tuple[Layer, bool]] = []
+    return assembled(stack, plan, elements_of(stack, plan, asked))
+
+
+def elements_of(stack: Stack, plan: Plan, asked: KnownDirections | None, make: Make = made) -> list[Any]:
+    """An element for every layer, and for a base: the `Layer` of what is a surface, the `Kernel` of a medium."""
+    dtype, indices = _dtype(stack), _indices(stack)
+    faces = iter(_interfaces(stack, plan, indices, asked, make))
+    found: list[Any] = []
     region = 0
     for layer in stack.layers:
         if isinstance(layer, Interface):
-            solved.append((faces[region], False))
+            found.append(next(faces))
             region += 1
         else:
             tilted = plan.azimuths is not None and is_tilted(layer)
-            of_medium = partial(_kernel, plan, region, layer.f0 is not None, tilted, dtype)
-            kernel = element(of_medium, (indices, layer.phase), None, dtype)
-            solved.append((medium_layer(layer, kernel), tilted))
+            options = plan, region, layer.f0 is not None, tilted, dtype
+            found.append(make(_kernel, options, (indices, layer.phase), None, dtype))
     if stack.base is not None:
-        build = partial(_base, plan, region, dtype)
-        solved.append((element(build, (indices, stack.base), None, dtype), False))
+        found.append(make(_base, (plan, region, dtype), (indices, stack.base), None, dtype))
+    return found
+
+
+def assembled(
+    stack: Stack, plan: Plan, elements: list[Any]
+) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
+    """See `solve`; elements: see `elements_of`. Of a base it only matters whether there is one."""
+    grid = make_grid(_indices(stack), plan.ranks, plan.nodes, _dtype(stack))
+    solved: list[tuple[Layer, bool]] = []
+    for layer, found in zip((*stack.layers, stack.base), elements, strict=False):
+        if isinstance(layer, Medium):
+            solved.append((medium_layer(layer, found), plan.azimuths is not None and is_tilted(layer)))
+        else:
+            solved.append((found, False))
     whole, is_expanded = solved[-1]
     for found, tilted in reversed(solved[:-1]):
         if tilted and not is_expanded:
@@ -92,11 +106,27 @@ def solve(
     return grid, whole, without_straight(stack, layers, whole), outer_faces(stack, layers)
 
 
+def can_be_split(stack: Stack) -> bool:
+    """Whether every element has a program of its own, which many interfaces share."""
+    return sum(isinstance(layer, Interface) for layer in stack.layers) < MANY
+
+
+def without_base(stack: Stack) -> Stack:
+    """The stack with nothing more of its base than that there is one."""
+    return stack if stack.base is None else Stack(stack.layers, Lambertian(jnp.zeros((), _dtype(stack))))
+
+
+def _indices(stack: Stack) -> Scalars:
+    """Refractive indices of all regions."""
+    faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
+    return tuple(jnp.asarray(n, _dtype(stack)) for n in (1.0, *(layer.ior for layer in faces)))
+
+
 def _dtype(stack: Stack) -> Any:
     return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
-def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None) -> list[Layer]:
+def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None, make: Make) -> list[Layer]:
     """Every interface of a stack as a layer. Many of a kind share one program, which is compiled once."""
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     behind: Behind = "narrow" if stack.base is None or isinstance(stack.base, Conductor) else "diffuse"
@@ -108,16 +138,17 @@ def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirectio
     for region, layer in enumerate(interfaces):
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if asked is not None and (layer is stack.layers[0] or leaves):
-            build = partial(_interface, plan, layer.distribution, not leaves, behind, dtype, region)
-            found[region] = element(build, (indices, layer.alpha), asked.below if leaves else asked.above, dtype)
+            options = plan, layer.distribution, not leaves, behind, dtype, region
+            along = asked.below if leaves else asked.above
+            found[region] = make(_interface, options, (indices, layer.alpha), along, dtype)
         else:
             alike[layer.distribution, not leaves].append(region)
     for kind, regions in alike.items():
         alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
         if len(regions) < MANY:
             for region, alpha in zip(regions, alphas, strict=True):
-                build = partial(_interface, plan, *kind, behind, dtype, region)
-                found[region] = element(build, (indices, alpha), None, dtype)
+                options = plan, *kind, behind, dtype, region
+                found[region] = make(_interface, options, (indices, alpha), None, dtype)
         else:
             build = partial(_numbered_interface, plan, *kind, behind, dtype)
             layers = jax.lax.map(
@@ -217,7 +248,7 @@ def _relative(base: Surface, above: Array) -> Surface:
     return eqx.tree_at(lambda surface: (surface.ior, surface.k), base, (base.ior / above, base.k / above))
 
 
-def _ranks(stack: Stack) -> tuple[int, ...] | None:
+def ranks(stack: Stack) -> tuple[int, ...] | None:
     """Place of every region's index among the distinct ones, if they are known."""
     indices: list[Any] = [1.0]
     for layer in stack.layers:

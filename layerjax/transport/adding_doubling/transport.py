@@ -25,12 +25,13 @@ from layerjax._devices import exact_products
 from layerjax._numerics import not_negative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
-from layerjax.compiling import filter_jit
+from layerjax.compiling import filter_jit, is_outermost, is_traced
 from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
+from layerjax.transport.adding_doubling.elements import compiled
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
@@ -43,7 +44,16 @@ from layerjax.transport.adding_doubling.resolution import (
     rungs,
     shortage,
 )
-from layerjax.transport.adding_doubling.solve import Plan, followed, make_plan, solve
+from layerjax.transport.adding_doubling.solve import (
+    Plan,
+    assembled,
+    can_be_split,
+    elements_of,
+    followed,
+    make_plan,
+    ranks,
+    without_base,
+)
 from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
@@ -194,6 +204,10 @@ class AddingDoubling(DeterministicTransport):
         carried, once = _as_carried(stack, plan)
         return Solved(first, _solve(stack, first, once, plan), None, straight(carried), once)
 
+    def when_traced(self, stack: Stack) -> "AddingDoubling":
+        options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return _Ranked(**options, ranks=ranks(stack))
+
     def prepare_energies(self, stack: Stack) -> Solved:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
         return dataclasses.replace(self, modes=1).prepare(stack)
@@ -322,13 +336,13 @@ class AddingDoubling(DeterministicTransport):
     def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         """The coarsest resolution that agrees with the one before to `tolerance`, at the directions asked for if
         light is followed along them, else all over the hemispheres."""
-        if _is_traced(stack):
+        if is_traced(stack):
             raise ValueError(
                 f"AddingDoubling.tolerance: {self.tolerance:g} needs concrete parameters: "
                 "prepare the stack outside jit, grad and vmap, or give nodes and modes"
             )
         with jax.ensure_compile_time_eval():
-            return self._agreeing(stack, None if _is_traced(known) else known)
+            return self._agreeing(stack, None if is_traced(known) else known)
 
     def _agreeing(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         assert self.tolerance is not None
@@ -355,6 +369,15 @@ class AddingDoubling(DeterministicTransport):
         )
 
 
+class _Ranked(AddingDoubling):
+    """Where the order of indices is known, though they are traced; None: it is not."""
+
+    ranks: tuple[int, ...] | None = eqx.field(static=True, default=None)
+
+    def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
+        return dataclasses.replace(super()._plan(stack, known), ranks=self.ranks)
+
+
 def _straight(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
     if state.straight is None or side == "reflection":
         return []
@@ -369,10 +392,6 @@ def _frames_inside() -> int:
     return count
 
 
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
-
-
 def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
     """The stack as the grid has it, and paths with one event in that, where they differ from the stack's own."""
     carried = scaled(stack, plan.nodes)
@@ -383,10 +402,39 @@ def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
     return carried, once if media else None
 
 
+def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
+    if not _is_split(stack, first, once):
+        return _solve_at_once(stack, first, once, plan)
+    return _tables(without_base(stack), elements_of(stack, plan, None, compiled), first, once, plan)
+
+
+def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+    if not _is_split(stack, known):
+        return _solve_between_at_once(stack, known, plan)
+    return _between(without_base(stack), elements_of(stack, plan, known, compiled), known, plan)
+
+
+def _is_split(stack: Stack, *inputs: Any) -> bool:
+    """Whether elements have programs of their own, which the next stack finds compiled."""
+    return can_be_split(stack) and is_outermost(stack, inputs)
+
+
 @filter_jit
 @exact_products
-def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
-    grid, whole, rest, faces = solve(stack, plan)
+def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
+    return _tables(stack, elements_of(stack, plan, None), first, once, plan)
+
+
+@filter_jit
+@exact_products
+def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+    return _between(stack, elements_of(stack, plan, known), known, plan)
+
+
+@filter_jit
+@exact_products
+def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
+    grid, whole, rest, faces = assembled(stack, plan, elements)
     met = partial(interaction_probability, first)
     onward = None if once is None else partial(onward_probability, first, once)
     outer = faces if first.layered else None
@@ -395,8 +443,8 @@ def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan)
 
 @filter_jit
 @exact_products
-def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
-    grid, _, rest, _ = solve(stack, plan, known)
+def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
+    grid, _, rest, _ = assembled(stack, plan, elements)
     return between(rest, known, grid.regions[-1].ior, stack.base is not None)
 
 

@@ -1,0 +1,81 @@
+"""Derivatives of un-jitted calls by a few numbers, from one program that finds values and Jacobian together.
+
+Where `jax.grad` and its like are applied outside of ``jit``, the numbers that they differentiate by are known. The rule
+of this module then runs a program of known numbers, the outermost one: the compiler takes options (see
+`layerjax.compiling`), and compiles one program in the place of those that JAX makes for every part of a function, there
+and back. Everything else is traced as ever: within ``jit`` and ``vmap``, for second derivatives, and by many numbers.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.core import Tracer
+
+from layerjax._devices import compiled
+from layerjax.compiling import is_outermost, is_traced
+
+MOST_PARAMETERS = 16
+"""More numbers are differentiated by on the way back."""
+
+MOST_SLOPES = 50_000
+"""Values times numbers that they are differentiated by: of more, the time to run counts, not that to compile."""
+
+
+def few_parameters(tree: Any, values: int) -> bool:
+    """Whether `by_parameters` pays: of known numbers, `grad` or its like differentiates so many values by a few."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, Tracer)]
+    if not leaves or not is_outermost() or not all(map(_is_known, leaves)):
+        return False
+    count = sum(leaf.size for leaf in leaves)
+    return count <= MOST_PARAMETERS and values * count <= MOST_SLOPES
+
+
+def _is_known(leaf: Any) -> bool:
+    """Whether `grad` or its like differentiates by this number, and nothing else is done to it."""
+    primal = getattr(leaf, "primal", None)
+    return isinstance(primal, Array) and not isinstance(primal, Tracer) and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def by_parameters(function: Callable[[Any], Array], tree: Any) -> Array:
+    """function(tree), differentiated by what is traced in the tree: see `few_parameters`.
+
+    function: of a module, as it is part of the program's key.
+    """
+    parameters, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, Tracer))
+
+    @jax.custom_jvp
+    def values(parameters: Any) -> Array:
+        return function(eqx.combine(parameters, rest))
+
+    @values.defjvp
+    def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array, Array]:
+        if is_traced(primals):  # a derivative of a derivative
+            return jax.jvp(lambda given: function(eqx.combine(given, rest)), primals, tangents)
+        with jax.ensure_compile_time_eval():  # all is known: a program of its own, the outermost
+            found, slopes = _with_jacobian(function, *primals, rest)
+        return found, _change(jax.tree.leaves(slopes), jax.tree.leaves(*tangents))
+
+    return values(parameters)
+
+
+@compiled
+def _with_jacobian(function: Callable[[Any], Array], parameters: Any, rest: Any) -> tuple[Array, Any]:
+    def twice(parameters: Any) -> tuple[Array, Array]:
+        found = function(eqx.combine(parameters, rest))
+        return found, found
+
+    slopes, found = jax.jacfwd(twice, has_aux=True)(parameters)
+    return found, slopes
+
+
+@jax.jit
+def _change(slopes: list[Array], rates: list[Array]) -> Array:
+    """Of the values, along tangents of the parameters."""
+    return sum(
+        (jnp.tensordot(slope, rate.astype(slope.dtype), rate.ndim) for slope, rate in zip(slopes, rates, strict=True)),
+        jnp.zeros((), slopes[0].dtype),
+    )
