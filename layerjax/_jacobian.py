@@ -40,26 +40,37 @@ def _is_known(leaf: Any) -> bool:
     return isinstance(primal, Array) and not isinstance(primal, Tracer) and jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
-def by_parameters(function: Callable[[Any], Array], tree: Any) -> Array:
+def by_parameters(function: Callable[[Any], Array], tree: Any, plain: Any) -> Array:
     """function(tree), differentiated by what is traced in the tree: see `few_parameters`.
 
-    function: of a module, as it is part of the program's key.
+    function: of a module, as it is part of the program's key. plain: a tree like it, for derivatives of derivatives.
     """
     parameters, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, Tracer))
+    # before the rule is asked for, in which JAX takes all numbers for traced
+    found, slopes = _with_jacobian(function, jax.tree.map(primal, parameters), rest)
 
     @jax.custom_jvp
-    def values(parameters: Any) -> Array:
-        return function(eqx.combine(parameters, rest))
+    def values(parameters: list[Array]) -> Array:
+        return found
 
     @values.defjvp
-    def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Array, Array]:
-        if is_traced(primals):  # a derivative of a derivative
-            return jax.jvp(lambda given: function(eqx.combine(given, rest)), primals, tangents)
-        with jax.ensure_compile_time_eval():  # all is known: a program of its own, the outermost
-            found, slopes = _with_jacobian(function, *primals, rest)
-        return found, _change(jax.tree.leaves(slopes), jax.tree.leaves(*tangents))
+    def rule(primals: tuple[list[Array]], tangents: tuple[list[Array]]) -> tuple[Array, Array]:
+        if is_traced(primals):
+            return jax.jvp(lambda given: function(_filled(plain, given)), primals, tangents)
+        return found, _change(jax.tree.leaves(slopes), *tangents)
 
-    return values(parameters)
+    return values(jax.tree.leaves(parameters))
+
+
+def _filled(tree: Any, given: list[Array]) -> Any:
+    """The tree with these in the place of what is traced in it."""
+    left = iter(given)
+    return jax.tree.map(lambda leaf: next(left) if isinstance(leaf, Tracer) else leaf, tree)
+
+
+def primal(leaf: Any) -> Any:
+    """Of what `grad` or its like differentiates by, the number; of a number, itself."""
+    return getattr(leaf, "primal", leaf) if isinstance(leaf, Tracer) else leaf
 
 
 @compiled

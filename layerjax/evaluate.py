@@ -109,11 +109,12 @@ def evaluate_known(
         if few_parameters(stack, values):
             require_numbers(stack)
             chosen, simplified = chosen_for(stack, transport, looked)
-            traced = chosen.when_traced(simplified)
+            traced = chosen.when_traced(simplified, looked)
             if traced is not None:
                 chosen.needed(key, "evaluate")
                 directions = looked() if chosen.uses_known else None
-                return by_parameters(_solved, (simplified, traced, directions, wi, wo, side, channel_count(stack)))
+                more = (directions, wi, wo, side, channel_count(stack))
+                return by_parameters(_solved, (simplified, traced, *more), (simplified, chosen, *more))
     prepared = prepared_at(stack, transport, wi.dtype, looked)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 

@@ -6,10 +6,11 @@ its scalars are therefore taken once, forward, however many parameters a Jacobia
 product with them: no program has to be run backwards through quadratures.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +18,9 @@ from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
 from layerjax._devices import exact_products
+from layerjax._jacobian import primal
 from layerjax._numerics import broadcasting
-from layerjax.compiling import filter_jit
+from layerjax.compiling import filter_jit, is_traced
 
 Scalars = tuple[Array, ...]
 
@@ -35,24 +37,33 @@ def element(function: Callable[[Any, Any], Any], parameters: Any, constants: Any
         constants: an array of any size, or None; a derivative by it (of a direction, say) runs through the function.
         dtype: of the parameters.
     """
-    leaves, structure = jax.tree.flatten(parameters)
-    numbers = [isinstance(leaf, Array | np.ndarray | float | int) and not isinstance(leaf, bool) for leaf in leaves]
-    arrays = [jnp.asarray(leaf, dtype) for leaf, is_number in zip(leaves, numbers, strict=True) if is_number]
-    if sum(array.size for array in arrays) > MOST_SCALARS:
+    scalars, filled = _scalars_of(parameters, dtype)
+    if len(scalars) > MOST_SCALARS:
         return function(parameters, constants)
-    scalars = tuple(array.ravel()[k] if array.ndim else array for array in arrays for k in range(array.size))
 
     def of_scalars(scalars: Scalars, constants: Any) -> Any:
-        left, filled = list(scalars), list(leaves)
+        return _tied(function(filled(scalars), constants), scalars)
+
+    return _of_scalars(of_scalars, scalars, constants)
+
+
+def _scalars_of(parameters: Any, dtype: Any) -> tuple[Scalars, Callable[[Scalars], Any]]:
+    """Every number in a tree, and the tree of others in their place; what is no array stays as it is."""
+    leaves, structure = jax.tree.flatten(parameters)
+    numbers = [_is_number(leaf) for leaf in leaves]
+    arrays = [jnp.asarray(leaf, dtype) for leaf, is_number in zip(leaves, numbers, strict=True) if is_number]
+
+    def filled(scalars: Scalars) -> Any:
+        left, given = list(scalars), list(leaves)
         shapes = iter(arrays)
         for place, is_number in enumerate(numbers):
             if is_number:
                 array = next(shapes)
                 part, left = left[: array.size], left[array.size :]
-                filled[place] = jnp.stack(part).reshape(array.shape) if array.ndim else part[0]
-        return _tied(function(jax.tree.unflatten(structure, filled), constants), scalars)
+                given[place] = jnp.stack(part).reshape(array.shape) if array.ndim else part[0]
+        return jax.tree.unflatten(structure, given)
 
-    return _of_scalars(of_scalars, scalars, constants)
+    return tuple(array.ravel()[k] if array.ndim else array for array in arrays for k in range(array.size)), filled
 
 
 Make = Callable[..., Any]
@@ -66,6 +77,78 @@ def made(function: Callable[..., Any], options: tuple[Any, ...], parameters: Any
 
 compiled = filter_jit(exact_products(made))
 """`made` by a program of its own, outside of ``jit``: other stacks that hold such a layer find it compiled."""
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, Array | np.ndarray | float | int) and not isinstance(leaf, bool)
+
+
+class Sloped(eqx.Module):
+    """An element that is known, and its derivatives by some of its scalars, along a leading axis."""
+
+    value: Any
+    slopes: Any
+    changing: tuple[int, ...] = eqx.field(static=True)
+
+
+def sloped(
+    function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any
+) -> Sloped | None:
+    """`made` by a program of its own where `grad` or its like differentiates by numbers that are known, with its
+    derivatives by these; None: there are too many scalars."""
+    changing: list[int] = []
+    count = 0
+    for leaf in filter(_is_number, jax.tree.leaves(parameters)):
+        size = np.size(leaf)
+        changing += range(count, count + size) if is_traced(leaf) else ()
+        count += size
+    if count > MOST_SCALARS:
+        return None
+    return _sloped(function, options, jax.tree.map(primal, parameters), constants, dtype, tuple(changing))
+
+
+def known_as(found: Sequence[Sloped]) -> Make:
+    """Gives one after the other as a function of what they are differentiated by."""
+    left = iter(found)
+
+    def make(_: Callable[..., Any], __: tuple[Any, ...], parameters: Any, ___: Any, dtype: Any) -> Any:
+        one = next(left)
+        scalars, _ = _scalars_of(parameters, dtype)
+        return _known(one.value, one.slopes, tuple(scalars[k] for k in one.changing)) if one.changing else one.value
+
+    return make
+
+
+@filter_jit
+@exact_products
+def _sloped(
+    function: Callable[..., Any],
+    options: tuple[Any, ...],
+    parameters: Any,
+    constants: Any,
+    dtype: Any,
+    changing: tuple[int, ...],
+) -> Sloped:
+    scalars, filled = _scalars_of(parameters, dtype)
+
+    def of_scalars(scalars: Scalars) -> Any:
+        return function(*options, filled(scalars), constants)
+
+    if not changing:
+        return Sloped(of_scalars(scalars), None, ())
+    return Sloped(*_slopes(of_scalars, scalars, changing, jnp.eye(len(changing), dtype=dtype)), changing)
+
+
+@jax.custom_jvp
+def _known(value: Any, slopes: Any, scalars: Scalars) -> Any:
+    return value
+
+
+@_known.defjvp
+@broadcasting
+def _known_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    value, slopes, _ = primals
+    return value, _combined(slopes, tangents[2])
 
 
 def _by_itself(function: Callable[[Array], Any], scalars: Scalars, given: Array) -> Any:
@@ -117,24 +200,35 @@ def _by_scalars(function: Callable[[Scalars, Any], Any], scalars: Scalars, const
         value = function(scalars, constants)
         return value, jax.tree.map(jnp.zeros_like, value)
 
+    def slopes(units: Array) -> tuple[Any, Any]:
+        return _slopes(lambda scalars: function(scalars, constants), scalars, changing, units)
+
+    value, found = _by_itself(slopes, scalars, jnp.eye(len(changing), dtype=scalars[0].dtype))
+    return value, _combined(found, [tangents[k] for k in changing])
+
+
+def _slopes(
+    function: Callable[[Scalars], Any], scalars: Scalars, changing: Sequence[int], units: Array
+) -> tuple[Any, Any]:
+    """The value, and its derivatives along units of some of the scalars, on a leading axis."""
+
     def along(unit: Array) -> tuple[Any, Any]:
         def changed(amount: Array) -> Any:
             given = list(scalars)
             for place, k in enumerate(changing):
                 given[k] = given[k] + amount[place]
-            return function(tuple(given), constants)
+            return function(tuple(given))
 
         return jax.jvp(changed, (jnp.zeros_like(unit),), (unit,))
 
-    value, slopes = _by_itself(
-        jax.vmap(along, out_axes=(None, 0)), scalars, jnp.eye(len(changing), dtype=scalars[0].dtype)
-    )
-    rates = [tangents[k] for k in changing]
+    return jax.vmap(along, out_axes=(None, 0))(units)
 
+
+def _combined(slopes: Any, rates: Sequence[Array]) -> Any:
     def combined(slopes: Array) -> Array:
         return sum((rate * slope for rate, slope in zip(rates[1:], slopes[1:], strict=True)), rates[0] * slopes[0])
 
-    return value, jax.tree.map(combined, slopes)
+    return jax.tree.map(combined, slopes)
 
 
 _of_scalars.defjvp(_jvp, symbolic_zeros=True)

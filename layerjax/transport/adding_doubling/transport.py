@@ -31,7 +31,7 @@ from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
-from layerjax.transport.adding_doubling.elements import compiled
+from layerjax.transport.adding_doubling.elements import Sloped, compiled, known_as, sloped
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
@@ -197,16 +197,20 @@ class AddingDoubling(DeterministicTransport):
 
     def prepare(self, stack: Stack) -> Solved:
         first = first_order(stack)
-        gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
-        if self.orders == "first" or not (stack.layers or gives_back):
+        if not self._is_solved(stack):
             return Solved(first, None)
         plan = self._plan(stack, None)
         carried, once = _as_carried(stack, plan)
-        return Solved(first, _solve(stack, first, once, plan), None, straight(carried), once)
+        return Solved(first, self._solve(stack, first, once, plan), None, straight(carried), once)
 
-    def when_traced(self, stack: Stack) -> "AddingDoubling":
+    def when_traced(self, stack: Stack, known: Known) -> "AddingDoubling":
+        found = followed(stack, known) if self.orders != "first" else None
+        whole, directions = (stack, None) if found is None else found
+        elements: list[Any] = [None]
+        if self._is_solved(stack) and can_be_split(stack):
+            elements = elements_of(whole, self._plan(whole, directions), directions, sloped)
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _Ranked(**options, ranks=ranks(stack))
+        return _Ranked(**options, ranks=ranks(stack), elements=None if None in elements else elements)
 
     def prepare_energies(self, stack: Stack) -> Solved:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
@@ -218,7 +222,7 @@ class AddingDoubling(DeterministicTransport):
             return self.prepare(stack)
         closed, directions = found
         plan = self._plan(closed, directions)
-        rest = _solve_between(closed, directions, plan)
+        rest = self._solve_between(closed, directions, plan)
         carried, once = _as_carried(closed, plan)
         return Solved(first_order(closed), None, rest, straight(carried), once)
 
@@ -310,6 +314,20 @@ class AddingDoubling(DeterministicTransport):
         near, far = (total([w, part], zero) for w, part in zip(whole, less, strict=True))
         return near, far
 
+    def _is_solved(self, stack: Stack) -> bool:
+        gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
+        return self.orders != "first" and (len(stack.layers) > 0 or gives_back)
+
+    def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
+        if not _is_split(stack, first, once):
+            return _solve_at_once(stack, first, once, plan)
+        return _tables(without_base(stack), elements_of(stack, plan, None, compiled), first, once, plan)
+
+    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+        if not _is_split(stack, known):
+            return _solve_between_at_once(stack, known, plan)
+        return _between(without_base(stack), elements_of(stack, plan, known, compiled), known, plan)
+
     def _at(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
@@ -370,12 +388,24 @@ class AddingDoubling(DeterministicTransport):
 
 
 class _Ranked(AddingDoubling):
-    """Where the order of indices is known, though they are traced; None: it is not."""
+    """Where the order of indices is known, though they are traced (None: it is not), and all elements, with their
+    derivatives (None: they are not)."""
 
     ranks: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    elements: list[Sloped] | None = None
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
         return dataclasses.replace(super()._plan(stack, known), ranks=self.ranks)
+
+    def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
+        if self.elements is None:
+            return super()._solve(stack, first, once, plan)
+        return _tables(stack, elements_of(stack, plan, None, known_as(self.elements)), first, once, plan)
+
+    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+        if self.elements is None:
+            return super()._solve_between(stack, known, plan)
+        return _between(stack, elements_of(stack, plan, known, known_as(self.elements)), known, plan)
 
 
 def _straight(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
@@ -400,18 +430,6 @@ def _as_carried(stack: Stack, plan: Plan) -> tuple[Stack, FirstOrder | None]:
     once = first_order(carried)
     media = once.upper.media if once.lower is None else once.upper.media + once.lower.media
     return carried, once if media else None
-
-
-def _solve(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
-    if not _is_split(stack, first, once):
-        return _solve_at_once(stack, first, once, plan)
-    return _tables(without_base(stack), elements_of(stack, plan, None, compiled), first, once, plan)
-
-
-def _solve_between(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
-    if not _is_split(stack, known):
-        return _solve_between_at_once(stack, known, plan)
-    return _between(without_base(stack), elements_of(stack, plan, known, compiled), known, plan)
 
 
 def _is_split(stack: Stack, *inputs: Any) -> bool:
