@@ -92,6 +92,7 @@ def carried(name, transport, call):
         ("haze", "statistical", "prepare"),
         ("haze", "statistical", "evaluate"),
         ("hazy coat", "adding", "prepare"),
+        ("hazy coat", "adding", "gradient"),
         ("dyed metal", "endf", "evaluate"),
         ("flakes", "spongecake", "evaluate"),
         ("flakes", "single", "albedo"),

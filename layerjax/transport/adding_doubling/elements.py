@@ -107,8 +107,18 @@ def sloped(
     return _sloped(function, options, jax.tree.map(primal, parameters), constants, dtype, tuple(changing))
 
 
+def recorded(make: Make, found: list[Any]) -> Make:
+    """The same, which appends to the list what it gives, in the order of its calls."""
+
+    def recording(*given: Any) -> Any:
+        found.append(make(*given))
+        return found[-1]
+
+    return recording
+
+
 def known_as(found: Sequence[Sloped]) -> Make:
-    """Gives one after the other as a function of what they are differentiated by."""
+    """Gives one after the other, in the order in which they were `recorded`, as a function of its scalars."""
     left = iter(found)
 
     def make(_: Callable[..., Any], __: tuple[Any, ...], parameters: Any, ___: Any, dtype: Any) -> Any:

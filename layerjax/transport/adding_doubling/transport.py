@@ -31,7 +31,7 @@ from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
-from layerjax.transport.adding_doubling.elements import Sloped, compiled, known_as, sloped
+from layerjax.transport.adding_doubling.elements import Sloped, compiled, known_as, recorded, sloped
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
@@ -206,11 +206,11 @@ class AddingDoubling(DeterministicTransport):
     def when_traced(self, stack: Stack, known: Known) -> "AddingDoubling":
         found = followed(stack, known) if self.orders != "first" else None
         whole, directions = (stack, None) if found is None else found
-        elements: list[Any] = [None]
+        elements: list[Any] = []
         if self._is_solved(stack) and can_be_split(stack):
-            elements = elements_of(whole, self._plan(whole, directions), directions, sloped)
+            elements_of(whole, self._plan(whole, directions), directions, recorded(sloped, elements))
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _Ranked(**options, ranks=ranks(stack), elements=None if None in elements else elements)
+        return _Ranked(**options, ranks=ranks(stack), elements=elements if elements and None not in elements else None)
 
     def prepare_energies(self, stack: Stack) -> Solved:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
