@@ -89,7 +89,7 @@ class Prediction:
         seed: seed of the draws that `bsdf` and `predictive` summarise.
         pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
             `fits.evidence`); NaN for draws of a chain.
-        effective_draws: how many independent draws of the posterior the D are worth.
+        effective_draws: effective sample size of the D draws of the posterior.
         measurements: the measurements that were predicted; None for a `Geometry`.
     """
 
@@ -376,10 +376,10 @@ def _require_visible(fit: Fit, at: Geometry) -> None:
 def _posterior_draws(
     fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Density | None" = None
 ) -> tuple[Floats, float, float]:
-    """Draws (D, P) of the posterior, the Pareto k of their weights, and how many independent ones they are worth."""
+    """Draws (D, P) of the posterior, the Pareto k of their weights, and their effective sample size."""
     if isinstance(fitted, Posterior):
         vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
-        return vectors, math.nan, _worth(draws, float(np.min(fitted.effective_samples)))
+        return vectors, math.nan, _resampled_size(draws, float(np.min(fitted.effective_samples)))
     random, pareto_k, effective = np.random.RandomState(generator.integers(2**31)), math.nan, float(draws)
     if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
         positions = normal_draws(fitted, draws, random)
@@ -388,13 +388,13 @@ def _posterior_draws(
             fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
         )
         positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
-        effective = _worth(draws, weighted.effective_sample_size)
+        effective = _resampled_size(draws, weighted.effective_sample_size)
     return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k, effective
 
 
-def _worth(draws: int, of: float) -> float:
-    """How many independent draws those are worth that are taken of so many."""
-    return 1.0 / (1.0 / draws + 1.0 / max(of, 1.0))
+def _resampled_size(draws: int, pool: float) -> float:
+    """Effective sample size of so many draws that are taken of a pool of this one."""
+    return 1.0 / (1.0 / draws + 1.0 / max(pool, 1.0))
 
 
 def _mixture(
