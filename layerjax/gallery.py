@@ -95,7 +95,17 @@ _MATERIALS = {
             "pale wood, fibers that dip into the surface",
             lambda: _wood([0.85, 0.7, 0.5], (1.0, 0.0, 0.2)),
         ),
-        Material("rough_copper", "Wang et al. 2022, Fig. 20", "deep flakes of alpha 0.5; the paper states no parameters", _copper),
-        Material("sheen", "Wang et al. 2022, Fig. 16", "upright fibers over a diffuse base; the paper states no parameters", _sheen),
+        Material(
+            "rough_copper",
+            "Wang et al. 2022, Fig. 20",
+            "deep flakes of alpha 0.5; the paper states no parameters",
+            _copper,
+        ),
+        Material(
+            "sheen",
+            "Wang et al. 2022, Fig. 16",
+            "upright fibers over a diffuse base; the paper states no parameters",
+            _sheen,
+        ),
     )
 }

@@ -34,9 +34,9 @@ layerjax render padauk --out padauk.png
 layerjax export padauk --to rgl --out padauk.bsdf
 ```
 
-Each picture shows spheres lit from the front, from the side and, if the material transmits light, from behind; the lobes
-in the plane of incidence; and the BSDF in that plane as a function of the angles of light and viewer. All orders of
-scattering are included. `python -m tools.gallery --pictures` generates this page and its pictures.
+Each picture shows spheres lit from the front, from the side and, if the material transmits light, from behind; the
+lobes in the plane of incidence; and the BSDF in that plane as a function of the angles of light and viewer. All
+orders of scattering are included. `python -m tools.gallery --pictures` generates this page and its pictures.
 """
 
 

@@ -143,7 +143,9 @@ WORDS = {
         "the same where `evaluate` knows the directions beforehand, as in a fit: under an interface light is traced "
         "along them and not interpolated in a table"
     ),
-    "adding-doubling, automatic resolution": "the same at the resolution that is chosen for each stack by default, for errors of about 1e-3",
+    "adding-doubling, automatic resolution": (
+        "the same at the resolution that is chosen for each stack by default, for errors of about 1e-3"
+    ),
     "random walk": "everything, with standard errors; to check the others",
 }
 
