@@ -46,7 +46,7 @@ def by_parameters(function: Callable[[Any], Array], tree: Any, plain: Any) -> Ar
     function: of a module, as it is part of the program's key. plain: a tree like it, for derivatives of derivatives.
     """
     parameters, rest = eqx.partition(tree, lambda leaf: isinstance(leaf, Tracer))
-    # before the rule is asked for, in which JAX takes all numbers for traced
+    # not within the rule, where JAX takes all numbers for traced
     found, slopes = _with_jacobian(function, jax.tree.map(primal, parameters), rest)
 
     @jax.custom_jvp
@@ -56,20 +56,20 @@ def by_parameters(function: Callable[[Any], Array], tree: Any, plain: Any) -> Ar
     @values.defjvp
     def rule(primals: tuple[list[Array]], tangents: tuple[list[Array]]) -> tuple[Array, Array]:
         if is_traced(primals):
-            return jax.jvp(lambda given: function(_filled(plain, given)), primals, tangents)
-        return found, _change(jax.tree.leaves(slopes), *tangents)
+            return jax.jvp(lambda numbers: function(_fill(plain, numbers)), primals, tangents)
+        return found, _directional_derivative(jax.tree.leaves(slopes), *tangents)
 
     return values(jax.tree.leaves(parameters))
 
 
-def _filled(tree: Any, given: list[Array]) -> Any:
+def _fill(tree: Any, numbers: list[Array]) -> Any:
     """The tree with these in the place of what is traced in it."""
-    left = iter(given)
+    left = iter(numbers)
     return jax.tree.map(lambda leaf: next(left) if isinstance(leaf, Tracer) else leaf, tree)
 
 
 def primal(leaf: Any) -> Any:
-    """Of what `grad` or its like differentiates by, the number; of a number, itself."""
+    """The number itself, where `grad` or its like differentiates by it."""
     return getattr(leaf, "primal", leaf) if isinstance(leaf, Tracer) else leaf
 
 
@@ -84,8 +84,8 @@ def _with_jacobian(function: Callable[[Any], Array], parameters: Any, rest: Any)
 
 
 @jax.jit
-def _change(slopes: list[Array], rates: list[Array]) -> Array:
-    """Of the values, along tangents of the parameters."""
+def _directional_derivative(slopes: list[Array], rates: list[Array]) -> Array:
+    """The derivative of the values along tangents of the parameters."""
     return sum(
         (jnp.tensordot(slope, rate.astype(slope.dtype), rate.ndim) for slope, rate in zip(slopes, rates, strict=True)),
         jnp.zeros((), slopes[0].dtype),

@@ -109,12 +109,12 @@ def evaluate_known(
         if few_parameters(stack, values):
             require_numbers(stack)
             chosen, simplified = chosen_for(stack, transport, looked)
-            traced = chosen.when_traced(simplified, looked)
+            traced = chosen.for_tracing(simplified, looked)
             if traced is not None:
                 chosen.needed(key, "evaluate")
                 directions = looked() if chosen.uses_known else None
                 more = (directions, wi, wo, side, channel_count(stack))
-                return by_parameters(_solved, (simplified, traced, *more), (simplified, chosen, *more))
+                return by_parameters(_evaluate_whole, (simplified, traced, *more), (simplified, chosen, *more))
     prepared = prepared_at(stack, transport, wi.dtype, looked)
     return _evaluate(prepared, wi, wo, side, prepared.transport.needed(key, "evaluate"))[0]
 
@@ -243,8 +243,8 @@ def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
     return _unscattered(slim, wi, channels)
 
 
-def _solved(given: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:
-    stack, transport, known, wi, wo, side, channels = given
+def _evaluate_whole(inputs: tuple[Stack, Transport, KnownDirections | None, Array, Array, Side, int]) -> Array:
+    stack, transport, known, wi, wo, side, channels = inputs
     prepared = Prepared(transport.prepare_for(stack, lambda: known), transport, channels)
     return _evaluate(in_precision(prepared, wi.dtype), wi, wo, side, None)[0]
 

@@ -76,7 +76,7 @@ class Transport(eqx.Module):
         """`prepare` for values at known directions alone, for transports to which these are of use."""
         return self.prepare(stack)
 
-    def when_traced(self, stack: Stack, known: Known) -> "Transport | None":
+    def for_tracing(self, stack: Stack, known: Known) -> "Transport | None":
         """What gives, within a program where all numbers of the simplified stack are traced, just what this one gives
         outside, and can be differentiated forward; None: nothing does. Directions are known, and the stack is but for
         what `grad` or its like differentiates by."""

@@ -1,4 +1,4 @@
-"""Differentiation by elements: what a layer is made of is differentiated by the layer's own few numbers.
+"""Differentiation by elements: what a layer is build_element of is differentiated by the layer's own few numbers.
 
 An element (the operators of an interface, the kernel of a medium) is dear to compute and depends on a handful of
 scalars, while the assembly of elements to a stack is cheap and linear in each. Derivatives of an element by each of
@@ -67,35 +67,39 @@ def _scalars_of(parameters: Any, dtype: Any) -> tuple[Scalars, Callable[[Scalars
 
 
 Make = Callable[..., Any]
-"""Gives the element of a function of options, parameters and constants: `made` or `compiled`."""
+"""Gives the element of a function of options, parameters and constants: `build_element` or `compile_element`."""
 
 
-def made(function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any) -> Any:
+def build_element(
+    function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any
+) -> Any:
     """The `element` of function(*options, parameters, constants)."""
     return element(partial(function, *options), parameters, constants, dtype)
 
 
-compiled = filter_jit(exact_products(made))
-"""`made` by a program of its own, outside of ``jit``: other stacks that hold such a layer find it compiled."""
+compile_element = filter_jit(exact_products(build_element))
+"""The same by a program of its own, outside of ``jit``: another stack that holds such a layer finds it compiled."""
 
 
 def _is_number(leaf: Any) -> bool:
     return isinstance(leaf, Array | np.ndarray | float | int) and not isinstance(leaf, bool)
 
 
-class Sloped(eqx.Module):
-    """An element that is known, and its derivatives by some of its scalars, along a leading axis."""
+class LinearElement(eqx.Module):
+    """The value of an element, and its derivatives by some of its scalars, along a leading axis."""
 
     value: Any
     slopes: Any
     changing: tuple[int, ...] = eqx.field(static=True)
 
 
-def sloped(
+def linearize_element(
     function: Callable[..., Any], options: tuple[Any, ...], parameters: Any, constants: Any, dtype: Any
-) -> Sloped | None:
-    """`made` by a program of its own where `grad` or its like differentiates by numbers that are known, with its
-    derivatives by these; None: there are too many scalars."""
+) -> LinearElement | None:
+    """`compile_element` where `grad` or its like differentiates by known numbers, with the derivatives by these.
+
+    None: there are too many scalars.
+    """
     changing: list[int] = []
     count = 0
     for leaf in filter(_is_number, jax.tree.leaves(parameters)):
@@ -104,59 +108,59 @@ def sloped(
         count += size
     if count > MOST_SCALARS:
         return None
-    return _sloped(function, options, jax.tree.map(primal, parameters), constants, dtype, tuple(changing))
+    return _linearize(function, options, jax.tree.map(primal, parameters), constants, dtype, tuple(changing))
 
 
-def recorded(make: Make, found: list[Any]) -> Make:
-    """The same, which appends to the list what it gives, in the order of its calls."""
+def record(make: Make, elements: list[Any]) -> Make:
+    """A `Make` that appends each element to the list."""
 
-    def recording(*given: Any) -> Any:
-        found.append(make(*given))
-        return found[-1]
+    def recording(*numbers: Any) -> Any:
+        elements.append(make(*numbers))
+        return elements[-1]
 
     return recording
 
 
-def known_as(found: Sequence[Sloped]) -> Make:
-    """Gives one after the other, in the order in which they were `recorded`, as a function of its scalars."""
-    left = iter(found)
+def replay(elements: Sequence[LinearElement]) -> Make:
+    """A `Make` that returns the elements which another one has recorded, as functions of their scalars."""
+    left = iter(elements)
 
     def make(_: Callable[..., Any], __: tuple[Any, ...], parameters: Any, ___: Any, dtype: Any) -> Any:
         one = next(left)
         scalars, _ = _scalars_of(parameters, dtype)
-        return _known(one.value, one.slopes, tuple(scalars[k] for k in one.changing)) if one.changing else one.value
+        return _linear(one.value, one.slopes, tuple(scalars[k] for k in one.changing)) if one.changing else one.value
 
     return make
 
 
 @filter_jit
 @exact_products
-def _sloped(
+def _linearize(
     function: Callable[..., Any],
     options: tuple[Any, ...],
     parameters: Any,
     constants: Any,
     dtype: Any,
     changing: tuple[int, ...],
-) -> Sloped:
+) -> LinearElement:
     scalars, filled = _scalars_of(parameters, dtype)
 
     def of_scalars(scalars: Scalars) -> Any:
         return function(*options, filled(scalars), constants)
 
     if not changing:
-        return Sloped(of_scalars(scalars), None, ())
-    return Sloped(*_slopes(of_scalars, scalars, changing, jnp.eye(len(changing), dtype=dtype)), changing)
+        return LinearElement(of_scalars(scalars), None, ())
+    return LinearElement(*_slopes(of_scalars, scalars, changing, jnp.eye(len(changing), dtype=dtype)), changing)
 
 
 @jax.custom_jvp
-def _known(value: Any, slopes: Any, scalars: Scalars) -> Any:
+def _linear(value: Any, slopes: Any, scalars: Scalars) -> Any:
     return value
 
 
-@_known.defjvp
+@_linear.defjvp
 @broadcasting
-def _known_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _linear_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     value, slopes, _ = primals
     return value, _combined(slopes, tangents[2])
 
@@ -235,6 +239,8 @@ def _slopes(
 
 
 def _combined(slopes: Any, rates: Sequence[Array]) -> Any:
+    """The derivative along these rates of the scalars."""
+
     def combined(slopes: Array) -> Array:
         return sum((rate * slope for rate, slope in zip(rates[1:], slopes[1:], strict=True)), rates[0] * slopes[0])
 

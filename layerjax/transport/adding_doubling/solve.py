@@ -21,7 +21,7 @@ from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
 from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.bases import base_layer
-from layerjax.transport.adding_doubling.elements import Make, Scalars, element, made
+from layerjax.transport.adding_doubling.elements import Make, Scalars, build_element, element
 from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
@@ -64,10 +64,10 @@ def solve(
     asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
     light passes it, ends) with an interface.
     """
-    return assembled(stack, plan, elements_of(stack, plan, asked))
+    return assemble(stack, plan, make_elements(stack, plan, asked))
 
 
-def elements_of(stack: Stack, plan: Plan, asked: KnownDirections | None, make: Make = made) -> list[Any]:
+def make_elements(stack: Stack, plan: Plan, asked: KnownDirections | None, make: Make = build_element) -> list[Any]:
     """An element for every layer, and for a base: the `Layer` of what is a surface, the `Kernel` of a medium."""
     dtype, indices = _dtype(stack), _indices(stack)
     faces = iter(_interfaces(stack, plan, indices, asked, make))
@@ -86,10 +86,10 @@ def elements_of(stack: Stack, plan: Plan, asked: KnownDirections | None, make: M
     return found
 
 
-def assembled(
+def assemble(
     stack: Stack, plan: Plan, elements: list[Any]
 ) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
-    """See `solve`; elements: see `elements_of`. Of a base it only matters whether there is one."""
+    """See `solve`; elements: see `make_elements`. Of a base it only matters whether there is one."""
     grid = make_grid(_indices(stack), plan.ranks, plan.nodes, _dtype(stack))
     solved: list[tuple[Layer, bool]] = []
     for layer, found in zip((*stack.layers, stack.base), elements, strict=False):

@@ -31,7 +31,13 @@ from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.asked import Between, between, read_between
-from layerjax.transport.adding_doubling.elements import Sloped, compiled, known_as, recorded, sloped
+from layerjax.transport.adding_doubling.elements import (
+    LinearElement,
+    compile_element,
+    linearize_element,
+    record,
+    replay,
+)
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
@@ -46,10 +52,10 @@ from layerjax.transport.adding_doubling.resolution import (
 )
 from layerjax.transport.adding_doubling.solve import (
     Plan,
-    assembled,
+    assemble,
     can_be_split,
-    elements_of,
     followed,
+    make_elements,
     make_plan,
     ranks,
     without_base,
@@ -203,14 +209,14 @@ class AddingDoubling(DeterministicTransport):
         carried, once = _as_carried(stack, plan)
         return Solved(first, self._solve(stack, first, once, plan), None, straight(carried), once)
 
-    def when_traced(self, stack: Stack, known: Known) -> "AddingDoubling":
+    def for_tracing(self, stack: Stack, known: Known) -> "AddingDoubling":
         found = followed(stack, known) if self.orders != "first" else None
         whole, directions = (stack, None) if found is None else found
         elements: list[Any] = []
         if self._is_solved(stack) and can_be_split(stack):
-            elements_of(whole, self._plan(whole, directions), directions, recorded(sloped, elements))
+            make_elements(whole, self._plan(whole, directions), directions, record(linearize_element, elements))
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return _Ranked(**options, ranks=ranks(stack), elements=elements if elements and None not in elements else None)
+        return _Planned(**options, ranks=ranks(stack), elements=elements if elements and None not in elements else None)
 
     def prepare_energies(self, stack: Stack) -> Solved:
         """Energies are means over azimuth: of Fourier modes the first is all they need."""
@@ -321,12 +327,12 @@ class AddingDoubling(DeterministicTransport):
     def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
         if not _is_split(stack, first, once):
             return _solve_at_once(stack, first, once, plan)
-        return _tables(without_base(stack), elements_of(stack, plan, None, compiled), first, once, plan)
+        return _tables(without_base(stack), make_elements(stack, plan, None, compile_element), first, once, plan)
 
     def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
         if not _is_split(stack, known):
             return _solve_between_at_once(stack, known, plan)
-        return _between(without_base(stack), elements_of(stack, plan, known, compiled), known, plan)
+        return _between(without_base(stack), make_elements(stack, plan, known, compile_element), known, plan)
 
     def _at(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
@@ -387,12 +393,12 @@ class AddingDoubling(DeterministicTransport):
         )
 
 
-class _Ranked(AddingDoubling):
+class _Planned(AddingDoubling):
     """Where the order of indices is known, though they are traced (None: it is not), and all elements, with their
     derivatives (None: they are not)."""
 
     ranks: tuple[int, ...] | None = eqx.field(static=True, default=None)
-    elements: list[Sloped] | None = None
+    elements: list[LinearElement] | None = None
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
         return dataclasses.replace(super()._plan(stack, known), ranks=self.ranks)
@@ -400,12 +406,12 @@ class _Ranked(AddingDoubling):
     def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
         if self.elements is None:
             return super()._solve(stack, first, once, plan)
-        return _tables(stack, elements_of(stack, plan, None, known_as(self.elements)), first, once, plan)
+        return _tables(stack, make_elements(stack, plan, None, replay(self.elements)), first, once, plan)
 
     def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
         if self.elements is None:
             return super()._solve_between(stack, known, plan)
-        return _between(stack, elements_of(stack, plan, known, known_as(self.elements)), known, plan)
+        return _between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
 def _straight(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
@@ -440,19 +446,19 @@ def _is_split(stack: Stack, *inputs: Any) -> bool:
 @filter_jit
 @exact_products
 def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
-    return _tables(stack, elements_of(stack, plan, None), first, once, plan)
+    return _tables(stack, make_elements(stack, plan, None), first, once, plan)
 
 
 @filter_jit
 @exact_products
 def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
-    return _between(stack, elements_of(stack, plan, known), known, plan)
+    return _between(stack, make_elements(stack, plan, known), known, plan)
 
 
 @filter_jit
 @exact_products
 def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
-    grid, whole, rest, faces = assembled(stack, plan, elements)
+    grid, whole, rest, faces = assemble(stack, plan, elements)
     met = partial(interaction_probability, first)
     onward = None if once is None else partial(onward_probability, first, once)
     outer = faces if first.layered else None
@@ -462,7 +468,7 @@ def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrd
 @filter_jit
 @exact_products
 def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
-    grid, _, rest, _ = assembled(stack, plan, elements)
+    grid, _, rest, _ = assemble(stack, plan, elements)
     return between(rest, known, grid.regions[-1].ior, stack.base is not None)
 
 
