@@ -62,7 +62,9 @@ def ruled(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "slab" else ()) for name in STACKS]
+)
 def test_gradients_are_those_within_jit(name, ruled):
     function = total(name)
     value, gradient = jax.value_and_grad(function)(AT)
