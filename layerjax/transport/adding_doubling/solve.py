@@ -69,7 +69,8 @@ def solve(
 
 def make_elements(stack: Stack, plan: Plan, asked: KnownDirections | None, make: Make = build_element) -> list[Any]:
     """An element for every layer, and for a base: the `Layer` of what is a surface, the `Kernel` of a medium."""
-    dtype, indices = _dtype(stack), _indices(stack)
+    dtype = _dtype(stack)
+    indices = _indices(stack, dtype)
     faces = iter(_interfaces(stack, plan, indices, asked, make))
     found: list[Any] = []
     region = 0
@@ -90,7 +91,8 @@ def assemble(
     stack: Stack, plan: Plan, elements: list[Any]
 ) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
     """See `solve`; elements: see `make_elements`. Of a base it only matters whether there is one."""
-    grid = make_grid(_indices(stack), plan.ranks, plan.nodes, _dtype(stack))
+    dtype = _dtype(stack)
+    grid = make_grid(_indices(stack, dtype), plan.ranks, plan.nodes, dtype)
     solved: list[tuple[Layer, bool]] = []
     for layer, found in zip((*stack.layers, stack.base), elements, strict=False):
         if isinstance(layer, Medium):
@@ -111,15 +113,27 @@ def can_be_split(stack: Stack) -> bool:
     return sum(isinstance(layer, Interface) for layer in stack.layers) < MANY
 
 
-def without_base(stack: Stack) -> Stack:
-    """The stack with nothing more of its base than that there is one."""
-    return stack if stack.base is None else Stack(stack.layers, Lambertian(jnp.zeros((), _dtype(stack))))
+class Layers(eqx.Module):
+    """All that `assemble` needs of a stack: the layers, and whether there is a base."""
+
+    layers: tuple[Interface | Medium, ...]
+    opaque: bool = eqx.field(static=True)
+    dtype: Any = eqx.field(static=True)
+
+    def stack(self) -> Stack:
+        """A stack of these layers, over a base that stands for any."""
+        return Stack(self.layers, Lambertian(jnp.zeros((), self.dtype)) if self.opaque else None)
 
 
-def _indices(stack: Stack) -> Scalars:
+def without_base(stack: Stack) -> Layers:
+    """The stack without its base, so that programs do not depend on it."""
+    return Layers(stack.layers, stack.base is not None, _dtype(stack))
+
+
+def _indices(stack: Stack, dtype: Any) -> Scalars:
     """Refractive indices of all regions."""
     faces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    return tuple(jnp.asarray(n, _dtype(stack)) for n in (1.0, *(layer.ior for layer in faces)))
+    return tuple(jnp.asarray(n, dtype) for n in (1.0, *(layer.ior for layer in faces)))
 
 
 def _dtype(stack: Stack) -> Any:

@@ -51,6 +51,7 @@ from layerjax.transport.adding_doubling.resolution import (
     shortage,
 )
 from layerjax.transport.adding_doubling.solve import (
+    Layers,
     Plan,
     assemble,
     can_be_split,
@@ -327,12 +328,14 @@ class AddingDoubling(DeterministicTransport):
     def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
         if not _is_split(stack, first, once):
             return _solve_at_once(stack, first, once, plan)
-        return _tables(without_base(stack), make_elements(stack, plan, None, compile_element), first, once, plan)
+        elements = make_elements(stack, plan, None, compile_element)
+        return _tables_of_elements(without_base(stack), elements, first, once, plan)
 
     def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
         if not _is_split(stack, known):
             return _solve_between_at_once(stack, known, plan)
-        return _between(without_base(stack), make_elements(stack, plan, known, compile_element), known, plan)
+        elements = make_elements(stack, plan, known, compile_element)
+        return _between_of_elements(without_base(stack), elements, known, plan)
 
     def _at(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
@@ -457,6 +460,18 @@ def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> 
 
 @filter_jit
 @exact_products
+def _tables_of_elements(
+    layers: Layers, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan
+) -> Tables:
+    return _tables(layers.stack(), elements, first, once, plan)
+
+
+@filter_jit
+@exact_products
+def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
+    return _between(layers.stack(), elements, known, plan)
+
+
 def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
     grid, whole, rest, faces = assemble(stack, plan, elements)
     met = partial(interaction_probability, first)
@@ -465,8 +480,6 @@ def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrd
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-@filter_jit
-@exact_products
 def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
     grid, _, rest, _ = assemble(stack, plan, elements)
     return between(rest, known, grid.regions[-1].ior, stack.base is not None)
