@@ -31,7 +31,7 @@ def few_parameters(tree: Any, values: int) -> bool:
     if not leaves or not is_outermost() or not all(map(_is_known, leaves)):
         return False
     count = sum(leaf.size for leaf in leaves)
-    return count <= MOST_PARAMETERS and values * count <= MOST_SLOPES
+    return count <= MOST_PARAMETERS and 0 < values * count <= MOST_SLOPES
 
 
 def _is_known(leaf: Any) -> bool:
