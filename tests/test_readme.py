@@ -15,11 +15,17 @@ LATER = {"which_stack", "renderers"}
 """Pages whose code begins with results of the commands above it, or needs an extra."""
 
 
+LONG = {"evaluating-0", "own_data-0"}
+"""Blocks that compile for half a minute: derivatives of media with an axis over a metal, and a fit of 16 starts."""
+
+
 def blocks(language, pages=PAGES):
     """What stands in fences of that language, with the name of the page and which of its blocks it is."""
     found = [(page.stem, re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)) for page in pages]
     return [
-        pytest.param(textwrap.dedent(block), id=f"{name}-{index}")
+        pytest.param(
+            textwrap.dedent(block), id=f"{name}-{index}", marks=[pytest.mark.slow] * (f"{name}-{index}" in LONG)
+        )
         for name, texts in found
         if name not in LATER
         for index, block in enumerate(texts)

@@ -37,10 +37,15 @@ def projected_solid_angles() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def sheet(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], np.ndarray]:
+def sheet_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("klems") / "sheet.xml"
     fits.export(SHEET, path, "klems", transport=TRANSPORT)
-    return matrices(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sheet(sheet_file: Path) -> dict[tuple[str, str], np.ndarray]:
+    return matrices(sheet_file)
 
 
 def test_columns_hold_what_the_stack_sends(sheet: dict[tuple[str, str], np.ndarray]) -> None:
@@ -118,10 +123,9 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(data.values[seen], true, rtol=0.03)
 
 
-def test_axes_are_not_turned(tmp_path: Path) -> None:
+def test_axes_are_not_turned(sheet_file: Path) -> None:
     """Fibers that lean: of every other orientation the readings would be another material's."""
-    fits.export(SHEET, tmp_path / "sheet.xml", "klems", transport=TRANSPORT)
-    data = fits.read(tmp_path / "sheet.xml").used()
+    data = fits.read(sheet_file).used()
     steep = (abs(data.wi[:, 2]) > 0.5) & (abs(data.wo[:, 2]) > 0.5)
 
     def apart(mirror: tuple[float, float, float]) -> float:

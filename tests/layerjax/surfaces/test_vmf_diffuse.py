@@ -166,8 +166,7 @@ def value(parameters, wi, wo, form="paper"):
     ("dtype", "mode"),
     [
         (np.float32, "reverse"),
-        (np.float64, "reverse"),
-        pytest.param(np.float32, "forward", marks=pytest.mark.slow),
+        *(pytest.param(*how, marks=pytest.mark.slow) for how in ((np.float64, "reverse"), (np.float32, "forward"))),
     ],
 )
 def test_values_and_gradients_are_finite(dtype, mode):

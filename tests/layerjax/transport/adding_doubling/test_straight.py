@@ -62,7 +62,8 @@ def test_is_the_same_beside_tables(above):
 
 
 def test_pairs_on_one_side_are_zero_and_change_no_others():
-    """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros."""
+    """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros.
+    Derivatives are those of differences."""
     wi, wo = jnp.tile(WI, (40, 1)), jnp.tile(WO, (40, 1))  # more than one chunk of pairs
     same_side = jnp.arange(len(wi)) < len(wi) // 2
     mixed = jnp.where(same_side[:, None], wi, wo)
@@ -71,6 +72,9 @@ def test_pairs_on_one_side_are_zero_and_change_no_others():
         return evaluate_straight(straight(slab(1.5, alpha, 1.2, 0.1)), split(wi), split(wo))[0]
 
     compiled = jax.jit(lambda alpha, wo: (values(alpha, wo), jax.jacfwd(values)(alpha, wo)))
+    ahead, behind = (compiled(0.05 + step, wo)[0] for step in (1e-6, -1e-6))
+    difference = (ahead - behind) / 2e-6
+    np.testing.assert_allclose(compiled(0.05, wo)[1], difference, rtol=1e-5, atol=1e-6 * np.abs(difference).max())
     for crossing, some, none in zip(compiled(0.05, wo), compiled(0.05, mixed), compiled(0.05, wi), strict=True):
         np.testing.assert_allclose(some, jnp.where(same_side, 0.0, crossing), rtol=1e-12)
         np.testing.assert_array_equal(none, 0.0)

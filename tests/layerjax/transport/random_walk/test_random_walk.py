@@ -227,8 +227,9 @@ def test_keys():
     assert lj.evaluate(lj.prepare(stack, walk), WI, ABOVE, key=jax.random.key(1)) == first
     assert lj.evaluate(stack, WI, ABOVE, walk, key=jax.random.key(2)) != first
     assert (lj.evaluate(stack, jnp.stack([WI] * 2), ABOVE, walk, key=KEY)[0] != first).all()
+    plain = lj.SingleScattering()
     np.testing.assert_array_equal(
-        lj.evaluate(lj.Stack(tilt3()), WI, ABOVE, key=KEY), lj.evaluate(lj.Stack(tilt3()), WI, ABOVE)
+        lj.evaluate(stack := lj.Stack(COLORED), WI, ABOVE, plain, key=KEY), lj.evaluate(stack, WI, ABOVE, plain)
     )
 
 

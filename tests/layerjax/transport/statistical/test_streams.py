@@ -66,7 +66,7 @@ def test_a_map_is_its_stacks() -> None:
     alphas = np.asarray([[0.1, 0.2], [0.3, 0.02]])
 
     def stack(alpha, depth):
-        return lj.Stack([lj.Interface(1.5, alpha), lj.Medium(depth, 0.8, lj.HenyeyGreenstein(0.5)), INNER], BASE)
+        return lj.Stack([lj.Interface(1.5, alpha), lj.Medium(depth, 0.8, lj.HenyeyGreenstein(0.5))], BASE)
 
     wi, wo = lj.direction(0.5, 0.0), lj.direction(0.9, 2.0)
     together = lj.evaluate(stack(alphas, depths), wi, wo, lj.Statistical())
@@ -80,7 +80,14 @@ def test_a_map_is_its_stacks() -> None:
 MILK = lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8))
 
 
-@pytest.mark.parametrize("layers", [[COAT, INNER], [COAT, MILK, INNER], [MILK], [MILK, COAT, MILK]])
+@pytest.mark.parametrize(
+    "layers",
+    [
+        [COAT, MILK, INNER],
+        [MILK],
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ([COAT, INNER], [MILK, COAT, MILK])),
+    ],
+)
 def test_nothing_is_lost(layers) -> None:
     """What diffuse light from the base does not return to it leaves: energy over a base that absorbs nothing is 1."""
     stack = simplify(lj.Stack(layers, lj.Lambertian(1.0)))
@@ -88,7 +95,7 @@ def test_nothing_is_lost(layers) -> None:
     np.testing.assert_allclose(energy, 1.0, atol=1e-13)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
     """Finite at the ends, along grazing light too, and as differences say, which at ends look inward."""
 
@@ -109,7 +116,7 @@ def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
         values = jax.jit(jax.vmap(value))
         ahead = [values(at[:, 0] + k * step, *at[:, 1:].T) for k in (0, 1, 2)]
         slope = (-3.0 * ahead[0] + 4.0 * ahead[1] - ahead[2]) / (2.0 * step)
-        np.testing.assert_allclose(jax.vmap(jax.grad(value))(*at.T), slope, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(value)))(*at.T), slope, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])
@@ -149,19 +156,20 @@ def test_slabs_at_ends(dtype) -> None:
 
 
 def test_derivatives_of_slabs_at_ends() -> None:
+    @jax.jit
     def energy(thickness, albedo, g):
         reflected, passed = stream_layers.slab(thickness[None], albedo[None], g[None])
         return jnp.stack([streams.DIFFUSE @ part[0] @ streams.DIFFUSE for part in (reflected, passed)])
 
+    ahead, back = (jax.jit(mode(energy, argnums=(0, 1, 2))) for mode in (jax.jacfwd, jax.jacrev))
     for place in ((0.0, 0.5, 0.3), (1.0, 0.0, 0.0), (1e4, 1.0, 0.999), (2.0, 1.0, -0.999)):
-        place = tuple(map(jnp.asarray, place))
-        for mode in (jax.jacfwd, jax.jacrev):
-            assert np.all(np.isfinite(np.stack(mode(energy, argnums=(0, 1, 2))(*place))))
+        for derivatives in (ahead, back):
+            assert np.all(np.isfinite(np.stack(derivatives(*map(jnp.asarray, place)))))
     step, at = 1e-5, [jnp.asarray(x) for x in (0.8, 0.6, 0.4)]
-    slopes = jax.jacfwd(energy, argnums=(0, 1, 2))(*at)
+    slopes = ahead(*at)
     for k, slope in enumerate(slopes):
-        ahead, behind = ([x + s * step * (j == k) for j, x in enumerate(at)] for s in (1.0, -1.0))
-        np.testing.assert_allclose(slope, (energy(*ahead) - energy(*behind)) / (2.0 * step), rtol=1e-6, atol=1e-9)
+        above, below = ([x + s * step * (j == k) for j, x in enumerate(at)] for s in (1.0, -1.0))
+        np.testing.assert_allclose(slope, (energy(*above) - energy(*below)) / (2.0 * step), rtol=1e-6, atol=1e-9)
 
 
 def test_packing_keeps_the_matrices() -> None:
