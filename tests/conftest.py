@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads of two workers wai
 
 import jax  # noqa: E402 (the flags must be set before)
 
-pytest_plugins = ["tests.helpers.compilations", "tests.helpers.memory"]
+pytest_plugins = ["tests.helpers.budget", "tests.helpers.compilations", "tests.helpers.memory"]
 
 jax.config.update("jax_enable_x64", True)
 if not jax.config.jax_compilation_cache_dir:  # JAX_COMPILATION_CACHE_DIR names another

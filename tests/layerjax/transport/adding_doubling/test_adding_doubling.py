@@ -191,6 +191,7 @@ def test_only_stacks_with_an_axis_pay_for_ordinates():
     assert lj.prepare(upright, transport).state.tables.azimuths is None
 
 
+@pytest.mark.slow  # `test_numerical_error` asks more, of a varnish
 def test_the_error_estimate_covers_the_error():
     stack = STACKS["haze"]
     wi, wo = directions(60, seed=8), directions(60, seed=9)
@@ -199,9 +200,15 @@ def test_the_error_estimate_covers_the_error():
     assert np.sqrt(np.mean((values - truth) ** 2)) <= np.sqrt(np.mean(errors**2))
 
 
-@pytest.mark.parametrize("tolerance", [0.02, pytest.param(1e-3, marks=pytest.mark.slow)])
-def test_tolerance_picks_the_resolution(tolerance):
-    stack = STACKS["haze"]
+@pytest.mark.parametrize(
+    ("stack", "tolerance"),
+    [
+        (Stack([Medium([0.5, 0.2], [0.8, 0.5], HenyeyGreenstein(0.2))]), 0.02),
+        *(pytest.param(STACKS["haze"], tolerance, marks=pytest.mark.slow) for tolerance in (0.02, 1e-3)),
+    ],
+    ids=["thin haze", "haze", "haze, closely"],
+)
+def test_tolerance_picks_the_resolution(stack, tolerance):
     wi, wo = directions(60, seed=8), directions(60, seed=9)
     values = lj.evaluate(stack, wi, wo, lj.AddingDoubling(tolerance=tolerance))
     truth = lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=20, modes=30))

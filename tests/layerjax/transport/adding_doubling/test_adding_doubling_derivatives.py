@@ -57,8 +57,8 @@ def test_derivatives_of_many_stacks_side_by_side(mode):
     wi, wo = jnp.asarray([[0.0, 0.6, 0.8]]), jnp.asarray([[0.6, 0.0, 0.8]])
     x = jnp.asarray([0.3, 0.4])
     together = jax.jit(mode(lambda x: jnp.sum(jax.vmap(value)(x))))(x)
-    alone = jax.jit(mode(value))
-    np.testing.assert_allclose(together, [alone(one) for one in x], rtol=1e-9)
+    values, step = jax.jit(jax.vmap(value)), 1e-5
+    np.testing.assert_allclose(together, (values(x + step) - values(x - step)) / (2.0 * step), rtol=1e-6)
 
 
 def test_elements_are_differentiated_by_directions_too():
