@@ -129,6 +129,7 @@ def test_energies_of_vmf_normals_have_the_slopes_of_their_differences():
                 np.testing.assert_allclose(found, (ahead - back) / (2 * step), rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 def test_slopes_of_energies_of_vmf_normals_are_those_of_a_finer_rule():
     for ratio in (0.7, 1.5):
         for alpha in (0.05, 0.1, 0.3, 1.0):
@@ -137,7 +138,8 @@ def test_slopes_of_energies_of_vmf_normals_are_those_of_a_finer_rule():
             np.testing.assert_allclose(found, fine, rtol=0, atol=2e-3 / max(alpha, 0.1))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, slow(np.float64)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_vmf_normals_are_finite_over_the_box(dtype):
     cosines = np.array([1e-6, 0.02, 0.745, 1.0], dtype)
     for ratio in (0.25, 1 - 2.0**-24, 1.0, 1.5, 4.0):
