@@ -30,7 +30,8 @@ def slopes(numbers):
     return jax.jvp(operators, (numbers,), (jnp.ones_like(numbers),))[1]
 
 
-@pytest.mark.parametrize("function", [operators, pytest.param(slopes, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("function", [operators, slopes])
 def test_many_interfaces_are_what_each_is_alone(function, monkeypatch):
     monkeypatch.setattr(solve, "MANY", 2)
     shared = jax.jit(lambda numbers: function(numbers))(NUMBERS)

@@ -43,9 +43,8 @@ def test_agrees_with_the_walk(numbers):
     assert np.all(np.abs(values - walked) < 4.0 * errors + 1e-3 * (walked + 0.1 * np.max(walked)))
 
 
-@pytest.mark.parametrize(
-    "above", [pytest.param((), marks=pytest.mark.slow), (lj.Medium(0.4, 0.5),)], ids=["slab", "haze on it"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("above", [(), (lj.Medium(0.4, 0.5),)], ids=["slab", "haze on it"])
 def test_is_the_same_beside_tables(above):
     """Off tables of 12 nodes, to 2e-3 of the values and of a tenth of the largest: as along known directions at 24
     nodes; with haze outside light is never followed, and the walk tells what is true."""
@@ -61,7 +60,8 @@ def test_is_the_same_beside_tables(above):
     assert np.all(np.abs(read - exact) < 4.0 * errors + 2e-3 * (exact + 0.1 * np.max(exact)))
 
 
-def test_pairs_on_one_side_are_zero_and_change_no_others():
+@pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_pairs_on_one_side_are_zero_and_change_no_others(reverse):
     """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros.
     Derivatives are those of differences."""
     wi, wo = jnp.tile(WI, (40, 1)), jnp.tile(WO, (40, 1))  # more than one chunk of pairs
@@ -79,8 +79,9 @@ def test_pairs_on_one_side_are_zero_and_change_no_others():
         np.testing.assert_allclose(some, jnp.where(same_side, 0.0, crossing), rtol=1e-12)
         np.testing.assert_array_equal(none, 0.0)
         assert np.any(np.asarray(some) != 0.0)
-    slope = jax.jit(jax.grad(lambda alpha: jnp.sum(values(alpha, mixed))))(0.05)
-    np.testing.assert_allclose(slope, jnp.sum(compiled(0.05, mixed)[1]), rtol=1e-9)
+    if reverse:
+        slope = jax.jit(jax.grad(lambda alpha: jnp.sum(values(alpha, mixed))))(0.05)
+        np.testing.assert_allclose(slope, jnp.sum(compiled(0.05, mixed)[1]), rtol=1e-9)
 
 
 def test_is_reciprocal_and_turns_upside_down():
