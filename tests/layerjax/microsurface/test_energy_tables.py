@@ -10,7 +10,7 @@ from layerjax.microsurface import energy_tables as tables
 from layerjax.microsurface.splines import fitted, read
 from tests.helpers.metals import conductor_energy
 
-COUNT = 1000
+COUNT = 2000
 
 
 def rough(seed: int = 0, narrowest: float = 1e-4) -> tuple[np.ndarray, np.ndarray]:

@@ -91,6 +91,7 @@ def test_is_reciprocal_and_turns_upside_down():
     np.testing.assert_allclose(forth, ratio * back, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_is_the_same_with_an_axis_that_is_the_normal():
     """Light that passes straight counts once however the flakes between say that they lie flat."""
 
