@@ -76,7 +76,7 @@ def test_truths_come_from_the_prior(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["bounded", "degenerate", *(pytest.param(name, marks=pytest.mark.slow) for name in ("banana", "errors"))]
+    "name", ["bounded", *(pytest.param(name, marks=pytest.mark.slow) for name in ("degenerate", "banana", "errors"))]
 )
 def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
     """Without all orders; free parameters stand in the order of the problem's."""
@@ -91,6 +91,7 @@ def test_posteriors_are_run(name: str, tmp_path: Path) -> None:
     assert all(label in text for label in case.labels.values())
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
     """Transport: paths with one event alone, which are cheap."""
     parts_of, cheap = tmp_path / "parts", {"transport": CHEAP, "processes": 1}

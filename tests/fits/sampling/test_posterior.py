@@ -67,7 +67,7 @@ def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, po
     for fewer."""
     path, shown = tmp_path / "chain", []
     sample(result, walkers=16, seed=1, path=path)
-    wanted = 4.0 * posterior.effective_samples.min()
+    wanted = 2.0 * posterior.effective_samples.min()
     more = sample(result, walkers=16, seed=1, path=path, ess=wanted, progress=lambda *given: shown.append(given))
     assert more.effective_samples.min() >= wanted
     assert len(more.chain) < 6 * len(posterior.chain)

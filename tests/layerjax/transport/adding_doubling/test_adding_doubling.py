@@ -191,7 +191,6 @@ def test_only_stacks_with_an_axis_pay_for_ordinates():
     assert lj.prepare(upright, transport).state.tables.azimuths is None
 
 
-@pytest.mark.slow  # `test_numerical_error` asks more, of a varnish
 def test_the_error_estimate_covers_the_error():
     stack = STACKS["haze"]
     wi, wo = directions(60, seed=8), directions(60, seed=9)
@@ -224,6 +223,7 @@ def test_errors_are_told_by_other_resolutions(nodes, compared):
     assert [(one.nodes, one.modes) for one in found] == compared
 
 
+@pytest.mark.slow
 def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
     """Next to a peak that is known in closed form any error of the rest is small: that counts by itself."""
     monkeypatch.setattr(

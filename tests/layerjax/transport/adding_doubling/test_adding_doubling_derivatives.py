@@ -46,6 +46,7 @@ def extreme_stack(kind, generator):
     return Stack([flakes((1.0, 0.0, 0.0)), haze(), flakes((0.3, 0.2, 0.9))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.grad, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
 def test_derivatives_of_many_stacks_side_by_side(mode):
     """Of a batch as a whole, for what the operators of a layer depend on: its index and its phase function."""

@@ -115,6 +115,7 @@ def test_energies_of_vmf_normals(ratio, alpha):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 if alpha < 1.0 else 5e-4)
 
 
+@pytest.mark.slow
 def test_energies_of_vmf_normals_have_the_slopes_of_their_differences():
     """No point crosses the critical angle or the horizon as width or index change. Wide normals cross the kink of their
     masking."""

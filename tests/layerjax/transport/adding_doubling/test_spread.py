@@ -58,6 +58,7 @@ def test_what_ends_like_a_root_has_its_mean(edge: float) -> None:
     assert found == pytest.approx(exact, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_tables_are_smooth_in_an_inner_interface() -> None:
     """Over metal, which does not make light diffuse: second differences 5e-5 apart, 1e-3 where rays jump over edges."""
     incidence, outgoing = np.radians([10.0, 60.0]), np.radians(np.linspace(-70.0, 70.0, 9))

@@ -60,6 +60,7 @@ def test_is_the_same_beside_tables(above):
     assert np.all(np.abs(read - exact) < 4.0 * errors + 2e-3 * (exact + 0.1 * np.max(exact)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reverse", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_pairs_on_one_side_are_zero_and_change_no_others(reverse):
     """Whatever they stand among, values and derivatives of the others stay; without any that cross there are zeros.
@@ -103,6 +104,7 @@ def test_is_the_same_with_an_axis_that_is_the_normal():
     np.testing.assert_allclose(values((0.0, 0.0, 1.0)), values(None), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_is_continuous_at_equal_indices():
     """An interface without effect refracts to one direction alone: nothing is lost or counted twice there.
 
