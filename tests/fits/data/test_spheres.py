@@ -101,6 +101,7 @@ def test_light_from_behind_meets_the_other_face() -> None:
     assert gains[0] > 1.02 * gains[1]
 
 
+@pytest.mark.slow
 def test_coefficients_are_recovered_through_spheres() -> None:
     spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
     slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])
