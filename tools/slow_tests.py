@@ -113,7 +113,7 @@ def pytest_runtest_setup() -> None:
     if time.time() > float(os.environ.get("SLOW_TESTS_UNTIL", "inf")):
         pytest.skip("this turn has no time left")
     if limit := float(os.environ.get("SLOW_TESTS_LIMIT", "0")):
-        faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__)
+        faulthandler.dump_traceback_later(limit, exit=True, file=2)
 
 
 def pytest_runtest_teardown() -> None:

@@ -66,6 +66,7 @@ def test_light_from_the_base_is_as_solved(name: str) -> None:
         np.testing.assert_allclose(found, wanted, atol=error)
 
 
+@pytest.mark.slow
 def test_a_map_is_its_stacks() -> None:
     """Over a diffuse base texels go together, and each is as its stack by itself; the exact solve stays an option."""
     depths = np.asarray([[0.1, 0.4], [1.0, 2.0]])[..., None]  # one number for all channels
@@ -101,6 +102,7 @@ def test_nothing_is_lost(layers) -> None:
     np.testing.assert_allclose(energy, 1.0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
     """Finite at the ends, along grazing light too, and as differences say, which at ends look inward."""
