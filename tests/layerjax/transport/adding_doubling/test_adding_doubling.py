@@ -199,11 +199,12 @@ def test_the_error_estimate_covers_the_error():
     assert np.sqrt(np.mean((values - truth) ** 2)) <= np.sqrt(np.mean(errors**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stack", "tolerance"),
     [
         (Stack([Medium([0.5, 0.2], [0.8, 0.5], HenyeyGreenstein(0.2))]), 0.02),
-        *(pytest.param(STACKS["haze"], tolerance, marks=pytest.mark.slow) for tolerance in (0.02, 1e-3)),
+        *((STACKS["haze"], tolerance) for tolerance in (0.02, 1e-3)),
     ],
     ids=["thin haze", "haze", "haze, closely"],
 )
@@ -223,7 +224,6 @@ def test_errors_are_told_by_other_resolutions(nodes, compared):
     assert [(one.nodes, one.modes) for one in found] == compared
 
 
-@pytest.mark.slow
 def test_a_tolerance_is_not_reached_by_what_shines_beside(monkeypatch):
     """Next to a peak that is known in closed form any error of the rest is small: that counts by itself."""
     monkeypatch.setattr(

@@ -104,6 +104,7 @@ def test_symmetric_model_is_reciprocal(stack):
     assert np.any(there > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", [0.0, 1.1, 2.3])
 def test_forward_model_conserves_energy_in_a_furnace(theta):
     """A lossless slab: the energies of its lobes, and, within 4 standard errors, what its samples carry."""

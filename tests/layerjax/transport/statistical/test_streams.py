@@ -195,6 +195,7 @@ def test_packing_keeps_the_matrices() -> None:
     np.testing.assert_allclose(outward[:, 0] + inner[:, 0], first[None].repeat(3, 0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_interfaces_are_as_their_quadrature() -> None:
     """Between the points of the table. No entry is further off than is stated."""
     random = np.random.default_rng(0)
