@@ -15,8 +15,9 @@ LATER = {"which_stack", "renderers"}
 """Pages whose code begins with results of the commands above it, or needs an extra."""
 
 
-LONG = {"evaluating-0", "own_data-0"}
-"""Blocks that compile for half a minute: derivatives of media with an axis over a metal, and a fit of 16 starts."""
+LONG = {"evaluating-0", "own_data-0", "transports-0", "convergence-0"}
+"""Blocks that compile for long: derivatives of media with an axis over a metal, a fit of 16 starts, and the solver
+beside walks."""
 
 
 def blocks(language, pages=PAGES):

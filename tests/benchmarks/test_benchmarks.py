@@ -79,6 +79,7 @@ def test_the_material_that_is_fitted_agrees_with_its_numpy_model() -> None:
     np.testing.assert_allclose(fitting.model(fitting.TRUTH, wi, wo), values[:, 0], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
     text, paths = throughput.study(
         with_peers=False,

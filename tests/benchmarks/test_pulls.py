@@ -8,6 +8,7 @@ import layerjax as lj
 from benchmarks.studies.pulls import cases, run
 
 
+@pytest.mark.slow
 def test_a_mixture_is_recovered():
     case = next(cases.of_mixtures(6))
     rows = run.run_case("mixtures", case)

@@ -53,7 +53,7 @@ def agrees(data: Measurements, stack: lj.Stack, transport: lj.Transport, toleran
     ("stack", "transport", "share", "azimuths"),
     [
         (METAL, lj.SingleScattering(), 1.0, (1, 1)),
-        (GLOSSY, lj.Statistical(), 1.0, (1, 1)),
+        pytest.param(GLOSSY, lj.Statistical(), 1.0, (1, 1), marks=pytest.mark.slow),
         (FIBERS, lj.SingleScattering(), 0.98, (25, 2)),
         pytest.param(TILTED, lj.SingleScattering(), 0.98, (49, 1), marks=pytest.mark.slow),
     ],

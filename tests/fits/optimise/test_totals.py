@@ -76,6 +76,7 @@ def test_totals_and_values_together_tell_more_than_either():
     np.testing.assert_allclose((first + second) / np.outer(size, size), both / np.outer(size, size), atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_total_costs_as_much_as_some_twenty_readings():
     """By operations: the solver knows the flux; what is left is the same solve, read off tables."""
     solver = lj.AddingDoubling(nodes=12, modes=16)

@@ -105,7 +105,7 @@ def test_wrong_models_need_a_discrepancy() -> None:
     assert np.mean(better) > 1.0
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     fitted, held_out = split(measurements(3, 0.1))
     noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)

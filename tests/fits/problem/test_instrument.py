@@ -276,6 +276,7 @@ def test_a_broad_lobe_keeps_four_rays() -> None:
     assert limited_with(found) == {}
 
 
+@pytest.mark.slow
 def test_what_a_lobe_decides_is_named_also_where_its_width_is_at_a_bound() -> None:
     """The albedo of a matt part beside it is not: readings far from the lobe know it."""
     data, seen = through(0.004, 8.0)

@@ -62,6 +62,7 @@ def test_it_stops_when_the_chain_is_long_enough(posterior) -> None:
     assert posterior.samples.shape == (-(-kept // posterior.thin) * 16, 2)
 
 
+@pytest.mark.slow
 def test_it_goes_on_for_the_effective_samples_that_are_asked_for(result: Fit, posterior, tmp_path: Path) -> None:
     """A chain goes on for more of them, to the same end as one that was asked for them at once, and is left as it is
     for fewer."""
@@ -126,6 +127,7 @@ def test_proposals_are_learned_from_the_chain(result: Fit) -> None:
     assert np.mean(initial.log_density(learned.draw(generator, 1000)) > -20.0) == pytest.approx(0.1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_parameters_tied_together_on_one_bound() -> None:
     """Two parameters at a bound, both traded against a third: mean and deviation by brute force."""
     x = design(COUNT)[:, 1:]

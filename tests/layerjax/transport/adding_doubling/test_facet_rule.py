@@ -151,6 +151,7 @@ def test_vmf_normals_are_finite_over_the_box(dtype):
                 assert np.isfinite(leaf).all(), (ratio, alpha)
 
 
+@pytest.mark.slow
 def test_energies_beyond_the_critical_angle_are_smooth_in_the_index():
     """Light that only tilted facets let in: no point crosses the horizon of what they refract. Steps are a fiftieth of
     the width of the normals; alpha 0.05, index 0.7."""

@@ -31,7 +31,7 @@ def pairs(stack):
 
 
 @pytest.mark.parametrize(
-    "name", ["paint", "below 1", *(pytest.param(name, marks=pytest.mark.slow) for name in ("metal", "vmf"))]
+    "name", ["paint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("below 1", "metal", "vmf"))]
 )
 def test_agrees_with_tables_of_a_finer_grid(name):
     stack = STACKS[name]

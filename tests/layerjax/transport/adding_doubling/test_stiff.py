@@ -31,6 +31,7 @@ def test_lossless_slabs_keep_their_energy(alpha):
         assert missing(ior, alpha, below, 1.0, 0.3) < 1e-6, (ior, below)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("alpha", [1e-4, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_lossless_media_in_a_slab_keep_their_energy(alpha):
     """Peaks too narrow for the nodes among them, whose energy interpolation takes below 0 on one side."""

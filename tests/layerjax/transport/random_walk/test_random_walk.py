@@ -281,7 +281,11 @@ def test_the_edges_of_the_box_are_finite(dtype, stack, microfacets):
 
 
 @pytest.mark.parametrize(
-    "stack", [lj.Stack([haze(0.5, 1.0, 0.9)]), lj.Stack([lj.Interface(1.5, 0.4)], lj.Lambertian(0.5))]
+    "stack",
+    [
+        lj.Stack([haze(0.5, 1.0, 0.9)]),
+        pytest.param(lj.Stack([lj.Interface(1.5, 0.4)], lj.Lambertian(0.5)), marks=pytest.mark.slow),
+    ],
 )
 def test_samples_weigh_the_albedo(stack):
     walk = lj.RandomWalk(paths=16)

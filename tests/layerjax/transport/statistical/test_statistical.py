@@ -148,6 +148,7 @@ def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, 
     assert abs(float(jnp.mean(weight[:, 0]) - expected)) < 4 * noise + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ior", "absorbing"),
     [
