@@ -143,15 +143,7 @@ def test_nothing_is_added_where_nothing_scatters_twice():
     assert np.max(added[~slanting]) < 0.05
 
 
-FEWER = [
-    "haze",
-    "fibers over haze",
-    *(pytest.param(name, marks=pytest.mark.slow) for name in ("flakes", "fibers", "flakes over fibers")),
-]
-"""One of one and of two media; those with two axes compile longest."""
-
-
-@pytest.mark.parametrize("name", FEWER)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "haze")) for name in STACKS])
 def test_error_is_what_the_tables_say(name):
     """Within the 95th percentile of the held-out materials of the record, and well below the first order alone."""
     record = load("spongecake")[f"{len(STACKS[name].layers)}-error"]
@@ -169,7 +161,8 @@ def test_error_is_what_the_tables_say(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "theta", "proposal"), [("flakes", 0.7, "first"), ("flakes", 2.3, "both"), ("haze", 0.7, "both")]
+    ("name", "theta", "proposal"),
+    [("flakes", 0.7, "first"), pytest.param("flakes", 2.3, "both", marks=pytest.mark.slow), ("haze", 0.7, "both")],
 )
 def test_samples(name, theta, proposal):
     stack, wi, how = STACKS[name], lj.direction(theta, 0.4), lj.SpongeCake(proposal=proposal)
