@@ -58,7 +58,7 @@ CASES = {
 }
 
 
-LONG = ("SpongeCake", "AddingDoubling, light passes", "AddingDoubling, ordinates")
+LONG = ("SpongeCake", "Statistical", "AddingDoubling, light passes", "AddingDoubling, ordinates")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in CASES])

@@ -85,6 +85,7 @@ def test_what_is_opaque_reflects_diffuse_light() -> None:
         np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_light_from_behind_meets_the_other_face() -> None:
     """A slab that is dark on one side: only the sphere there sees it."""
     grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)

@@ -152,7 +152,9 @@ def test_a_merl_table_says_that_light_passes(monkeypatch: pytest.MonkeyPatch) ->
     assert any("transmission is omitted" in note for note in notes)
 
 
-@pytest.mark.parametrize(("stack", "total"), [(HAZE, 1), (FIBERS, 24)], ids=["haze", "fibers"])
+@pytest.mark.parametrize(
+    ("stack", "total"), [(HAZE, 1), pytest.param(FIBERS, 24, marks=pytest.mark.slow)], ids=["haze", "fibers"]
+)
 def test_a_zemax_file_holds_the_stack(tmp_path: Path, stack: lj.Stack, total: int) -> None:
     path, notes = written(stack, tmp_path, "zemax", transport=lj.SingleScattering())
     data = fits.read(path)

@@ -122,6 +122,7 @@ def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     assert at.scores == scores(at, held_out)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
     """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
     inside: dict[str, list[float]] = {"bsdf": [], "latent": []}

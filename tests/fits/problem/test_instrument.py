@@ -240,6 +240,7 @@ FREE = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
 NOISE = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -> None:
     """At 1.4 widths of the lobe four rays made k 2.78 +- 0.12 of 3.5."""
     data, seen = through(0.02, 1.4)
