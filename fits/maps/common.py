@@ -143,7 +143,7 @@ def _held(unit: Floats, gradient: Floats) -> Truths:
     return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
 
 
-def _joint(problem: Problem, places: Integers, own: Integers, fits: Fits) -> _Joint:
+def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _Joint:
     """What M texels say together, from what each says of all parameters."""
     box, count, gradient = problem.model.box, len(fits.cost), np.array(fits.gradient)
     # a prior of common parameters counts once in all, and not once a texel
@@ -155,10 +155,10 @@ def _joint(problem: Problem, places: Integers, own: Integers, fits: Fits) -> _Jo
     slopes[of_common] /= np.sqrt(count)
     information = np.einsum("mki,mkj->mij", fits.root, fits.root) + slopes.T @ slopes
     # the Schur complement, texel by texel
-    held = _held(fits.unit[:, own], gradient[:, own])
-    inner = np.where(held[:, :, None] | held[:, None, :], 0.0, information[:, own[:, None], own])
-    across = np.where(held[:, :, None], 0.0, information[:, own[:, None], places])
-    slope = np.where(held, 0.0, gradient[:, own])
+    held = _held(fits.unit[:, rest], gradient[:, rest])
+    inner = np.where(held[:, :, None] | held[:, None, :], 0.0, information[:, rest[:, None], rest])
+    across = np.where(held[:, :, None], 0.0, information[:, rest[:, None], places])
+    slope = np.where(held, 0.0, gradient[:, rest])
     solved = np.linalg.pinv(inner, hermitian=True) @ np.concatenate([across, slope[:, :, None]], axis=2)
     reduced = np.einsum("mis,mit->st", across, solved[:, :, :-1])
     whole = information[:, places[:, None], places].sum(axis=0)

@@ -23,7 +23,7 @@ from fits.maps.report import summary as summaries
 from fits.maps.report.summary import Summary, degrees_of_freedom, own_parameters, summarise
 from fits.maps.store import FLAGS, FittedMap, Floats
 from fits.progress import Progress, silent
-from fits.reports.pages import Pictures, document, image, made_with, section, verdict
+from fits.reports.pages import document, image, made_with, section, verdict
 from fits.reports.plots.data import CYCLE, GREY, INK, LOG_ABOVE, STYLE, as_png
 
 MADE = ("version", "shape", "chunk", "samples", "channels", "transport", "noise", "options", "pilot", "numerical")
@@ -42,40 +42,56 @@ def report(map: FittedMap, path: str | Path, force: bool = True, progress: Progr
         ValueError: `path` exists and `force` is False, or a chunk of the map is damaged.
     """
     numbers = summarise(map)
-    write_text(path, page(map, numbers, draw(map, progress)), force=force)
+    write_text(path, page(map, numbers, progress), force=force)
     return numbers
 
 
-def page(map: FittedMap, numbers: Summary, images: Pictures) -> str:
+def page(map: FittedMap, numbers: Summary, progress: Progress = silent) -> str:
     """The HTML text of the report, with the pictures inside."""
-    title, leading = f"Map of {map.path.resolve().name}", _leading(map.shape)
-    part = f" Slice {list(leading)} of {' x '.join(str(size) for size in map.shape[:-2])}." if leading else ""
-
-    def pair(*figures: tuple[str, str]) -> str:
-        return f'<div class="pair">{"".join(image(images, name, f"{words}{part}") for name, words in figures)}</div>'
-
+    title, flags, names = f"Map of {map.path.resolve().name}", map.flags, own_parameters(map)
     body = [
         f"<h1>{html.escape(title)}</h1>",
         verdict(*summaries.verdict(numbers, map)),
-        section("Texels", pair(("flags", "The gravest flag of each texel.")), summaries.count_table(numbers)),
+        section(
+            "Texels",
+            _pair(map, ("The gravest flag of each texel.", flag_picture(flags))),
+            summaries.count_table(numbers),
+        ),
     ]
     if numbers.fitted:
+        common, note = (
+            summaries.common_table(map),
+            "<p>One value for all texels, from the pilot that was fitted first.</p>",
+        )
         body.append(section("Values in short", summaries.quartile_table(numbers, map)))
-        if (common := summaries.common_table(map)).rows:
-            note = "<p>One value for all texels, from the pilot that was fitted first.</p>"
-            body.append(section("Common parameters", note, common))
-        note = '<p class="note">Colours run over the middle 98 % of the values.</p>'
-        parts = [note, f"<p>{html.escape(summaries.smoothing_words(map))}</p>"]
-        for name in own_parameters(map):
+        body.append(section("Common parameters", note, common) if common.rows else "")
+        parts = ['<p class="note">Colours run over the middle 98 % of the values.</p>']
+        parts.append(f"<p>{html.escape(summaries.smoothing_words(map))}</p>")
+        for number, name in enumerate(names):
+            progress("pictures", number, len(names), name)
+            unit, norm = "unitless" if map.units[name] == "1" else map.units[name], inner_norm(map.values[name])
             parts.append(f"<h3>{html.escape(name)}</h3>")
-            for which, words in (("", "over the map"), (", smoothed", "with a spatial prior")):
-                value = (f"{name}{which}", f"{name}, {words}.")
-                parts.append(pair(value, (f"error of {name}{which}", f"Standard error of {name}, {words}.")))
-        ratio = ("chi_square", "Chi-square per degree of freedom; 1: as the noise makes it.")
-        often = ("chi_square_histogram", "How often it occurs, beside what noise of the stated size makes of it.")
+            plain, smoothed = (map.values, map.errors, "over the map"), (map.smoothed, map.smoothed_errors)
+            for values, errors, words in (plain, (*smoothed, "with a spatial prior")):
+                if values is not None and errors is not None:
+                    value = value_picture(values[name], name, unit, "viridis", norm)
+                    error = value_picture(errors[name], f"error of {name}", unit, "plasma", inner_norm(errors[name]))
+                    parts.append(
+                        _pair(map, (f"{name}, {words}.", value), (f"Standard error of {name}, {words}.", error))
+                    )
+        progress("pictures", len(names), len(names))
+        fitted = (flags & FLAGS["fitted"]) != 0
+        ratio = np.where(fitted, map.reduced_chi_square, np.nan)
+        freedom = degrees_of_freedom(map.measurements[fitted].astype(float), map)
+        goodness = (
+            ("Chi-square per degree of freedom; 1: as the noise makes it.",
+             value_picture(ratio, "chi-square per degree of freedom", RATIO, "PuOr_r", ratio_norm(ratio))),
+            ("How often it occurs, beside what noise of the stated size makes of it.",
+             chi_square_histogram(ratio[fitted], freedom)),
+        )  # fmt: skip
         body += [
             section("Values and errors", *parts),
-            section("Goodness of fit", pair(ratio, often)),
+            section("Goodness of fit", _pair(map, *goodness)),
             section("The worst texels", summaries.worst_table(map)),
         ]
     made = {name: map.attributes[name] for name in MADE if name in map.attributes}
@@ -84,34 +100,15 @@ def page(map: FittedMap, numbers: Summary, images: Pictures) -> str:
     return document(title, body)
 
 
+def _pair(map: FittedMap, *figures: tuple[str, Figure]) -> str:
+    """Pictures beside each other, with what each shows."""
+    leading = _leading(map.shape)
+    part = f" Slice {list(leading)} of {' x '.join(str(size) for size in map.shape[:-2])}." if leading else ""
+    shown = (image({"": as_png(figure, trimmed=False)}, "", f"{words}{part}") for words, figure in figures)
+    return f'<div class="pair">{"".join(shown)}</div>'
+
+
 # ---- pictures ----
-
-
-def draw(map: FittedMap, progress: Progress = silent) -> dict[str, bytes]:
-    """Every picture that applies, as PNG by name."""
-    flags, names = map.flags, own_parameters(map)
-    fitted = (flags & FLAGS["fitted"]) != 0
-    figures = {"flags": flag_picture(flags)}
-    if fitted.any():
-        ratio = np.where(fitted, map.reduced_chi_square, np.nan)
-        freedom = degrees_of_freedom(map.measurements[fitted].astype(float), map)
-        title = "chi-square per degree of freedom"
-        figures["chi_square"] = value_picture(ratio, title, RATIO, "PuOr_r", ratio_norm(ratio))
-        figures["chi_square_histogram"] = chi_square_histogram(ratio[fitted], freedom)
-        for number, name in enumerate(names):
-            progress("pictures", number, len(names), name)
-            unit, norm = "unitless" if map.units[name] == "1" else map.units[name], inner_norm(map.values[name])
-            for which, values, errors in (
-                ("", map.values, map.errors),
-                (", smoothed", map.smoothed, map.smoothed_errors),
-            ):
-                if values is not None and errors is not None:
-                    title = f"{name}{which}"
-                    figures[title] = value_picture(values[name], title, unit, "viridis", norm)
-                    title = f"error of {title}"
-                    figures[title] = value_picture(errors[name], title, unit, "plasma", inner_norm(errors[name]))
-        progress("pictures", len(names), len(names))
-    return {name: as_png(figure, trimmed=False) for name, figure in figures.items()}  # of one size, side by side
 
 
 def value_picture(values: Floats, title: str, label: str, colours: str, norm: Normalize) -> Figure:
@@ -122,10 +119,9 @@ def value_picture(values: Floats, title: str, label: str, colours: str, norm: No
         title, label: what stands above, and what the numbers are, with their unit.
         colours, norm: of matplotlib.
     """
-    colour_map = mpl.colormaps[colours].with_extremes(bad=NO_VALUE)
-    finite = np.isfinite(values)
-    return _map_picture(np.where(finite, values, np.nan), title, {NO_VALUE: "no value"} if not finite.all() else {},
-                        label, cmap=colour_map, norm=norm)  # fmt: skip
+    finite, cmap = np.isfinite(values), mpl.colormaps[colours].with_extremes(bad=NO_VALUE)
+    legend = {} if finite.all() else {NO_VALUE: "no value"}
+    return _map_picture(np.where(finite, values, np.nan), title, legend, label, cmap=cmap, norm=norm)
 
 
 def inner_norm(values: Floats) -> Normalize:
@@ -163,7 +159,7 @@ applies."""
 
 def flag_picture(flags: np.ndarray) -> Figure:
     """The gravest flag of every texel, with counts over the whole map."""
-    states = np.argmax([((flags & has) == has) & ((flags & lacks) == 0) for _, _, has, lacks in STATES], axis=0)
+    states = np.argmax([((flags & bits) == bits) & ((flags & without) == 0) for _, _, bits, without in STATES], axis=0)
     counts, colours = np.bincount(states.ravel(), minlength=len(STATES)), [colour for _, colour, *_ in STATES]
     legend = {colour: f"{words}: {count:,}" for (words, colour, *_), count in zip(STATES, counts, strict=True) if count}
     norm, cmap = Normalize(-0.5, len(STATES) - 0.5), mpl.colors.ListedColormap(colours)

@@ -49,7 +49,7 @@ def test_results_and_failures_are_those_of_the_other_engines(client):
 
 def test_short_tasks_are_grouped_and_each_has_its_own_result(client, monkeypatch):
     submit, sent = client.submit, []
-    monkeypatch.setattr(client, "submit", lambda *given, **rest: sent.append(given) or submit(*given, **rest))
+    monkeypatch.setattr(client, "submit", lambda *call, **rest: sent.append(call) or submit(*call, **rest))
     outcomes = dict(run(tasks.picky, None, [5] * 300 + [1] + [5] * 300, client=client))
     assert [index for index, result in outcomes.items() if isinstance(result, Failure)] == [300]
     assert len(outcomes) == 601 > 4 * len(sent)

@@ -231,9 +231,9 @@ def test_only_blocks_are_read(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["zarr", "hdf5", "xarray", "xarray, by angles"])
-@pytest.mark.parametrize("own", [False, True], ids=["common", "own"])
-def test_directions_may_stand_beside_the_values(tmp_path, kind, own):
-    turn = np.linspace(0.0, 30.0, SHAPE[0] * SHAPE[1]).reshape(*SHAPE, 1) if own else 0.0
+@pytest.mark.parametrize("each", [False, True], ids=["common", "each"])
+def test_directions_may_stand_beside_the_values(tmp_path, kind, each):
+    turn = np.linspace(0.0, 30.0, SHAPE[0] * SHAPE[1]).reshape(*SHAPE, 1) if each else 0.0
     wi, wo = direction(VIEW.theta_i, VIEW.phi_i), direction(VIEW.theta_o, VIEW.phi_o + turn)
     angles = ANGLES | {"phi_o": VIEW.phi_o + turn}
     if kind == "zarr":
@@ -250,8 +250,8 @@ def test_directions_may_stand_beside_the_values(tmp_path, kind, own):
             data = map_data(xarray.Dataset(vectors | {"values": (DIMS, VALUES)}).transpose())
         else:
             data = map_data(xarray.DataArray(VALUES, dims=DIMS, coords=named).transpose("x", ...))
-        wo = np.swapaxes(wo, 0, 1) if own else wo
-    assert (data.geometry is None) == own
+        wo = np.swapaxes(wo, 0, 1) if each else wo
+    assert (data.geometry is None) == each
     if data.geometry is not None:
         np.testing.assert_allclose((data.geometry.wi, data.geometry.wo), (wi, wo), atol=1e-12)
         return

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 
 import fits
 import layerjax as lj
@@ -27,12 +27,21 @@ HUBER = 0.1
 """Share of a scale below which a total variation is quadratic."""
 
 FREE = coat(fits.Free(0.5, 0.05, 3.0, prior=fits.LogUniform()), fits.Free(0.4, 0.0, 1.0, prior=fits.Normal(MEAN, SD)))
-SCALES = np.array([0.03, 0.02])
-WIDER = 3.0 * SCALES
-"""Of a total variation, whose neighbours hold on to each other ten times as much: few rounds are enough."""
+SCALES = {"gaussian": np.array([0.03, 0.02]), "total_variation": np.array([0.09, 0.06])}
+"""Those of a total variation, whose neighbours hold on to each other ten times as much, are wider: fewer rounds."""
 
-GAUSSIAN = fits.SpatialPrior("gaussian", dict(zip(NAMES, SCALES, strict=True)), rounds=40)
-VARIATION = fits.SpatialPrior("total_variation", dict(zip(NAMES, WIDER, strict=True)), rounds=100)
+PRIORS = {kind: fits.SpatialPrior(kind, dict(zip(NAMES, scales, strict=True)), 100) for kind, scales in SCALES.items()}
+GAUSSIAN = PRIORS["gaussian"]
+MASK = np.ones(SHAPE, bool)
+MASK[1, 2] = False
+PLACES = np.cumsum(MASK.ravel()).reshape(SHAPE) - 1
+PAIRS = [
+    (PLACES[row, column], PLACES[other])
+    for row, column in np.argwhere(MASK)
+    for other in ((row + 1, column), (row, column + 1))
+    if max(other) < 4 and MASK[other]
+]
+"""Places, among the texels that are fitted, of those that lie beside each other."""
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +57,6 @@ def predict(geometry):
 
 
 @pytest.fixture(scope="module")
-def mask():
-    mask = np.ones(SHAPE, bool)
-    mask[1, 2] = False
-    return mask
-
-
-@pytest.fixture(scope="module")
 def measured(predict):
     """Values of a map whose albedo has an edge in the middle, and their standard deviations."""
     rows, columns = np.indices(SHAPE)
@@ -65,51 +67,15 @@ def measured(predict):
 
 
 @pytest.fixture(scope="module")
-def fitted(measured, mask):
+def fitted(measured):
     """Fits the map, with these options."""
 
     def fit(out, **options):
         values, sigma = measured
-        given = {"chunk_size": CHUNK, "pilot_texels": 4, "noise": fits.Noise(relative=0.0, floor=0.0)} | options
-        return quick_maps.fitted(out, values, FREE, sigma=sigma, mask=mask, **given)
+        options = {"chunk_size": CHUNK, "pilot_texels": 4, "noise": fits.Noise(relative=0.0, floor=0.0)} | options
+        return quick_maps.fitted(out, values, FREE, sigma=sigma, mask=MASK, **options)
 
     return fit
-
-
-@pytest.fixture(scope="module")
-def residuals(predict, measured, mask):
-    """Residuals of all measured and priors at units (15, 2) of the texels that are fitted, written down anew."""
-    values, sigma = (jnp.asarray(one[mask][..., 0]) for one in measured)
-
-    def one(units):
-        data = (jax.vmap(predict)(units) - values) / sigma
-        return jnp.concatenate([data.reshape(-1), (units[:, 1] - MEAN) / SD])
-
-    return one
-
-
-@pytest.fixture(scope="module")
-def pairs(mask):
-    """Places, among the texels that are fitted, of those that lie beside each other: first and second."""
-    place = np.full(SHAPE, -1)
-    place[mask] = np.arange(mask.sum())
-    found = []
-    for row, column in np.argwhere(mask):
-        for other in ((row + 1, column), (row, column + 1)):
-            if max(other) < 4 and mask[other]:
-                found.append((place[row, column], place[other]))
-    return np.array(found).T
-
-
-def units_of(values, mask):
-    """Numbers of the texels that are fitted, (15, 2), in the unit box."""
-    natural = np.stack([np.log(values[THICKNESS][mask]), values[ALBEDO][mask]], axis=-1)
-    return (natural - LOW) / (HIGH - LOW)
-
-
-def unit_errors(map, mask):
-    slope = (HIGH - LOW) * np.stack([map.smoothed[THICKNESS][mask], np.ones(mask.sum())], axis=-1)
-    return np.stack([map.smoothed_errors[name][mask] for name in NAMES], axis=-1) / slope
 
 
 @pytest.fixture(scope="module")
@@ -124,89 +90,75 @@ def out(tmp_path, plain):
 
 
 @pytest.fixture(scope="module")
-def gaussian(tmp_path_factory, plain, fitted):
-    out = shutil.copytree(plain.path, tmp_path_factory.mktemp("map") / "gaussian.zarr")
-    return fitted(out, spatial_prior=GAUSSIAN)
+def smoothed(tmp_path_factory, plain, fitted):
+    """The maps with a spatial prior of each kind."""
+    folder = tmp_path_factory.mktemp("map")
+    return {kind: fitted(shutil.copytree(plain.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
 
 
 @pytest.fixture(scope="module")
-def variation(tmp_path_factory, plain, fitted):
-    out = shutil.copytree(plain.path, tmp_path_factory.mktemp("map") / "variation.zarr")
-    return fitted(out, spatial_prior=VARIATION)
+def gaussian(smoothed):
+    return smoothed["gaussian"]
 
 
-def left_to_go(map):
-    """How far the end of a geometric series of moves is at most, in standard errors, by its last two."""
-    *_, before, last = map.smoothing["largest_moves"]
-    return last / (1.0 - last / before)
+def units_of(values):
+    """Numbers of the texels that are fitted, (15, 2), in the unit box."""
+    natural = np.stack([np.log(values[THICKNESS][MASK]), values[ALBEDO][MASK]], axis=-1)
+    return (natural - LOW) / (HIGH - LOW)
 
 
-def test_gaussian_smoothness_ends_where_a_joint_minimisation_does(gaussian, residuals, pairs, mask):
-    assert gaussian.smoothing["settled"]
-    first, second = pairs
+@pytest.mark.parametrize("kind", PRIORS)
+def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, kind):
+    map, (first, second) = smoothed[kind], np.array(PAIRS).T
+    values, sigma = (jnp.asarray(one[MASK][..., 0]) for one in measured)
 
-    def joint(flat):
+    def residuals(flat):  # of the data and the prior, written down anew
         units = flat.reshape(-1, 2)
-        return jnp.concatenate([residuals(units), ((units[second] - units[first]) / SCALES).reshape(-1)])
+        data = (jax.vmap(predict)(units) - values) / sigma
+        return jnp.concatenate([data.reshape(-1), (units[:, 1] - MEAN) / SD])
 
-    value, slopes = jax.jit(joint), jax.jit(jax.jacfwd(joint))
-    plain = units_of(gaussian.values, mask)
-    best = least_squares(
-        lambda x: np.asarray(value(x)), plain.ravel(), lambda x: np.asarray(slopes(x)), bounds=(0.0, 1.0),
-        xtol=1e-14, ftol=1e-14, gtol=1e-12,
-    )  # fmt: skip
-    joint, found = best.x.reshape(-1, 2), units_of(gaussian.smoothed, mask)
-    information = best.jac.T @ best.jac
-    errors = np.array([np.sqrt(np.diag(np.linalg.inv(information[k : k + 2, k : k + 2]))) for k in range(0, 30, 2)])
-    assert np.max(np.abs(joint - plain) / errors) > 3.0  # what is compared is no small change
-    assert np.max(np.abs(joint - found) / errors) < left_to_go(gaussian) + 2e-3  # a fit ends within 1e-4 errors
-    assert left_to_go(gaussian) < 0.1
-    # of Gauss-Newton at the optimum, to which the map has come this close
-    np.testing.assert_allclose(unit_errors(gaussian, mask), errors, rtol=0.01)
-
-
-def test_total_variation_ends_where_a_joint_minimisation_does(variation, residuals, pairs, mask):
-    assert variation.smoothing["settled"]
-    first, second = pairs
+    def share(flat):
+        units = flat.reshape(-1, 2)
+        return jnp.abs(units[second] - units[first]) / SCALES[kind]
 
     def cost(flat):
-        units = flat.reshape(-1, 2)
-        share = jnp.abs(units[second] - units[first]) / WIDER
-        size = jnp.where(share < HUBER, 0.5 * share**2 / HUBER + 0.5 * HUBER, share)
-        return 0.5 * jnp.sum(residuals(units) ** 2) + jnp.sum(size)
+        size = share(flat)
+        if kind == "gaussian":
+            size = 0.5 * size**2
+        else:
+            size = jnp.where(size < HUBER, 0.5 * size**2 / HUBER + 0.5 * HUBER, size)
+        return 0.5 * jnp.sum(residuals(flat) ** 2) + jnp.sum(size)
 
     both = jax.jit(jax.value_and_grad(cost))
-    plain, found = units_of(variation.values, mask), units_of(variation.smoothed, mask)
-    best = minimize(
-        lambda x: [np.asarray(one, float) for one in both(x)], plain.ravel(), jac=True, method="BFGS",
-        options={"gtol": 1e-4, "maxiter": 2000},
-    )  # fmt: skip
+    plain, ends = units_of(map.values), units_of(map.smoothed)
+    options = {"gtol": 1e-4, "maxiter": 2000}
+    best = minimize(lambda x: [np.asarray(one, float) for one in both(x)], plain.ravel(), jac=True, options=options)
     assert np.max(np.abs(best.jac)) < 1e-2  # slopes over a box: of next to nothing within an error
-    joint, errors = best.x.reshape(-1, 2), unit_errors(variation, mask)
-    assert np.max(np.abs(joint - plain) / errors) > 3.0
-    assert left_to_go(variation) < 0.1
-    assert np.max(np.abs(joint - found) / errors) < left_to_go(variation) + 2e-2
-    assert cost(found.ravel()) < cost(plain.ravel())
+    slope = (HIGH - LOW) * np.stack([map.smoothed[THICKNESS][MASK], np.ones(15)], axis=-1)
+    errors = np.stack([map.smoothed_errors[name][MASK] for name in NAMES], axis=-1) / slope
+    joint = best.x.reshape(-1, 2)
+    assert np.max(np.abs(joint - plain) / errors) > 3.0  # what is compared is no small change
+    *_, before, last = map.smoothing["largest_moves"]
+    remaining = last / (1.0 - last / before)  # at most, of a geometric series of moves, in standard errors
+    assert map.smoothing["settled"]
+    assert remaining < 0.1
+    assert np.max(np.abs(joint - ends) / errors) < remaining + (2e-3 if kind == "gaussian" else 2e-2)
+    assert cost(ends.ravel()) < cost(plain.ravel())
+    if kind == "gaussian":  # errors are those of Gauss-Newton at the optimum, with the neighbours held
+        jacobian = jax.jacfwd(lambda flat: jnp.concatenate([residuals(flat), share(flat).ravel()]))(best.x)
+        information = np.asarray(jacobian.T @ jacobian)
+        exact = [np.sqrt(np.diag(np.linalg.inv(information[k : k + 2, k : k + 2]))) for k in range(0, 30, 2)]
+        np.testing.assert_allclose(errors, exact, rtol=0.01)
 
 
-def test_total_variation_keeps_edges_better_than_a_gaussian(gaussian, variation):
-    jumps, scatter = [], []
-    for map in (gaussian, variation):
-        left, right = map.smoothed[ALBEDO][:, :2], map.smoothed[ALBEDO][:, 2:]
-        jumps.append(np.nanmean(right[:, 0]) - np.nanmean(left[:, 1]))
-        scatter.append(np.nanstd(left) + np.nanstd(right))
-    assert abs(jumps[1] - 0.3) < 0.5 * abs(jumps[0] - 0.3)
-    assert scatter[1] < scatter[0]
-
-
-def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian, mask):
+def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian):
     assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
     assert plain.attributes == gaussian.attributes
     for name in plain.arrays:
         np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
-            np.testing.assert_array_equal(np.isfinite(numbers), mask)
+            np.testing.assert_array_equal(np.isfinite(numbers), MASK)
         np.testing.assert_array_equal(gaussian[f"smoothed/values/{name}"][:], gaussian.smoothed[name])
 
 
@@ -245,8 +197,8 @@ def test_data_that_cannot_be_read_again_are_named(out, monkeypatch, fitted):
         fitted(out, spatial_prior=GAUSSIAN)
 
 
-def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, variation, fitted, gaussian):
-    out, stages = shutil.copytree(variation.path, tmp_path / "again.zarr"), []
+def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted, gaussian):
+    out, stages = shutil.copytree(smoothed["total_variation"].path, tmp_path / "again.zarr"), []
     before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
     assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage)), gaussian)
     assert "pilot" not in stages

@@ -89,22 +89,22 @@ def test_the_model_stands_in_the_program_once(geometry, noisy, monkeypatch):
     """It takes most of the time and the memory that compiling takes."""
     traced = []
     original = texels._linearise
-    monkeypatch.setattr(texels, "_linearise", lambda *given: traced.append(given) or original(*given))
+    monkeypatch.setattr(texels, "_linearise", lambda *call: traced.append(call) or original(*call))
     model, rows = problem_of(geometry, FIXED).model, make_texels(noisy, least=1e-4).rows(np.arange(SIZE))
     known = texels.Linearisation(np.zeros((64, 16, 1)), np.zeros((64, 2, 16, 1)))
-    given = np.full((SIZE, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, 0, False, 200))
-    jax.make_jaxpr(lambda *given: texels._program(model, *given))(*jax.tree.map(jnp.asarray, given))
+    arguments = np.full((SIZE, 2), 0.5), known, np.zeros(SIZE, int), rows, *map(np.asarray, (SIZE, 0, False, 200))
+    jax.make_jaxpr(lambda *parts: texels._program(model, *parts))(*jax.tree.map(jnp.asarray, arguments))
     assert len(traced) == 1
 
 
-@pytest.mark.parametrize("own", [False, True], ids=["common directions", "own directions"])
-def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, noisy, own):
+@pytest.mark.parametrize("each", [False, True], ids=["common directions", "own directions"])
+def test_any_number_of_texels_is_searched_by_the_same_programs(geometry, noisy, each):
     problem = problem_of(geometry, FIXED)
     plain = fit_texels(problem, np.full((TEXELS, 2), 0.5), make_texels(noisy, least=1e-4), SIZE)
-    problem = with_own_directions(problem) if own else problem
-    sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if own else []
+    problem = with_own_directions(problem) if each else problem
+    sides = [np.broadcast_to(part, (TEXELS, *part.shape)) for part in (geometry.wi, geometry.wo)] if each else []
     rows, vectors = make_texels(noisy, None, 1e-4, *sides), np.array([[0.3, 0.3], [0.5, 0.5], [1.5, 0.7]])
-    starts = starts_at(problem, vectors, own, SIZE)
+    starts = starts_at(problem, vectors, each, SIZE)
     whole = search(problem, starts, rows, SIZE, DEFAULT)
     found = fit_texels(problem, np.full((TEXELS, 2), 0.5), rows, SIZE)
     np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-9, atol=1e-6)
