@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, Literal, get_args
 
 from fits.names import Objective
@@ -149,7 +150,7 @@ class MapOptions:
 
 
 def _require_number(name: str, value: Any, low: float, high: float) -> None:
-    if not (isinstance(value, int | float) and low <= value <= high):
+    if not (isinstance(value, Real) and low <= float(value) <= high):
         raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
 
 
