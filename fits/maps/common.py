@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from fits.maps.options import MapOptions
 from fits.maps.search import fit_first, search, starts_at
-from fits.maps.texels import Fits, Integers, Texels, Truths, fit_texels, widths, with_own_directions
+from fits.maps.texels import Fits, Integers, Texels, fit_texels, held_by_bounds, widths, with_own_directions
 from fits.optimise.multi_start import start_points
-from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNKNOWN_BEYOND
+from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.problem.parameters import is_free
 from fits.problem.problem import Problem
 
@@ -125,7 +125,7 @@ class _Joint(NamedTuple):
     def step(self, at: Floats) -> tuple[Floats, Floats]:
         """A Gauss-Newton step from there and standard errors, in boxes: 0 and NaN for what a bound holds, 0 and
         infinite for what the data do not know."""
-        free = np.flatnonzero(~_held(at, self.gradient))
+        free = np.flatnonzero(~held_by_bounds(at, self.gradient))
         step, error = np.zeros(len(at)), np.full(len(at), np.nan)
         if free.size:
             sizes, directions = np.linalg.eigh(self.information[np.ix_(free, free)])
@@ -135,12 +135,6 @@ class _Joint(NamedTuple):
             lengths = np.linalg.norm(directions * spread, axis=1)
             error[free] = np.where(lengths > UNKNOWN_BEYOND, np.inf, lengths)
         return step, error
-
-
-def _held(unit: Floats, gradient: Floats) -> Truths:
-    """Which parameters a bound holds."""
-    least = LEAST_GRADIENT
-    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
 
 
 def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _Joint:
@@ -155,7 +149,7 @@ def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _J
     slopes[of_common] /= np.sqrt(count)
     information = np.einsum("mki,mkj->mij", fits.root, fits.root) + slopes.T @ slopes
     # the Schur complement, texel by texel
-    held = _held(fits.unit[:, rest], gradient[:, rest])
+    held = held_by_bounds(fits.unit[:, rest], gradient[:, rest])
     inner = np.where(held[:, :, None] | held[:, None, :], 0.0, information[:, rest[:, None], rest])
     across = np.where(held[:, :, None], 0.0, information[:, rest[:, None], places])
     slope = np.where(held, 0.0, gradient[:, rest])

@@ -117,7 +117,7 @@ class MapOptions:
     """The median chi-square is no chance this many of a texel's standard deviations from 1."""
 
     processes: int = 1
-    """1: threads of this process, one a core; of more each has a core of its own."""
+    """1: threads of this process, one a core; more: so many processes with one thread each."""
     force: bool = False
     """Throw away a store of other arguments, and begin anew."""
     progress: Progress | None = None

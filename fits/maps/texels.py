@@ -227,6 +227,11 @@ def widths(problem: Problem, vectors: Floats) -> Floats:
     return np.asarray(problem.model.box.slope(jnp.asarray(vectors)), float)
 
 
+def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:
+    """Which parameters lie on a bound of the unit box and would go beyond it; least: gradient that counts."""
+    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
+
+
 def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
     """As `fits.optimise.uncertainty`, of M fits: standard errors (M, P), NaN where a bound holds the parameter and
     infinite where nothing does; which are at a bound, (M, P); in which texels the data leave a parameter unidentified,
@@ -239,9 +244,7 @@ def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Float
     root, known = fits.root / np.sqrt(scatter)[..., None], fits.finite & np.isfinite(fits.root).all((1, 2))
     root = np.where(known[:, None, None], root, 0.0)
     insensitive = np.linalg.norm(root, axis=1) * UNKNOWN_BEYOND < 1.0
-    up, down = fits.gradient < -LEAST_GRADIENT * scatter, fits.gradient > LEAST_GRADIENT * scatter
-    at_bound = ((fits.unit <= ON_BOUND) & down) | ((fits.unit >= 1.0 - ON_BOUND) & up)
-    at_bound &= ~insensitive & known[:, None]
+    at_bound = held_by_bounds(fits.unit, fits.gradient, LEAST_GRADIENT * scatter) & ~insensitive & known[:, None]
     unidentified = (np.linalg.svd(root, compute_uv=False)[:, -1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
     prior = np.asarray(problem.model.box.prior_slopes())
     prior = prior[prior.any(axis=1)]
