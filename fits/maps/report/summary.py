@@ -39,7 +39,7 @@ class Summary:
     Attributes:
         texels, done: texels of the map, and of them those that are fitted or excluded.
         counts: texels with each flag.
-        at_bound, no_error: texels at which each parameter is at a bound, or is fitted and has no finite error.
+        at_bound: texels at which each parameter is at a bound.
         quartiles: of each array of the store, such as "values/base.albedo", where it is finite; NaN if it nowhere is.
     """
 
@@ -47,7 +47,6 @@ class Summary:
     done: int
     counts: dict[str, int]
     at_bound: dict[str, int]
-    no_error: dict[str, int]
     quartiles: dict[str, tuple[float, ...]]
 
     @property
@@ -65,19 +64,16 @@ def summarise(map: FittedMap) -> Summary:
     """The numbers of a map, finished or not; arrays are read one after the other."""
     flags = map.flags  # first: a texel that has them has everything
     fitted = (flags & FLAGS["fitted"]) != 0
-    at_bound, no_error, quartiles = map.at_bound[fitted], {}, {}
-    for path in (*map.arrays.keys() - {"flags", "start", "at_bound"},):
+    at_bound, quartiles = map.at_bound[fitted], {}
+    for path in map.arrays.keys() - {"flags", "start", "at_bound"}:
         values = map.read(path)[fitted].astype(float)
         finite = values[np.isfinite(values)]
         quartiles[path] = tuple(np.quantile(finite, (0.25, 0.5, 0.75)).tolist()) if finite.size else (np.nan,) * 3
-        if path.startswith("errors/"):
-            no_error[path.partition("/")[2]] = len(values) - len(finite)
     return Summary(
         texels=flags.size,
         done=int(np.count_nonzero(flags)),
         counts={name: int(np.count_nonzero(flags & bit)) for name, bit in FLAGS.items()},
         at_bound={name: int(np.count_nonzero(at_bound & (1 << place))) for place, name in enumerate(map.names)},
-        no_error=no_error,
         quartiles=quartiles,
     )
 
@@ -200,10 +196,8 @@ def quartile_table(summary: Summary, map: FittedMap) -> Table:
     rows = [(name, *words(f"values/{name}"), *words(f"errors/{name}"), map.units[name]) for name in map.names]
     rows.append(("chi2/dof", *words("reduced_chi_square"), "", "", "", "1"))
     rows.append(("measurements", *words("measurements"), "", "", "", "1"))
-    missing = {name: summary.no_error[name] for name in map.names if summary.no_error[name]}
-    notes = [f"{name} has no error in {share(count, summary.fitted)} of them." for name, count in missing.items()]
     columns = ("", "25 %", "median", "75 %", "error: 25 %", "error: median", "error: 75 %", "unit")
-    return Table("Quartiles over the fitted texels", columns, tuple(rows), " ".join(notes))
+    return Table("Quartiles over the fitted texels", columns, tuple(rows), "Of errors, those that are finite.")
 
 
 def worst_table(map: FittedMap) -> Table:
