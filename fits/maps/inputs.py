@@ -114,14 +114,14 @@ def _ordered(array: xr.DataArray, dims: tuple[Hashable, ...]) -> xr.DataArray:
     return array.transpose(*(name for name in dims if name in array.dims), ...)
 
 
-def _arrays(source: Any, wanted: str) -> tuple[Arrays, str | None]:
-    """The arrays of a file, a group, a Dataset or a mapping, None; or those beside one array, and its name."""
+def _arrays(source: Any, wanted: str) -> Arrays:
+    """The arrays of a file, a group, a Dataset or a mapping; or one array by the wanted name, and those beside it."""
     if isinstance(source, str | os.PathLike):
-        return _arrays_of_file(str(source))
+        return _arrays_of_file(str(source), wanted)
     coordinates = _members(source.coords, f"{wanted}/") if isinstance(source, xr.Dataset | xr.DataArray) else {}
     if isinstance(source, Mapping) or hasattr(source, "array_keys"):  # Datasets of xarray and groups are such
-        return coordinates | _members(source, f"{wanted}/"), None
-    return coordinates | {wanted: _array(source, wanted)}, wanted
+        return coordinates | _members(source, f"{wanted}/")
+    return coordinates | {wanted: _array(source, wanted)}
 
 
 def _members(group: Any, where: str) -> Arrays:
@@ -139,8 +139,8 @@ def _members(group: Any, where: str) -> Arrays:
     }
 
 
-def _arrays_of_file(source: str) -> tuple[Arrays, str | None]:
-    """The arrays of a file, None; or of the group of the one that is named as ``file.h5:/name``, and its name."""
+def _arrays_of_file(source: str, wanted: str) -> Arrays:
+    """The arrays of a file; or that which is named as ``file.h5:/name``, by the wanted name, and those beside it."""
     inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", source, re.IGNORECASE)
     path, name = (inside[1], inside[2].strip("/")) if inside else (source, "")
     require_there(path)
@@ -164,9 +164,9 @@ def _arrays_of_file(source: str) -> tuple[Arrays, str | None]:
     except Exception as error:  # codecs raise what they like
         raise ValueError(f"{path}: cannot be read: {one_line(error)}") from None
     arrays = {} if is_array and not name else _members(group, place)
-    if is_array and last not in arrays:
-        arrays[last] = _array(node, source)
-    return arrays, last if is_array else None
+    if is_array:
+        arrays[wanted] = arrays[last] if last in arrays else _array(node, source)
+    return arrays
 
 
 def _open(path: str, suffix: str) -> Any:
@@ -181,14 +181,13 @@ def _open(path: str, suffix: str) -> Any:
     return h5py.File(path, "r")
 
 
-def _choose(arrays: Arrays, name: str | None, wanted: str, source: Any) -> xr.DataArray:
-    """The array that was named, or that of the wanted name, or the only one."""
-    name = wanted if name is None else name
-    if name not in arrays and len(arrays) != 1:
+def _choose(arrays: Arrays, wanted: str, source: Any) -> xr.DataArray:
+    """The array of the wanted name, or the only one."""
+    if wanted not in arrays and len(arrays) != 1:
         where = source if isinstance(source, str | os.PathLike) else wanted
         names = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
         raise ValueError(f"{where}: no array {wanted!r}, {names}; PATH:/NAME chooses another")
-    return arrays[name] if name in arrays else next(iter(arrays.values()))
+    return arrays[wanted] if wanted in arrays else next(iter(arrays.values()))
 
 
 # ---- the measurements of a map ----
@@ -314,8 +313,8 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     Raises:
         ValueError: an array is not there or no such array, or shapes do not fit together.
     """
-    arrays, name = _arrays(values, "values")
-    array = _choose(arrays, name, "values", values)
+    arrays = _arrays(values, "values")
+    array = _choose(arrays, "values", values)
     if 0 in array.shape:
         raise ValueError(f"{array.name} has shape {array.shape}, must hold something along every axis")
     array = array.transpose(..., *(name for name in (SAMPLE, CHANNEL) if name in array.dims))
@@ -341,7 +340,7 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
     def other(source: Any, wanted: str, *choices: tuple[str, ...]) -> xr.DataArray | None:
         if source is None:
             return None
-        chosen = _ordered(_choose(*_arrays(source, wanted), wanted, source), array.dims)
+        chosen = _ordered(_choose(_arrays(source, wanted), wanted, source), array.dims)
         return _with_axes(chosen, sizes, *choices)
 
     deviations = other(sigma, "sigma", (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE), (SAMPLE,))
@@ -371,7 +370,7 @@ def _directions(geometry: Any, arrays: Arrays, dims: tuple[Hashable, ...]) -> Ar
             if len(geometry) != 2:
                 raise ValueError(f"geometry has {len(geometry)} entries, must be two: wi and wo")
             geometry = dict(zip(VECTORS, geometry, strict=True))
-        where, (arrays, _) = "geometry", _arrays(geometry, "geometry")
+        where, arrays = "geometry", _arrays(geometry, "geometry")
     names = next((names for names in (VECTORS, ANGLES) if all(name in arrays for name in names)), None)
     if names is None:
         wanted = f"{' and '.join(VECTORS)}, or {', '.join(ANGLES)} in degrees"
