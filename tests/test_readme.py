@@ -23,13 +23,12 @@ beside walks."""
 def blocks(language, pages=PAGES):
     """What stands in fences of that language, with the name of the page and which of its blocks it is."""
     found = [(page.stem, re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)) for page in pages]
+    named = [
+        (f"{name}-{index}", block) for name, texts in found if name not in LATER for index, block in enumerate(texts)
+    ]
     return [
-        pytest.param(
-            textwrap.dedent(block), id=f"{name}-{index}", marks=[pytest.mark.slow] * (f"{name}-{index}" in LONG)
-        )
-        for name, texts in found
-        if name not in LATER
-        for index, block in enumerate(texts)
+        pytest.param(textwrap.dedent(block), id=of, marks=[pytest.mark.slow] * (language == "python" and of in LONG))
+        for of, block in named
     ]
 
 
