@@ -22,51 +22,58 @@ from fits.data.checks import (
 from fits.data.measurements import Measurements
 from fits.data.scans import in_plane, incidences
 from fits.data.totals import Totals
-from fits.reports.tables import Table, degrees, quantity_in_words, shortened
+from fits.reports.tables import Table, degrees, shortened
 from fits.reports.verdicts import DEFAULT, ReportOptions
 
-RADIANS = 1.6
-"""A little more than a right angle in radians: angles that are all below this may be in radians."""
-
-MOST_CHANNELS, MOST_TOTALS, MOST_ENERGIES, MOST_ROWS = 12, 6, 6, 40
-"""Shown one by one: channels of measurements, channels of totals, incidences with an energy, and rows of a table."""
+MOST_CHANNELS, MOST_ENERGIES, MOST_ANGLES = 12, 6, 24
+"""Shown one by one: channels, incidences with an energy, and incidences in a line."""
 
 
-def source_table(data: Measurements) -> Table:
-    """What a file is: format, convention, counts, channels, sigma, and notes of its reader."""
-    source, used = data.source, int(np.count_nonzero(data.mask))
-    channels = ", ".join(data.channels)
+def source_rows(data: Measurements) -> tuple[tuple[str, str], ...]:
+    """What a file is: format, convention, counts, channels, incidences, sigma, and notes of its reader."""
+    source, used, channels = data.source, int(np.count_nonzero(data.mask)), ", ".join(data.channels)
     if len(data.channels) > MOST_CHANNELS:
         channels = f"{', '.join(data.channels[:3])}, ..., {data.channels[-1]} ({len(data.channels):,} in all)"
-    plane = [] if isinstance(data, Totals) else [("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}")]
-    rows = [
+    if isinstance(data, Totals):
+        quantity, plane = "shares of the incident flux", []
+        if data.spheres is not None:
+            spheres = "two integrating spheres" if data.spheres.together else "an integrating sphere"
+            quantity = f"{quantity}, as measured with {spheres}"
+    else:
+        quantity = f"{source.quantity}, converted to BRDF in 1/sr"
+        plane = [("in plane", f"{np.count_nonzero(in_plane(data))} of {len(data)}")]
+    angles = [one.theta for one in incidences(data.used())]
+    span = ", ".join(f"{angle:g}°" for angle in angles)
+    if len(angles) > MOST_ANGLES:
+        span = f"{len(angles)}, from {min(angles):g}° to {max(angles):g}°"
+    sigma = "none"
+    if data.sigma is not None and used:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = (data.sigma / np.abs(data.values))[data.mask]
+        sigma = f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
+    return (
         ("format", source.format),
-        ("quantity", quantity_in_words(data)),
+        ("quantity", quantity),
         ("measurements", f"{len(data)}, {used} used, {len(data) - used} masked"),
         ("channels", channels),
         *plane,
-        ("sigma", _sigma(data)),
+        ("incidence", span),
+        ("sigma", sigma),
         *(("attribution", word) for word in (source.attribution,) if word),
         *(("note", note) for note in source.notes),
-    ]
-    return Table(source.path, ("", ""), tuple(rows))
-
-
-def _sigma(data: Measurements) -> str:
-    if data.sigma is None:
-        return "none"
-    if not data.mask.any():
-        return "no measurement is used"
-    with np.errstate(divide="ignore", invalid="ignore"):
-        relative = (data.sigma / np.abs(data.values))[data.mask]
-    return f"median {np.median(relative):.2%} of the value, {np.min(relative):.2%} to {np.max(relative):.2%}"
+    )
 
 
 def data_table(data: Measurements) -> Table:
     """A row for each incidence: angles, counts, and the range of each channel's values; of totals for each of them."""
+    few, rows = len(data.channels) <= MOST_CHANNELS, []
     if isinstance(data, Totals):
-        return _totals_table(data)
-    flat, rows, few = in_plane(data), [], len(data.channels) <= MOST_CHANNELS
+        for kind, theta, values in zip(data.kinds, data.theta_i, data.values, strict=True):
+            numbers = values if few else (values.min(), values.max())
+            rows.append((kind, degrees(theta), *(f"{value:.4g}" for value in numbers)))
+        names = ("kind", "theta_i", *(data.channels if few else ("from", "to")))
+        return Table("Shares of the incident flux", names, shortened(rows))
+    flat = in_plane(data)
     for incidence in incidences(data):
         own = incidence.rows
         theta, values = data.theta_o[own], data.values[own]
@@ -76,31 +83,20 @@ def data_table(data: Measurements) -> Table:
         rows.append((*angles, *map(str, counts), *ranges))
     heads = tuple(f"BRDF {channel}" for channel in data.channels) if few else ("BRDF",)
     names = ("theta_i", "phi_i", "theta_o", "count", "used", "in plane", *heads)
-    return Table("Angles, and BRDF in 1/sr", names, tuple(shortened(rows, MOST_ROWS)), keys=2)
-
-
-def _totals_table(totals: Totals) -> Table:
-    few = len(totals.channels) <= MOST_TOTALS
-    rows = []
-    for kind, theta, values in zip(totals.kinds, totals.theta_i, totals.values, strict=True):
-        shown = values if few else (values.min(), values.max())
-        rows.append((kind, degrees(theta), *(f"{value:.4g}" for value in shown)))
-    names = ("kind", "theta_i", *(totals.channels if few else ("from", "to")))
-    return Table("Shares of the incident flux", names, tuple(shortened(rows, MOST_ROWS)), keys=1)
+    return Table("Angles, and BRDF in 1/sr", names, shortened(rows), keys=2)
 
 
 def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> list[str]:
     """Sentences on angles that look wrong, reciprocity, energy, symmetry, sampling and repeats of the used data; of
     totals on angles only."""
     angles = data.theta_i if isinstance(data, Totals) else np.concatenate([data.theta_i, data.theta_o])
-    largest = np.max(angles, initial=0.0)
-    found = []
-    if 0.0 < largest < RADIANS:
-        found = [f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees."]
+    largest, words = np.max(angles, initial=0.0), []
+    if 0.0 < largest < 1.6:  # a little more than a right angle in radians
+        words = [f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees."]
     if isinstance(data, Totals):
-        return found
+        return words
     return [
-        *found,
+        *words,
         *_brighter_side(sides(data)),
         _agreement(
             "Reciprocity",
@@ -130,9 +126,8 @@ def _agreement(what: str, pairs: Agreement | None, words: str, without: str) -> 
     """How well measurements agree that should; without: what is said where there are none."""
     if pairs is None:
         return f"{what}: {without}."
-    difference = (
-        f"they differ by {100.0 * pairs.median:.2g} % (median; 95 % of them by up to {100.0 * pairs.p95:.2g} %)"
-    )
+    median, most = 100.0 * pairs.median, 100.0 * pairs.p95
+    difference = f"they differ by {median:.2g} % (median; 95 % of them by up to {most:.2g} %)"
     if not math.isnan(pairs.z):
         difference += f", {pairs.z:.2g} of their standard errors"
     return f"{what}: {words.format(count=pairs.count, difference=difference, noise=100.0 * pairs.noise)}."
@@ -146,10 +141,10 @@ def _brighter_side(by_incidence: list[Sides]) -> list[str]:
     )
     if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
         return [f"Sides: all measurements in the plane of incidence lie on the light's side. {doubt}"]
-    of_light = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if len(of_light) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
+    brighter = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
+    if len(brighter) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
         return []
-    worst = max(of_light, key=lambda one: one.light)
+    worst = max(brighter, key=lambda one: one.light)
     where = f"at {worst.theta:g}° up to {worst.light:.3g} there, and {worst.mirror:.3g} on the mirror side"
     return [f"Sides: the brightest side is the light's: {where}. {doubt}"]
 
@@ -163,10 +158,8 @@ def _energy(by_incidence: list[Energy]) -> str:
         parts.append(f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it")
     more = f", and {len(by_incidence) - MOST_ENERGIES} more incidences" if len(by_incidence) > MOST_ENERGIES else ""
     words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}{more}."
-    above = [one for one in by_incidence if max(one.share) > 1.0]
-    if above:
-        words += f" It exceeds 1 at {', '.join(f'{one.theta:g}°' for one in above)}: the scale is wrong."
-    return words
+    above = [f"{one.theta:g}°" for one in by_incidence if max(one.share) > 1.0]
+    return f"{words} It exceeds 1 at {', '.join(above)}: the scale is wrong." if above else words
 
 
 def _sampling(by_incidence: list[Peak], options: ReportOptions) -> str:

@@ -31,8 +31,7 @@ def test_what_loses_nothing_cannot_be_seen_under_a_sky() -> None:
 
 
 def test_an_opaque_material_has_no_picture_from_behind() -> None:
-    figure = render(WHITE, SINGLE, title="white", size=16)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    titles = [axes.get_title(loc="left") for axes in render(WHITE, SINGLE, title="white", size=16).axes]
     assert "lit from the front" in titles
     assert "from behind" not in titles
     assert not any("transmitted" in title for title in titles)

@@ -11,7 +11,7 @@ import fits
 import layerjax as lj
 from fits.cli.parser import main
 from fits.data.formats import totals_csv
-from fits.reports.data_summary import data_table, source_table
+from fits.reports.data_summary import data_table, source_rows
 from fits.reports.plots.data import totals_picture
 from tests.helpers.commands import refused
 
@@ -76,6 +76,8 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
     assert (folder / "result" / "report.html").is_file()
     assert main(["convert", "totals.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
+    sphere = "200 25 12 1 0.96"
+    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
     capsys.readouterr()
     fit = ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r"]
     for words, message in (
@@ -83,22 +85,16 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
         ([*fit, "--max-polar-angle", "50"], "--max-polar-angle does not apply"),
         (["info", "totals.csv", "--read", "quantity=brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
         (["search", "totals.csv", "--out", "r"], "a search needs measurements along directions"),
+        (["convert", "slab.rxt", "slab.csv"], "slab.rxt: integrating spheres"),
     ):
         assert message in refused(words, capsys, folder)
-
-
-def test_totals_of_spheres_are_not_converted(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    monkeypatch.chdir(folder)
-    sphere = "200 25 12 1 0.96"
-    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
-    assert "slab.rxt: integrating spheres" in refused(["convert", "slab.rxt", "slab.csv"], capsys, folder)
 
 
 def test_many_channels_have_a_range(tmp_path: Path) -> None:
     names = tuple(f"{nm} nm" for nm in range(400, 700, 10))
     totals = fits.Totals.of(reflectance=np.linspace(0.1, 0.5, 30)[None], channels=names)
     assert data_table(totals).rows == (("reflectance", "0°", "0.1", "0.5"),)
-    assert dict(source_table(totals).rows)["quantity"] == "shares of the incident flux"
+    assert dict(source_rows(totals))["quantity"] == "shares of the incident flux"
     panel = totals_picture(totals).axes[0]
     assert len(panel.get_xticks()) == 10
     assert panel.get_xticklabels()[0].get_text() == "400 nm"
