@@ -224,13 +224,11 @@ class Search:
 
     Attributes:
         candidates: all stacks that were fitted, best first: by predictive score, then by BIC.
-        indistinguishable: names of those whose predictive score is within its error of the best.
         options: of the search.
         stopped: whether its budget ended it before it was done.
     """
 
     candidates: tuple[Candidate, ...]
-    indistinguishable: tuple[str, ...]
     options: SearchOptions = SearchOptions()
     stopped: bool = False
 
@@ -238,6 +236,12 @@ class Search:
     def best(self) -> Candidate:
         """The one with the best predictive score."""
         return self.candidates[0]
+
+    @property
+    def indistinguishable(self) -> tuple[str, ...]:
+        """Names of those whose predictive score is within its error of the best."""
+        others = [(one.name, one.model_score) for one in self.candidates[1:]]
+        return tuple(name for name, score in others if score is not None and score.indistinguishable)
 
     @property
     def ranking(self) -> tuple[str, ...]:
@@ -338,8 +342,7 @@ def search(
         fit = full[structure].fit if structure in full else coarse[structure]
         above = bic[structure] - min(bic.values())
         candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
-    near = [name for name, one in scores.items() if name != candidates[0].name and one.indistinguishable]
-    return Search(tuple(candidates), tuple(near), options, stopped)
+    return Search(tuple(candidates), options, stopped)
 
 
 class _CrossValidated(NamedTuple):

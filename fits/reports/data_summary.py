@@ -95,86 +95,70 @@ def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> lis
         words = [f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees."]
     if isinstance(data, Totals):
         return words
+    repeated = repeats(data)
+    noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
     return [
         *words,
         *_brighter_side(sides(data)),
-        _agreement(
-            "Reciprocity",
-            reciprocity(data),
-            "light and viewer are exchanged in {count:,} pairs of measurements; {difference}. A reciprocal model can "
-            "be no closer to them than half of that",
-            "no two measurements have light and viewer exchanged, it cannot be tested",
-        ),
+        f"Reciprocity: {_agreement('with light and viewer exchanged', reciprocity(data))}.",
         _energy(energies(data)),
-        _agreement(
-            "Symmetry",
-            symmetry(data),
-            "{count:,} pairs lie on either side of the plane of incidence; {difference}",
-            "no measurements lie on both sides of the plane of incidence, it cannot be tested",
-        ),
+        f"Symmetry: {_agreement('on either side of the plane of incidence', symmetry(data))}.",
         _sampling(peaks(data), options),
-        _agreement(
-            "Repeats",
-            repeats(data),
-            "{count:,} measurements were repeated; {difference}: a noise of about {noise:.2g} %",
-            "no measurement was repeated; the noise has to come from the file's sigma or from the fit",
-        ),
+        f"Repeats: {_agreement('along the same directions', repeated)}{noise}.",
     ]
 
 
-def _agreement(what: str, pairs: Agreement | None, words: str, without: str) -> str:
-    """How well measurements agree that should; without: what is said where there are none."""
+def _agreement(what: str, pairs: Agreement | None) -> str:
+    """How well pairs of measurements agree that should."""
     if pairs is None:
-        return f"{what}: {without}."
+        return f"there are no measurements {what}"
     median, most = 100.0 * pairs.median, 100.0 * pairs.p95
-    difference = f"they differ by {median:.2g} % (median; 95 % of them by up to {most:.2g} %)"
-    if not math.isnan(pairs.z):
-        difference += f", {pairs.z:.2g} of their standard errors"
-    return f"{what}: {words.format(count=pairs.count, difference=difference, noise=100.0 * pairs.noise)}."
+    errors = "" if math.isnan(pairs.z) else f", {pairs.z:.2g} of their standard errors"
+    words = f"{pairs.count:,} pairs of measurements {what} differ by {median:.2g} %"
+    return f"{words} (median; 95 % of them by up to {most:.2g} %){errors}"
 
 
 def _brighter_side(by_incidence: list[Sides]) -> list[str]:
     """That the brightest side is the light's, where it is: azimuths may be counted from the mirror direction."""
-    doubt = (
-        "Unless the sample is retro-reflective, azimuths of this file count from the mirror direction, which must lie "
-        "at phi_o = phi_i + 180."
-    )
-    if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
-        return [f"Sides: all measurements in the plane of incidence lie on the light's side. {doubt}"]
     brighter = [one for one in by_incidence if one.light > BRIGHTER * max(one.mirror, 0.0)]
-    if len(brighter) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
+    if by_incidence and all(math.isnan(one.mirror) for one in by_incidence):
+        where = "all measurements in the plane of incidence lie on the light's side"
+    elif len(brighter) <= sum(one.mirror > BRIGHTER * max(one.light, 0.0) for one in by_incidence):
         return []
-    worst = max(brighter, key=lambda one: one.light)
-    where = f"at {worst.theta:g}° up to {worst.light:.3g} there, and {worst.mirror:.3g} on the mirror side"
-    return [f"Sides: the brightest side is the light's: {where}. {doubt}"]
+    else:
+        worst = max(brighter, key=lambda one: one.light)
+        where = f"the brightest side is the light's: at {worst.theta:g}° up to {worst.light:.3g} there"
+        where = f"{where}, and {worst.mirror:.3g} on the mirror side"
+    return [
+        f"Sides: {where}. Unless the sample is retro-reflective, azimuths of this file count from the mirror "
+        "direction, which must lie at phi_o = phi_i + 180."
+    ]
 
 
 def _energy(by_incidence: list[Energy]) -> str:
     if not by_incidence:
         return "Energy: no incidence is measured over half of the hemisphere, the directional albedo is unknown."
-    parts = []
-    for one in by_incidence[:MOST_ENERGIES]:
-        share = "/".join(f"{part:.3g}" for part in one.share)
-        parts.append(f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it")
-    more = f", and {len(by_incidence) - MOST_ENERGIES} more incidences" if len(by_incidence) > MOST_ENERGIES else ""
-    words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}{more}."
+    shares = [("/".join(f"{part:.3g}" for part in one.share), one) for one in by_incidence[:MOST_ENERGIES]]
+    parts = [f"{share} at {one.theta:g}° over {100.0 * one.covered:.0f} % of it" for share, one in shares]
+    words = f"Energy: directional albedo over the measured part of the projected hemisphere: {'; '.join(parts)}."
     above = [f"{one.theta:g}°" for one in by_incidence if max(one.share) > 1.0]
     return f"{words} It exceeds 1 at {', '.join(above)}: the scale is wrong." if above else words
 
 
 def _sampling(by_incidence: list[Peak], options: ReportOptions) -> str:
+    """Whether the width of the peak about the mirror direction is sampled, where it is sampled least."""
     if not by_incidence:
         return "Sampling: no scan crosses the mirror direction of its light, the peak was not measured."
-    if not any(one.stands_out for one in by_incidence):
+    standing = [one for one in by_incidence if one.stands_out]
+    if not standing:
         return (
             f"Sampling: no peak stands out about the mirror direction: measurements within {FAR:g}° of it nowhere fall "
             "to half of the brightest one."
         )
-    worst = min((one for one in by_incidence if one.stands_out), key=lambda one: one.count)
-    words = (
-        f"Sampling: measurements above half the height of the peak about the mirror direction: {worst.count} or "
-        f"more (at {worst.theta:g}°, in steps of {worst.step:.2g}°)"
+    worst = min(standing, key=lambda one: one.count)
+    narrow = "the peak may be narrower than the steps, which then limit a fitted roughness"
+    return (
+        "Sampling: measurements above half the height of the peak about the mirror direction: "
+        f"{worst.count} or more (at {worst.theta:g}°, in steps of {worst.step:.2g}°): "
+        f"{narrow if worst.count < options.peak_points else 'its width is sampled'}."
     )
-    if worst.count < options.peak_points:
-        return f"{words}: the peak may be narrower than the steps, which then limit a fitted roughness."
-    return f"{words}: its width is sampled."

@@ -115,11 +115,7 @@ class FitReport:
             f"<h1>{html.escape(title)}</h1>",
             verdict(opening.sentences, opening.sound),
             sentences(opening.remarks) if opening.remarks else "",
-            section(
-                "Values",
-                tables.parameter_table(fit),
-                _stack_text(fit),
-            ),
+            section("Values", tables.parameter_table(fit, both=True), _stack_text(fit)),
             section(
                 "Data and model",
                 Table(

@@ -133,12 +133,10 @@ def load_fit(directory: str | Path) -> "Fit":
         )
         alternatives = tuple(minima[index] for index in content["alternatives"])
         return Fit(problem=problem, minima=minima, alternatives=alternatives, **stored)
-    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
-    except ValueError as error:
-        if str(error).startswith(str(directory)):
+    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
+        if isinstance(error, ValueError) and str(error).startswith(str(directory)):
             raise
-        raise ValueError(f"{directory / FIT}: {error}") from None
+        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
 
 
 def _content(directory: Path) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
@@ -20,7 +20,7 @@ from fits.reports.verdicts import identifiability, numerical_error
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
-    from fits.prediction.compare import ComparedFit, Comparison
+    from fits.prediction.compare import Comparison
     from fits.prediction.predict import Prediction
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
@@ -102,17 +102,14 @@ def noise_in_words(problem: "Problem") -> str:
     noise, start = problem.noise, problem.build(problem.start)
     parts = ["the file's own sigma"] if noise.use_sigma and problem.data.sigma is not None else []
     for level, unit in (("relative", "of the model's value"), ("floor", "1/sr")):
-        value = float(np.asarray(getattr(start, level)))
         if f"noise.{level}" in problem.names:
             parts.append(f"a fitted {level} part")
-        elif value > 0.0:
+        elif (value := float(np.asarray(getattr(start, level)))) > 0.0:
             assumed = " (assumed)" if level == "relative" and problem.noise_is_assumed else ""
             parts.append(f"{value:.3g} {unit}{assumed}")
-    if noise.discrepancy:
-        parts.append("a model discrepancy (Gaussian process)")
-    student = f"Student-t with {noise.degrees_of_freedom:g} degrees of freedom"
-    together = ", added in quadrature" if len(parts) > 1 else ""
-    return f"{', '.join(parts)}{together}; {'Gaussian' if noise.tails == 'gaussian' else student}"
+    parts += ["a model discrepancy (Gaussian process)"] if noise.discrepancy else []
+    law = "Gaussian" if noise.tails == "gaussian" else f"Student-t, {noise.degrees_of_freedom:g} degrees of freedom"
+    return f"{', '.join(parts)}{', added in quadrature' if len(parts) > 1 else ''}; {law}"
 
 
 # ---- tables of a fit ----
@@ -135,10 +132,12 @@ def problem_rows(fit: "Fit") -> tuple[tuple[str, str], ...]:
     )
 
 
-def parameter_table(fit: "Fit") -> Table:
-    """Value, standard error, unit, bounds and identifiability of each fitted parameter; where a model discrepancy was
-    added, also the value with independent noise."""
-    words, limits, independent = identifiability(fit), instrument_limits(fit), fit.without_discrepancy
+def parameter_table(fit: "Fit", both: bool = False) -> Table:
+    """Value, standard error, unit, bounds and identifiability of each fitted parameter.
+
+    both: where a model discrepancy was added, also the value with independent noise.
+    """
+    words, limits, independent = identifiability(fit), instrument_limits(fit), fit.without_discrepancy if both else None
     rows = []
     for name, value, low, high in zip(fit.values, fit.vector, fit.problem.low, fit.problem.high, strict=True):
         number, spread = with_error(value, fit.standard_errors[name])
@@ -220,33 +219,27 @@ def incidence_table(fit: "Fit") -> Table:
 
 def comparison_table(comparison: "Comparison") -> Table:
     """One row per fit, the best first: goodness of fit, number of parameters, and predictive score."""
-    rows, score = comparison.rows, comparison.rows[0].model_score
-    aic, bic = min(row.aic for row in rows), min(row.bic for row in rows)
-    cell: dict[str, Callable[[ComparedFit, Any], str]] = {  # by column: of a fit and its score
-        "fit": lambda row, _: row.name,
-        "parameters": lambda row, _: str(row.parameters),
-        "chi2/dof": lambda row, _: f"{row.reduced_chi_square:.4g}",
-        "chi2": lambda row, _: f"{row.chi_square:.5g}",
-    }
-    if math.isfinite(aic):
-        cell["log-lik."] = lambda row, _: f"{row.log_likelihood:.2f}"
-        cell["AIC - best"] = lambda row, _: f"{row.aic - aic:.1f}"
-        cell["BIC - best"] = lambda row, _: f"{row.bic - bic:.1f}"
-    if all(math.isfinite(row.loo) for row in rows):
-        cell["elpd_loo diff"] = lambda row, _: f"{row.loo_diff:.1f} ± {row.loo_dse:.1f}"
-    if score is not None:
-        cell["elpd"] = lambda _, score: f"{score.elpd:.1f}"
-        cell["elpd_diff ± dse"] = lambda _, score: f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
-        cell["weight"] = lambda _, score: f"{score.weight:.2f}"
-        cell["log evidence"] = lambda _, score: f"{score.evidence.log_evidence:.1f} ± {score.evidence.error:.1f}"
-        cell["model probability"] = lambda _, score: f"{score.model_probability:.2g}"
-    cell["converged"] = lambda row, _: "yes" if row.converged else "NO"
-    cell["at a bound"] = lambda row, _: ", ".join(row.at_bound)
+    fits, rows = comparison.rows, []
+    aic, bic = min(fit.aic for fit in fits), min(fit.bic for fit in fits)
+    for fit in fits:
+        cells = {"fit": fit.name, "parameters": str(fit.parameters)}
+        cells |= {"chi2/dof": f"{fit.reduced_chi_square:.4g}", "chi2": f"{fit.chi_square:.5g}"}
+        if math.isfinite(aic):
+            differences = {"AIC - best": f"{fit.aic - aic:.1f}", "BIC - best": f"{fit.bic - bic:.1f}"}
+            cells |= {"log-lik.": f"{fit.log_likelihood:.2f}", **differences}
+        if all(math.isfinite(one.loo) for one in fits):
+            cells["elpd_loo diff"] = f"{fit.loo_diff:.1f} ± {fit.loo_dse:.1f}"
+        if (score := fit.model_score) is not None:
+            cells |= {"elpd": f"{score.elpd:.1f}", "elpd_diff ± dse": f"{score.elpd_diff:.1f} ± {score.dse:.1f}"}
+            evidence = f"{score.evidence.log_evidence:.1f} ± {score.evidence.error:.1f}"
+            cells |= {"weight": f"{score.weight:.2f}", "log evidence": evidence}
+            cells["model probability"] = f"{score.model_probability:.2g}"
+        cells |= {"converged": "yes" if fit.converged else "NO", "at a bound": ", ".join(fit.at_bound)}
+        rows.append(tuple(cells.values()))
     words = {"elpd": "cross-validated elpd", "loo": "leave-one-out", "aic": "AIC", "chi_square": "chi-square"}
     notes = (f"sorted by {words[comparison.sorted_by]}, best first", *comparison.notes)
     note = " ".join(f"{line[0].upper()}{line[1:]}." for line in notes)
-    table = tuple(tuple(word(row, row.model_score) for word in cell.values()) for row in rows)
-    return Table("Comparison", tuple(cell), table, note)
+    return Table("Comparison", tuple(cells), tuple(rows), note)
 
 
 def scores_table(prediction: "Prediction", data: Measurements, title: str) -> Table:

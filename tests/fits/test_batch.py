@@ -19,6 +19,7 @@ from tests.helpers.coats import TRUE, make_folder
 from tests.helpers.files import contents
 
 STACKS, FEW = ["coat.toml", "bare.toml"], {"starts": 2}
+FIT_FILE = batch.fit_file
 
 
 @pytest.fixture(autouse=True)
@@ -230,18 +231,25 @@ def test_processes_give_what_threads_give(folder: Path, whole: Path) -> None:
 def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(
     folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit_file = batch.fit_file
+    copied = batch.fit_file
 
     def broken(directory: Path, *given: object, **options: object) -> object:
         if directory.parent.name == "coated.csv" and directory.name == "coat":
             raise RuntimeError("no memory\nis left")
-        return fit_file(directory, *given, **options)
+        by = FIT_FILE if directory.parent.name == "paint.csv" and directory.name == "bare" else copied
+        return by(directory, *given, **options)
 
     monkeypatch.setattr(batch, "fit_file", broken)
+    fits.fit_files("scans/coated.csv", ["bare.toml"], "out", **FEW)
+    precious = folder / "out" / "paint.csv" / "bare" / "precious"
+    precious.parent.mkdir(parents=True)
+    precious.touch()
     for force in (False, True):
         found = fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", force=force, **FEW)
-        assert [row["result"] for row in found.rows] == ["failed", "converged", "converged", "converged"]
+        assert [row["result"] for row in found.rows] == ["failed", "converged", "converged", "failed"]
         assert found.rows[0]["status"] == "RuntimeError: no memory is left"
+        assert "bare: exists and is not a result directory" in found.rows[3]["status"]
+        assert precious.exists()
 
 
 @pytest.mark.parametrize(

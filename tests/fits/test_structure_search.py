@@ -170,8 +170,11 @@ def test_it_is_reported_with_one_verdict(found: fits.Search, tmp_path: Path) -> 
     assert "Of 4 models, haze / diffuse has the best cross-validated predictive score." in words
     assert "It is ahead of every other cross-validated model by more than the error of the difference." in words
     assert "indistinguishable" not in words
-    near = " ".join(structure_search.search_sentences(replace(found, indistinguishable=("metal",))))
-    assert "It is statistically indistinguishable from metal (" in near
+    close = {one: replace(one, model_score=replace(one.model_score, clear_diff=-1.0)) for one in found.candidates[:2]}
+    near = replace(found, candidates=tuple(close.get(one, one) for one in found.candidates))
+    assert near.indistinguishable == (found.candidates[1].name,)
+    near = " ".join(structure_search.search_sentences(near))
+    assert f"It is statistically indistinguishable from {found.candidates[1].name} (" in near
     assert "BIC, weight and probability do not overrule this" in near
     assert "It is ahead" not in near
     structure_search.write_report(found, tmp_path)

@@ -99,7 +99,7 @@ def test_both_are_told(wrong: Fit) -> None:
     assert "neighbouring residuals correlate by +0." in words
     assert "Set `discrepancy = false` to disable it" in words
     assert f"Model discrepancy: {100.0 * wrong.values['noise.discrepancy.amplitude']:.2g} % of the BSDF" in words
-    table = tables.parameter_table(wrong)
+    table = tables.parameter_table(wrong, both=True)
     place = table.columns.index("independent noise")
     before = {row[0]: row[place] for row in table.rows if row[place]}
     assert list(before) == ["['a']", "['b']"]

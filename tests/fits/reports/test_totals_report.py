@@ -116,12 +116,3 @@ def test_an_angle_has_one_colour_in_all_panels_and_is_in_the_legend() -> None:
                 colours.setdefault(label, set()).add(line.get_color())
     assert all(len(one) == 1 for one in colours.values())
     assert len(set.union(*colours.values())) == 3
-
-
-def test_a_stack_of_one_channel_beside_data_of_three(tmp_path: Path) -> None:
-    geometry = fits.slices((10.0, 40.0), np.arange(-60.0, 61.0, 20.0))
-    values = np.full((len(geometry), 3), 0.1) * (1.0 + 0.01 * np.random.default_rng(0).standard_normal((1, 3)))
-    data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(geometry), bool), ("r", "g", "b"))
-    fit = fits.fit(lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0))), data, starts=1)
-    assert fit.predicted.shape == values.shape
-    fits.report(fit, path=tmp_path / "report.html")
