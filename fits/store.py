@@ -214,11 +214,11 @@ def fingerprint(**parts: Any) -> dict[str, str]:
     return {name: _digest(part) for name, part in parts.items()}
 
 
-def differences(stored: Mapping[str, str], given: Mapping[str, str]) -> str:
+def differences(stored: Mapping[str, str], expected: Mapping[str, str]) -> str:
     """In words, where two fingerprints differ; empty if they do not."""
     words = []
-    for name in dict.fromkeys((*stored, *given)):
-        one, other = stored.get(name, "none"), given.get(name, "none")
+    for name in dict.fromkeys((*stored, *expected)):
+        one, other = stored.get(name, "none"), expected.get(name, "none")
         if one != other:
             hidden = one.startswith(_DIGEST) or other.startswith(_DIGEST)
             words.append(name if hidden else f"{name} {one}, not {other}")
@@ -284,11 +284,11 @@ def _encoded(record: Any) -> tuple[str, bytes]:
 def _decoded(text: str, content: bytes) -> Any:
     begin = 0
 
-    def taken(found: dict[str, Any]) -> Any:
+    def taken(table: dict[str, Any]) -> Any:
         nonlocal begin
-        if _ARRAY not in found:
-            return found
-        dtype, shape = np.dtype(found[_ARRAY]), tuple(found["shape"])
+        if _ARRAY not in table:
+            return table
+        dtype, shape = np.dtype(table[_ARRAY]), tuple(table["shape"])
         count = int(np.prod(shape, dtype=int))
         array = np.frombuffer(content, dtype, count, begin).reshape(shape)
         begin += count * dtype.itemsize

@@ -10,7 +10,7 @@ from html import escape
 from typing import Literal, NamedTuple
 
 WIDTH, LEFT, RIGHT = 640, 8, 158
-"""Of the picture, and where its layers begin and end, in pixels."""
+"""Size of the picture, and where its layers begin and end, in pixels."""
 
 SKY, LINE, MARGIN = 40, 17, 7
 """Heights of what lies above the layers and of a line of words, and what is left above and below these."""

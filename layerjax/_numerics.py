@@ -55,7 +55,7 @@ def decay_between(a: Array, b: Array) -> Array:
     difference, middle = a - b, 0.5 * (a + b)
     near = jnp.abs(difference) < 1.0
     square = jnp.where(near, 0.25 * difference * difference, 0.25)
-    terms = 7 if jnp.finfo(square.dtype).bits == 64 else 4  # what is left out is below half a unit of rounding
+    terms = 7 if jnp.finfo(square.dtype).bits == 64 else 4  # the omitted terms are below half a unit of rounding
     total = horner([1.0 / math.factorial(2 * n + 1) for n in range(terms)], square)  # sinh(x) / x
     smaller, apart = jnp.where(a < b, a, b), jnp.where(near, 2.0, jnp.abs(difference))
     ratio = jnp.where(near, total, (1.0 - jnp.exp(-apart)) / apart)
@@ -132,6 +132,6 @@ def horizon(dtype: jnp.dtype) -> float:
 
 
 def _series(x: Array) -> Array:
-    """Sum of (-x)^n / (n + 1)!; what is left out is below half a unit of rounding up to SERIES_LIMIT."""
+    """Sum of (-x)^n / (n + 1)!; the omitted terms are below half a unit of rounding up to SERIES_LIMIT."""
     terms = 12 if jnp.finfo(x.dtype).bits == 64 else 7
     return horner([(-1.0) ** n / math.factorial(n + 1) for n in range(terms)], x)

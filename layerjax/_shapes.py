@@ -26,20 +26,20 @@ Shape = tuple[int, ...]
 
 
 class Number(NamedTuple):
-    """A number of a stack: its name, its shape, and how many axes of that are its own, not the map's.
+    """A number of a stack: its name, its shape, and how many axes of that are not the map's.
 
-    by_channel: it may differ from channel to channel; `own` is then 0 or 1.
+    by_channel: it may differ from channel to channel; `channel_axes` is then 0 or 1.
     """
 
     name: str
     shape: Shape
-    own: int
+    channel_axes: int
     by_channel: bool
 
     @property
     def of_map(self) -> int:
         """Axes of the map."""
-        return len(self.shape) - self.own
+        return len(self.shape) - self.channel_axes
 
 
 def numbers_of(stack: Any) -> Iterator[Number]:
@@ -89,7 +89,7 @@ def channel_count(stack: Any) -> int:
     map_shape(stack)
     sizes: dict[int, str] = {}
     for number in numbers_of(stack):
-        if number.by_channel and number.own and number.shape[-1] > 1:
+        if number.by_channel and number.channel_axes and number.shape[-1] > 1:
             sizes.setdefault(number.shape[-1], number.name)
     if len(sizes) > 1:
         raise ValueError(
@@ -103,7 +103,7 @@ def map_shape(stack: Any) -> Shape:
     """Shape of a map of stacks; () if it is a single one.
 
     Raises:
-        ValueError: shapes that do not go together, or of which it cannot be told whether they count texels or channels.
+        ValueError: shapes that do not go together, or that may count texels as well as channels.
     """
     found = list(numbers_of(stack))
     axes = max((number.of_map for number in found), default=0)
@@ -124,7 +124,13 @@ def map_shape(stack: Any) -> Shape:
         raise ValueError(f"Stack: parameters disagree on the shape of the map: {shapes}") from None
     _refuse_square(found, mapped)
     for number in found:
-        if number.by_channel and axes == 1 and not number.of_map and number.own and number.shape == shape != (1,):
+        if (
+            number.by_channel
+            and axes == 1
+            and not number.of_map
+            and number.channel_axes
+            and number.shape == shape != (1,)
+        ):
             raise ValueError(
                 f"Stack.{number.name}: shape {number.shape} given in a map of shape {shape}: texels or channels? "
                 f"{_wanted(number, axes)}, or (1, C) for channels that all texels share"
@@ -132,12 +138,12 @@ def map_shape(stack: Any) -> Shape:
     return shape
 
 
-def _refuse_square(found: list[Number], mapped: list[Number]) -> None:
+def _refuse_square(numbers: list[Number], mapped: list[Number]) -> None:
     """Refuse a map of as many texels as channels where no other number tells which of its axes are which."""
     number = mapped[0]
     if len(number.shape) != 2 or len({*number.shape}) != 1 or number.shape == (1, 1):
         return
-    others = [other for other in found if other.by_channel or other.of_map]
+    others = [other for other in numbers if other.by_channel or other.of_map]
     if all(other.shape in (number.shape, (), (1,)) for other in others):
         raise ValueError(
             f"Stack.{number.name}: shape {number.shape} given, and nothing else says whether these are texels or "
@@ -150,7 +156,7 @@ def _wanted(number: Number, axes: int) -> str:
     texels = ", ".join("HW" if axes == 2 else "N" * axes)
     if number.by_channel:
         return f"({texels}, 1) is a number a texel, ({texels}, C) one a channel of each"
-    return f"({texels}{',' if axes == 1 else ''}{' 3' if number.own else ''}) is one a texel"
+    return f"({texels}{',' if axes == 1 else ''}{' 3' if number.channel_axes else ''}) is one a texel"
 
 
 def require_single(stack: Any, who: str) -> None:

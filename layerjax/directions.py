@@ -139,9 +139,9 @@ def normalize(a: Vector) -> Vector:
 def horizontal(a: Vector) -> Vector:
     """The unit vector in the tangent plane (z = 0) below or above a, +x if a has no azimuth."""
     squared = a[0] * a[0] + a[1] * a[1]
-    leans = squared > 0
-    inverse = 1.0 / jnp.sqrt(jnp.where(leans, squared, 1.0))
-    return jnp.where(leans, a[0] * inverse, 1.0), jnp.where(leans, a[1] * inverse, 0.0), jnp.zeros_like(squared)
+    tilted = squared > 0
+    inverse = 1.0 / jnp.sqrt(jnp.where(tilted, squared, 1.0))
+    return jnp.where(tilted, a[0] * inverse, 1.0), jnp.where(tilted, a[1] * inverse, 0.0), jnp.zeros_like(squared)
 
 
 def is_above(w: Vector) -> Array:
@@ -161,7 +161,7 @@ def half_vector(wi: Vector, wo: Vector, *, same_side: bool = False) -> tuple[Vec
     """Half vector h of the unit vectors wi and wo, and the cosine |wi . h|, in [0, 1].
 
     At wo = -wi the half vector is undefined (any vector normal to wi is a limit): one fixed vector normal to wi
-    stands in. `same_side` promises that wi and wo lie on the same side of the surface, where that cannot happen, and
+    stands in. `same_side` states that wi and wo lie on the same side of the surface, where that cannot happen, and
     skips the guard.
     """
     total = add(wi, wo)

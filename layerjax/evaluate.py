@@ -336,7 +336,7 @@ def _evaluate_map(
     given, channels = chosen.needed(key, "evaluate"), channel_count(stack)
     if not chosen.uses_known:
         known, own_known = None, False
-    own = maps.Own(own_known, above)
+    own = maps.TexelDirections(own_known, above)
     return maps.values(mapped, chosen, at, directions, side, channels, given, None if own_known else known, own)
 
 

@@ -77,7 +77,7 @@ _TABLE = "Wang et al. 2022, Table 2 and Fig. "
 _MATERIALS = {
     each.name: each
     for each in (
-        Material("window_shade", _TABLE + "1", "the orientation map stands as fibers along x", _window_shade),
+        Material("window_shade", _TABLE + "1", "fibers along x in place of the orientation map", _window_shade),
         Material("fabric", _TABLE + "17", "fibers of alpha 0.1 as in the table, along x", lambda: _fabric(0.1)),
         Material("fabric_as_in_the_text", _TABLE + "17", "fibers of alpha 0.5, along x", lambda: _fabric(0.5)),
         Material("plant", _TABLE + "18", "white, thickness 1, orientation the normal", lambda: _plant(1.0, None)),
@@ -95,7 +95,17 @@ _MATERIALS = {
             "pale wood, fibers that dip into the surface",
             lambda: _wood([0.85, 0.7, 0.5], (1.0, 0.0, 0.2)),
         ),
-        Material("rough_copper", "Wang et al. 2022, Fig. 20", "deep flakes of alpha 0.5; no numbers given", _copper),
-        Material("sheen", "Wang et al. 2022, Fig. 16", "upright fibers over a diffuse base; no numbers given", _sheen),
+        Material(
+            "rough_copper",
+            "Wang et al. 2022, Fig. 20",
+            "deep flakes of alpha 0.5; the paper states no parameters",
+            _copper,
+        ),
+        Material(
+            "sheen",
+            "Wang et al. 2022, Fig. 16",
+            "upright fibers over a diffuse base; the paper states no parameters",
+            _sheen,
+        ),
     )
 }

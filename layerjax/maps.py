@@ -1,9 +1,9 @@
 """Maps of stacks: every texel a stack of its own, in chunks that stay in the cache.
 
-What a map is, and how its texels are told from channels, stands in `layerjax._shapes`. Directions broadcast against it:
-one of shape ``(3,)`` serves all texels, ``(H, W, 3)`` are one for each, ``(K, 1, 1, 3)`` K for all of them, and
-``(K, H, W, 3)`` K for each. Memory grows with inputs and results alone; a gradient computes each chunk again on the way
-back.
+`layerjax._shapes` documents what a map is, and how texels are distinguished from channels. Directions broadcast
+against a map: one of shape ``(3,)`` serves all texels, ``(H, W, 3)`` are one for each, ``(K, 1, 1, 3)`` K for all of
+them, and ``(K, H, W, 3)`` K for each. Memory grows with inputs and results alone; a gradient computes each chunk again
+on the way back.
 """
 
 import math
@@ -52,12 +52,12 @@ class Layout(NamedTuple):
         w = jnp.broadcast_to(w, (*self.result, 3)).reshape(math.prod(self.ahead), math.prod(self.shape), 3)
         return jnp.swapaxes(w, 0, 1)
 
-    def gathered(self, found: Array) -> Array:
-        """What was found, (texels, pairs, ...), in the shape of the result."""
-        return jnp.swapaxes(found, 0, 1).reshape(*self.result, *found.shape[2:])
+    def gathered(self, values: Array) -> Array:
+        """Values (texels, pairs, ...) in the shape of the result."""
+        return jnp.swapaxes(values, 0, 1).reshape(*self.result, *values.shape[2:])
 
 
-class Own(NamedTuple):
+class TexelDirections(NamedTuple):
     """Whether the directions of each texel are few enough to be known, and whether all are known to lie above."""
 
     known: bool
@@ -88,12 +88,12 @@ def layout(shape: Shape, *directions: Array) -> Layout:
     return Layout(shape, result[: len(result) - over], shared)
 
 
-def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequence[Array], together: int) -> Any:
-    """function(stack, *own) of every texel; what it returns along a new first axis.
+def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, rows: Sequence[Array], together: int) -> Any:
+    """function(stack, *rows) of every texel; what it returns along a new first axis.
 
     Args:
         stack: a map; function gets single ones.
-        own: arrays (texels, ...), an entry for each.
+        rows: arrays (texels, ...), an entry for each.
         together: texels side by side.
     """
     texels = math.prod(at.shape)
@@ -106,14 +106,14 @@ def each_texel(function: Callable[..., Any], stack: Stack, at: Layout, own: Sequ
         if is_mapped
     ]
 
-    def one(numbers: list[Array], own: Sequence[Array], _: Array) -> Any:
+    def one(numbers: list[Array], row: Sequence[Array], _: Array) -> Any:
         rest = iter(numbers)
         filled = [next(rest) if is_mapped else leaf for leaf, is_mapped in zip(leaves, mapped, strict=True)]
-        return function(jax.tree.unflatten(structure, filled), *own)
+        return function(jax.tree.unflatten(structure, filled), *row)
 
     # numbered: a map may be left without a number that differs, where all its layers are known not to be there
-    rows = (numbers, tuple(own), jnp.arange(texels))
-    return over_devices(partial(_side_by_side, one, together), rows, least=together, filled=True)
+    numbered = (numbers, tuple(rows), jnp.arange(texels))
+    return over_devices(partial(_side_by_side, one, together), numbered, least=together, filled=True)
 
 
 def _side_by_side(one: Callable[..., Any], together: int, rows: Any) -> Any:
@@ -143,7 +143,7 @@ def values(
     channels: int,
     key: Array | None,
     known: KnownDirections | None,
-    own: Own,
+    texels: TexelDirections,
 ) -> Array:
     """BSDF of every texel of a simplified map, ``at.result + (channels,)``.
 
@@ -151,7 +151,7 @@ def values(
     """
 
     def one(stack: Stack, wi: Array, wo: Array, key: Array | None) -> tuple[Array, ...]:
-        state = transport.prepare_for(stack, lambda: own_cosines(wi, wo, own.above) if own.known else known)
+        state = transport.prepare_for(stack, lambda: own_cosines(wi, wo, texels.above) if texels.known else known)
         found, _ = transport.measured(state, wi, wo, side, channels, key)
         return tuple(found[..., c] for c in range(channels))
 
@@ -223,10 +223,10 @@ def _along(
 @compiled
 def of_directions(function: Callable[..., Array], stack: Stack, at: Layout, w: Array, *options: Any) -> Array:
     """function(stack, w, *options) of every texel, ``at.result + ...``."""
-    own = [] if at.shared else [at.spread(w)]
+    rows = [] if at.shared else [at.spread(w)]
 
-    def one(stack: Stack, *own: Array) -> Array:
-        return function(stack, own[0] if own else at.spread(w), *options)
+    def one(stack: Stack, *row: Array) -> Array:
+        return function(stack, row[0] if row else at.spread(w), *options)
 
     together = max(1, room() * TEXELS // max(1, math.prod(at.ahead)))
-    return at.gathered(each_texel(one, stack, at, own, together))
+    return at.gathered(each_texel(one, stack, at, rows, together))

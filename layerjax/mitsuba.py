@@ -130,7 +130,7 @@ class Material:
         return mi.Spectrum(*_called(found, self._varying(), wi))
 
     def density(self, wi: Any, wo: Any) -> Any:
-        """Of `draw`, in 1/sr, without derivatives."""
+        """Density of `draw`, in 1/sr, without derivatives."""
 
         def found(_: Any, wi: Any, wo: Any) -> tuple[Array, ...]:
             return (pdf(self.prepared, _rows(wi), _rows(wo)),)
@@ -148,7 +148,7 @@ class Material:
         return mi.Vector3f(*wo), density
 
     def _varying(self) -> dict[str, Any]:
-        """The numbers that derivatives are asked for."""
+        """The numbers that gradients are enabled for."""
         return {name: number for name, number in self.numbers.items() if dr.grad_enabled(number)}
 
     def _by_colour(self, values: Array) -> tuple[Array, ...]:
@@ -162,7 +162,7 @@ def _plugin(variant: str) -> type:
     class Layered(mi.BSDF):
         def __init__(self, properties: Any, material: Material | None = None):
             mi.BSDF.__init__(self, properties)
-            self.material = _asked_for(properties) if material is None else material
+            self.material = _material_of(properties) if material is None else material
             self._name_components()
 
         def _name_components(self) -> None:
@@ -202,7 +202,7 @@ def _plugin(variant: str) -> type:
     return Layered
 
 
-def _asked_for(properties: Any) -> Material:
+def _material_of(properties: Any) -> Material:
     """The material that a scene names."""
     name = properties.get("material", "")
     if name not in (*materials, *gallery.names()):
@@ -213,7 +213,7 @@ def _asked_for(properties: Any) -> Material:
 
 def _evaluate(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
     light, viewer = (wo, si.wi) if ctx.mode == mi.TransportMode.Radiance else (si.wi, wo)
-    active = active & _is_asked_for(material, ctx, si.wi, wo)
+    active = active & _is_enabled(material, ctx, si.wi, wo)
     value = material.value(light, viewer, si.p) * dr.abs(mi.Frame3f.cos_theta(wo))
     return dr.select(active, value, 0.0)
 
@@ -222,7 +222,7 @@ def _both(material: Material, ctx: Any, si: Any, wo: Any, active: Any) -> tuple[
     """Value and density. Where light cannot go there is none of either: what is drawn there counts as not drawn."""
     value = _evaluate(material, ctx, si, wo, active)
     density = material.density(si.wi, wo) * (1.0 - _share_of_null(material, ctx, si))
-    active = active & _is_asked_for(material, ctx, si.wi, wo) & (material.is_random | (dr.max(value) > 0.0))
+    active = active & _is_enabled(material, ctx, si.wi, wo) & (material.is_random | (dr.max(value) > 0.0))
     return value, dr.select(active, density, 0.0)
 
 
@@ -240,26 +240,26 @@ def _sample(material: Material, ctx: Any, si: Any, sample1: Any, sample2: Any, a
     glossy = dr.select(passes, +mi.BSDFFlags.GlossyTransmission, +mi.BSDFFlags.GlossyReflection)
     drawn.sampled_type, drawn.sampled_component = mi.UInt32(glossy), dr.select(passes, mi.UInt32(1), mi.UInt32(0))
     if material.has_null:
-        straight = sample1 < null
-        drawn.wo = dr.select(straight, -si.wi, drawn.wo)
-        drawn.pdf = dr.select(straight, null, drawn.pdf)
-        drawn.eta = dr.select(straight, 1.0, drawn.eta)
-        drawn.sampled_type = dr.select(straight, +mi.BSDFFlags.Null, drawn.sampled_type)
-        drawn.sampled_component = dr.select(straight, mi.UInt32(2), drawn.sampled_component)
-        value = dr.select(straight, material.passing(si.wi) / null, value)
+        passes_through = sample1 < null
+        drawn.wo = dr.select(passes_through, -si.wi, drawn.wo)
+        drawn.pdf = dr.select(passes_through, null, drawn.pdf)
+        drawn.eta = dr.select(passes_through, 1.0, drawn.eta)
+        drawn.sampled_type = dr.select(passes_through, +mi.BSDFFlags.Null, drawn.sampled_type)
+        drawn.sampled_component = dr.select(passes_through, mi.UInt32(2), drawn.sampled_component)
+        value = dr.select(passes_through, material.passing(si.wi) / null, value)
     drawn.pdf = dr.select(active, drawn.pdf, 0.0)
     return drawn, dr.select(active & (drawn.pdf > 0.0), value, 0.0)
 
 
-def _is_asked_for(material: Material, ctx: Any, wi: Any, wo: Any) -> Any:
-    """Whether a context asks for light that is scattered from wi to wo."""
+def _is_enabled(material: Material, ctx: Any, wi: Any, wo: Any) -> Any:
+    """Whether a context enables the component that scatters light from wi to wo."""
     reflects = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0)
     passes = material.is_open and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)
     return dr.select(wi.z * wo.z > 0.0, mi.Bool(reflects), mi.Bool(passes))
 
 
 def _share_of_null(material: Material, ctx: Any, si: Any) -> Any:
-    """How often light is drawn that passes straight."""
+    """Share of samples that pass through without scattering."""
     if not (material.has_null and ctx.is_enabled(mi.BSDFFlags.Null, 2)):
         return mi.Float(0.0)
     if not (ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0) or ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1)):

@@ -25,7 +25,7 @@ RANGES[WEIGHTS] = (0.0, 1.0)
 _PARTS = "Mixture.parts"
 
 SUM_SLACK = 1e-6
-"""By which weights may miss a sum of 1: digits that a file has left out."""
+"""By which the sum of weights may differ from 1, as files round them."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")

@@ -61,5 +61,5 @@ def numerical_error(
 
 def _values(prepared: Prepared, wi: Array, wo: Array, side: Side) -> tuple[Array, Array | float]:
     """Values, and the error of them in which resolutions may agree."""
-    asked = prepared.state, wi, wo, side, prepared.channels
-    return prepared.transport.measured(*asked, None)[0], prepared.transport.doubt(*asked)
+    arguments = prepared.state, wi, wo, side, prepared.channels
+    return prepared.transport.measured(*arguments, None)[0], prepared.transport.doubt(*arguments)

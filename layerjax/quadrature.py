@@ -185,7 +185,7 @@ def _crossings(wi: Vector, first: Vector, second: Vector) -> Array:
 
 
 def _panel_frame(pole: Vector, towards: Vector) -> tuple[Vector, Vector]:
-    """A frame about the pole whose first vector leans towards the given one (any, if they are parallel)."""
+    """A frame about the pole whose first vector is tilted towards the given one (any, if they are parallel)."""
     projected = combine(jnp.ones_like(pole[2]), towards, -dot(towards, pole), pole)
     tangent, _ = frame(pole)
     parallel = dot(projected, projected) < jnp.finfo(pole[2].dtype).eps ** 1.5  # what is left is rounding

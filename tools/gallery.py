@@ -23,21 +23,20 @@ SPHERE, WIDTH, QUALITY = 256, 1000, 88
 BEGINNING = """\
 # Gallery
 
-The materials of `layerjax.gallery`, after the scenes of Wang et al. 2022. Where the paper has a map (of orientation,
-thickness or colour) a constant stands, which the remark says. `python -m tools.gallery --pictures` makes this page and
-its pictures again.
+The materials of `layerjax.gallery`, after the scenes of Wang et al. 2022. Where the paper has a texture map (of
+orientation, thickness or colour), the material has a constant, and its remark says so.
 
-`layerjax.gallery.stack("padauk")` is such a stack in Python; `gallery = "padauk"` stands for its layers in a stack
-file, and the commands take the name:
+In Python, `layerjax.gallery.stack("padauk")` returns the stack. In a stack file, `gallery = "padauk"` replaces the
+layers and the base. Commands take the name in place of a file:
 
 ```sh
 layerjax render padauk --out padauk.png
 layerjax export padauk --to rgl --out padauk.bsdf
 ```
 
-Each picture has spheres under a lamp from the front, from the side and, where light passes, from behind; the lobes in
-the plane of incidence; and the BSDF in that plane as a map of the light's angle by the viewer's. All orders of
-scattering are carried.
+Each picture shows spheres lit from the front, from the side and, if the material transmits light, from behind; the
+lobes in the plane of incidence; and the BSDF in that plane as a function of the angles of light and viewer. All
+orders of scattering are included. `python -m tools.gallery --pictures` generates this page and its pictures.
 """
 
 

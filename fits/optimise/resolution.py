@@ -63,19 +63,19 @@ class Resolutions:
     """The resolutions that a transport may take for a problem.
 
     Attributes:
-        given: the transport, with what it does not state.
+        stated: the transport, as far as it is stated.
         chosen: the same with nothing left open, for the start values.
         tilted: whether the stack is solved by ordinates, not by nodes and modes, as is decided while tracing.
     """
 
-    given: lj.AddingDoubling
+    stated: lj.AddingDoubling
     chosen: lj.AddingDoubling
     tilted: bool
 
     @property
     def open(self) -> bool:
         """Whether a fit chooses the resolution."""
-        return (self.given.ordinates if self.tilted else self.given.nodes) is None
+        return (self.stated.ordinates if self.tilted else self.stated.nodes) is None
 
     @property
     def far(self) -> lj.AddingDoubling:
@@ -118,7 +118,7 @@ class Resolutions:
         """The transport with what the user gave put back in; unchanged where the user left nothing to choose."""
         if not self.open:
             return transport
-        given = {name: value for name in FAR if (value := getattr(self.given, name)) is not None}
+        given = {name: value for name in FAR if (value := getattr(self.stated, name)) is not None}
         return replace(transport, **given)
 
 
@@ -133,10 +133,10 @@ def resolutions(problem: Problem) -> Resolutions | None:
     if not isinstance(transport, lj.AddingDoubling | str):
         return None
 
-    def chosen(stack: Any, given: Any) -> Any:
+    def chosen(stack: Any, transport: Any) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", lj.ResolutionWarning)  # a fit tells the error that is left by itself
-            return transport_for(stack, given, directions)
+            return transport_for(stack, transport, directions)
 
     def traced(vector: Array) -> tuple[lj.Transport, bool]:
         stack = model.build(vector).stack
@@ -160,9 +160,9 @@ def at_start(problem: Problem) -> Problem:
 class Values:
     """What a problem predicts with one vector (P,) at several resolutions, of which that at its own is known."""
 
-    def __init__(self, problem: Problem, own: lj.AddingDoubling, vector: Floats, predicted: Floats):
+    def __init__(self, problem: Problem, transport: lj.AddingDoubling, vector: Floats, predicted: Floats):
         self.problem, self.vector = problem, vector
-        self._known = {own: predicted}
+        self._known = {transport: predicted}
         self._spread = spread(problem, vector, predicted)
 
     @property
@@ -199,27 +199,27 @@ def spread(problem: Problem, vector: Floats, predicted: Floats) -> Floats:
 
 
 def needed_resolution(
-    known: Resolutions, own: lj.AddingDoubling, values: Values, allowed: float, progress: Progress
+    known: Resolutions, transport: lj.AddingDoubling, values: Values, allowed: float, progress: Progress
 ) -> tuple[lj.AddingDoubling, float, bool]:
-    """The coarsest resolution from its own on that is fine enough, its error, and whether it is the finest there is."""
+    """The coarsest resolution from this one on that is fine enough, its error, and whether none is finer."""
 
     def error(one: lj.AddingDoubling, other: lj.AddingDoubling) -> float:
         found = values.error(one, other)
-        progress("numerical error", values.count, None, f"{found:.2g} sigma at {known.in_words(own)}")
+        progress("numerical error", values.count, None, f"{found:.2g} sigma at {known.in_words(transport)}")
         return found
 
-    finer = known.finer(own)
+    finer = known.finer(transport)
     if finer is None:
-        return own, error(known.coarser(own), own), True
-    found = error(own, finer)
+        return transport, error(known.coarser(transport), transport), True
+    found = error(transport, finer)
     while known.open and found > allowed:
-        parts = known.partly_finer(own, finer)
-        own = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
-        finer = known.finer(own)
+        parts = known.partly_finer(transport, finer)
+        transport = next((part for part in parts if error(part, finer) <= MINOR_SHARE * allowed), finer)
+        finer = known.finer(transport)
         if finer is None:
-            return own, found, True
-        found = error(own, finer)
-    return own, found, False
+            return transport, found, True
+        found = error(transport, finer)
+    return transport, found, False
 
 
 # ---- of an instrument's cones ----

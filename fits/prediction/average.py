@@ -58,6 +58,7 @@ class Average:
             discrepancy_sd=discrepancy_sd,
             seed=seed,
             pareto_k=float(np.fmax.reduce([part.pareto_k for part in parts])),
+            effective_draws=sum(part.effective_draws for part in parts),
         )
 
 

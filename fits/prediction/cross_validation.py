@@ -6,6 +6,7 @@ Measurements at one incidence resemble each other, so a single one that is held 
 whatever the stack. Groups are therefore whole incidences; of fewer than three, parts of every scan.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,7 @@ from fits.sampling.initial import other_minima, vector_of
 from layerjax._checks import require_kind
 
 DRAWS = 128
+"""Draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`."""
 
 INFINITE_NOISE = 1e8
 """Noise with which a measurement does not influence a fit, in units of the largest measurement."""
@@ -46,13 +48,15 @@ class CrossValidation:
 
     groups: names of what was held out together. rows: rows of each group among the used samples. log_density: log
     predictive density of each measurement, (N, C), by the fit without its group; 0 for those in no group, whose plane
-    has too few to hold some out. converged: whether all of these fits converged.
+    has too few to hold some out. converged: whether all of these fits converged. errors: standard error of the elpd of
+    each group, (G,), by the number of draws of the posterior.
     """
 
     groups: tuple[str, ...]
     rows: tuple[NDArray[np.int64], ...]
     log_density: Floats
     converged: bool
+    errors: Floats
 
     @property
     def elpd(self) -> float:
@@ -63,6 +67,11 @@ class CrossValidation:
     def elpd_by_group(self) -> Floats:
         """The elpd of each group, (G,)."""
         return np.array([np.sum(self.log_density[rows]) for rows in self.rows])
+
+    @property
+    def error(self) -> float:
+        """Standard error of the elpd by the number of draws of the posterior."""
+        return float(np.linalg.norm(self.errors))
 
     @property
     def group_sizes(self) -> NDArray[np.int64]:
@@ -85,7 +94,8 @@ def cross_validate(
 
     Args:
         fit: a fit of a likelihood.
-        draws, seed: see `predict`.
+        draws: of the posterior at a time, see `predict`; as many again until the elpd is as exact as `options` ask for.
+        seed: see `predict`.
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
         posterior: draws of the fit's posterior; those without a group are sought about them.
@@ -93,9 +103,10 @@ def cross_validate(
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
     """
+    options = options or ComparisonOptions()
     groups, data = require_groups(fit, options), fit.problem.data.used()
     proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
-    density, converged = np.zeros(data.values.shape), True
+    density, errors, converged = np.zeros(data.values.shape), np.zeros(len(groups)), True
     starts = [fit.vector, *(vector_of(fit, one) for one in other_minima(fit))]
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
@@ -103,12 +114,19 @@ def cross_validate(
         held_out = np.zeros(len(data), bool)
         held_out[rows] = True
         rest = refit(without(fit.problem, held_out), *starts)
-        prediction = posterior_predictive(rest, data, draws=draws, seed=seed, proposal=proposal)
-        density[rows] = prediction.log_density(data.values)[rows]
+        each, effective = np.empty((0, *density[rows].shape)), 0.0
+        while not len(each) or (errors[number] > options.monte_carlo_error and len(each) < options.most_draws):
+            again = seed + len(each)
+            prediction = posterior_predictive(rest, data, draws=draws, seed=again, proposal=proposal)
+            each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
+            effective += prediction.effective_draws
+            density[rows] = logsumexp(each, axis=0) - math.log(len(each))
+            # how much each draw adds to the elpd, to first order
+            errors[number] = np.std(np.sum(np.exp(each - density[rows]), axis=(1, 2))) / math.sqrt(effective)
         converged &= rest.converged
     if progress is not None:
         progress("cross-validation", len(groups), len(groups), "")
-    return CrossValidation(tuple(groups), tuple(groups.values()), density, converged)
+    return CrossValidation(tuple(groups), tuple(groups.values()), density, converged, errors)
 
 
 def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
@@ -170,8 +188,9 @@ class ModelScore:
     """How well one of several stacks predicts held-out data, and how probable it is.
 
     elpd: sum of log predictive densities of measurements, each by a fit without its incidence. elpd_diff: how far it is
-    below the best; dse: standard error of the difference, by the incidences. least_diff: the difference a measurement,
-    of the incidence where that is least. clear_diff: the difference less its error (see `ComparisonOptions`). weight:
+    below the best; dse: standard error of the difference, by the incidences and by the draws of the posterior.
+    least_diff: the difference a measurement, of the incidence where that is least. clear_diff: the difference less its
+    error (see `ComparisonOptions`). weight:
     of stacking (Yao, Vehtari, Simpson & Gelman 2018, Bayesian Anal. 13, 917). evidence: see `evidence`.
     model_probability: of this stack among those compared, equally probable a priori.
     """
@@ -228,6 +247,7 @@ def rank_models(
     for (name, one), weight, probability in zip(held_out.items(), weights, probabilities, strict=True):
         gaps = best.elpd_by_group - one.elpd_by_group
         elpd_diff, dse = float(gaps.sum()), float(np.sqrt(gaps.size) * gaps.std(ddof=1))
+        dse = math.hypot(dse, 0.0 if one is best else math.hypot(one.error, best.error))
         least_diff = float(np.min(gaps / best.group_sizes))
         decisive = least_diff > options.decisive_per_measurement
         scores[name] = ModelScore(

@@ -145,10 +145,12 @@ def _pareto_k(log_weights: Floats) -> float:
 
 
 def _resample(log_weights: Floats, generator: np.random.RandomState, count: int) -> NDArray[np.int64]:
+    """So many rows, each as often as its weight says to within one (systematic resampling, Kitagawa 1996)."""
     if not np.isfinite(log_weights).any():
         return generator.randint(len(log_weights), size=count)
-    probabilities = np.exp(log_weights - logsumexp(log_weights))
-    return generator.choice(len(log_weights), count, p=probabilities / probabilities.sum())
+    cumulative = np.cumsum(np.exp(log_weights - np.max(log_weights)))
+    places = (generator.random_sample() + np.arange(count)) / count
+    return np.minimum(np.searchsorted(cumulative, places * cumulative[-1]), len(log_weights) - 1)
 
 
 def _tempered(log_weights: Floats) -> Floats:

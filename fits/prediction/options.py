@@ -36,6 +36,13 @@ class ComparisonOptions:
     scan_parts: int = 5
     """Parts of equal size that every scan is then divided into."""
 
+    monte_carlo_error: float = 0.3
+    """Standard error that the elpd of a group of held-out data may have because draws of the posterior are few: more
+    are taken until it is below this,"""
+
+    most_draws: int = 1024
+    """or until there are so many."""
+
     def __post_init__(self) -> None:
         for field in fields(self):
             if not getattr(self, field.name) > 0:

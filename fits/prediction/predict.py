@@ -89,6 +89,7 @@ class Prediction:
         seed: seed of the draws that `bsdf` and `predictive` summarise.
         pareto_k: Pareto k of the importance weights that the draws of a fit's posterior are resampled by (see
             `fits.evidence`); NaN for draws of a chain.
+        effective_draws: effective sample size of the D draws of the posterior.
         measurements: the measurements that were predicted; None for a `Geometry`.
     """
 
@@ -104,6 +105,7 @@ class Prediction:
     degrees_of_freedom: float
     seed: int = 0
     pareto_k: float = math.nan
+    effective_draws: float = math.nan
     measurements: Measurements | None = None
 
     @property
@@ -181,10 +183,12 @@ class Prediction:
 
     def log_density(self, values: Floats) -> Floats:
         """Log predictive density of each of the measured `values`, (M, C)."""
+        return logsumexp(self.log_densities(values), axis=0) - math.log(len(self.means))
+
+    def log_densities(self, values: Floats) -> Floats:
+        """Log-density of each of the measured `values` for each draw of the posterior, (D, M, C)."""
         density = self._noise.logpdf(self._standardised(values, self.scales)) - np.log(self.scales)
-        if self.softness is not None:
-            density = density - np.log(np.asarray(size(values, self.softness)))
-        return logsumexp(density, axis=0) - math.log(len(density))
+        return density if self.softness is None else density - np.log(np.asarray(size(values, self.softness)))
 
     def cdf(self, values: Floats) -> Floats:
         """Predictive probability of a measurement below each of `values`, (M, C)."""
@@ -318,7 +322,7 @@ def posterior_predictive(
     if not fit.is_posterior:
         raise ValueError(f"predict: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements")
     data, channels, noise = _measurements(fit, at), fit.problem.data.channels, fit.problem.noise
-    vectors, pareto_k = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
+    vectors, pareto_k, effective = _posterior_draws(fitted, draws, np.random.default_rng(seed), proposal)
     values = np.asarray(fit.problem.predict_at(vectors, data.wi, data.wo), float)
     values = np.broadcast_to(values, (*values.shape[:2], len(channels)))
     means, scales, softness, discrepancy_sd = _mixture(fit, vectors, values, data)
@@ -335,6 +339,7 @@ def posterior_predictive(
         degrees_of_freedom=noise.degrees_of_freedom if noise.tails == "student" else math.inf,
         seed=seed,
         pareto_k=pareto_k,
+        effective_draws=effective,
         measurements=at.used() if isinstance(at, Measurements) else None,
     )
 
@@ -370,11 +375,12 @@ def _require_visible(fit: Fit, at: Geometry) -> None:
 
 def _posterior_draws(
     fitted: Fit | Posterior, draws: int, generator: np.random.Generator, proposal: "Density | None" = None
-) -> tuple[Floats, float]:
-    """Draws (D, P) of the posterior, and the Pareto k of their weights."""
+) -> tuple[Floats, float, float]:
+    """Draws (D, P) of the posterior, the Pareto k of their weights, and their effective sample size."""
     if isinstance(fitted, Posterior):
-        return generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws), math.nan
-    random, pareto_k = np.random.RandomState(generator.integers(2**31)), math.nan
+        vectors = generator.choice(fitted.samples, draws, axis=0, replace=len(fitted.samples) < draws)
+        return vectors, math.nan, _resampled_size(draws, float(np.min(fitted.effective_samples)))
+    random, pareto_k, effective = np.random.RandomState(generator.integers(2**31)), math.nan, float(draws)
     if fitted.dataset is not None:  # the other data sets of a joint fit constrain it as well: in its covariance
         positions = normal_draws(fitted, draws, random)
     else:
@@ -382,7 +388,13 @@ def _posterior_draws(
             fitted, max(MIN_PROPOSALS, 2 * draws), random, max_pareto_k=MAX_PARETO_K, proposal=proposal
         )
         positions, pareto_k = weighted.resample(random, draws), weighted.pareto_k
-    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k
+        effective = _resampled_size(draws, weighted.effective_sample_size)
+    return np.asarray(jax.vmap(fitted.problem.model.box.constrain)(jnp.asarray(positions)), float), pareto_k, effective
+
+
+def _resampled_size(draws: int, pool: float) -> float:
+    """Effective sample size of so many draws that are taken of a pool of this one."""
+    return 1.0 / (1.0 / draws + 1.0 / max(pool, 1.0))
 
 
 def _mixture(

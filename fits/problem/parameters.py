@@ -154,21 +154,21 @@ def _steps(random_walk_sd: Any, channels: int) -> Floats:
     return inverse[:, None] * np.diff(np.eye(channels), axis=0)
 
 
-def _random_walk_normaliser(prior: Prior, steps: Floats, own: Floats) -> Floats:
-    """Of channels (C,) with these normalisers of their own, and steps between them: of all together, in the first.
+def _random_walk_normaliser(prior: Prior, steps: Floats, normalisers: Floats) -> Floats:
+    """Of channels (C,), by the normaliser of each and the steps between them: of all together, in the first.
 
     Flat priors count once, for the walk starts anywhere; Gaussian ones by their joint precision. Bounds cut off nothing
     of the steps.
     """
-    channels = len(own)
+    channels = len(normalisers)
     inverse_sd = prior.gaussian()[1]
     if inverse_sd > 0.0:
-        cut = own.sum() - channels * (0.5 * math.log(2 * math.pi) - math.log(inverse_sd))
+        cut = normalisers.sum() - channels * (0.5 * math.log(2 * math.pi) - math.log(inverse_sd))
         precision = inverse_sd**2 * np.eye(channels) + steps.T @ steps
         whole = cut + 0.5 * channels * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(precision)[1]
     else:
         scales = -np.log(np.max(np.abs(steps), axis=1))
-        whole = own[0] + np.sum(scales) + 0.5 * (channels - 1) * math.log(2 * math.pi)
+        whole = normalisers[0] + np.sum(scales) + 0.5 * (channels - 1) * math.log(2 * math.pi)
     return np.array([whole] + [0.0] * (channels - 1))
 
 
@@ -396,7 +396,7 @@ def _ends(value: Any) -> tuple[float, float]:
 class Box(eqx.Module):
     """Bounds and priors of P parameters as arrays of shape (P,), and the maps between the three spaces.
 
-    between: (Q, P), differences between neighbouring channels in units of `Free.random_walk_sd`.
+    differences: (Q, P), differences between neighbouring channels in units of `Free.random_walk_sd`.
     """
 
     low: Array
@@ -405,7 +405,7 @@ class Box(eqx.Module):
     centre: Array
     inverse_sd: Array
     log_normaliser: Array
-    between: Array
+    differences: Array
 
     @classmethod
     def of(cls, free: Sequence[Free]) -> "Box":
@@ -416,14 +416,14 @@ class Box(eqx.Module):
         priors = [entry.prior for entry, b in zip(free, bounds, strict=True) for _ in range(b[0].size)]
         gaussians = np.array([prior.gaussian() for prior in priors]).reshape(-1, 2)
         logs = np.array([_log_normaliser(prior, a, b) for prior, a, b in zip(priors, low, high, strict=True)])
-        between = [np.zeros((0, len(low)))]
+        differences = [np.zeros((0, len(low)))]
         first = 0
         for entry in free:
             here = slice(first, first := first + math.prod(entry.shape))
             if entry.random_walk_sd is not None:
                 rows = np.zeros((here.stop - here.start - 1, len(low)))
                 rows[:, here] = _steps(entry.random_walk_sd, here.stop - here.start)
-                between.append(rows)
+                differences.append(rows)
                 logs[here] = _random_walk_normaliser(entry.prior, rows[:, here], logs[here])
         return cls(
             low=jnp.asarray(low),
@@ -432,7 +432,7 @@ class Box(eqx.Module):
             centre=jnp.asarray(gaussians[:, 0]),
             inverse_sd=jnp.asarray(gaussians[:, 1]),
             log_normaliser=jnp.asarray(logs, dtype=jnp.result_type(float)),
-            between=jnp.asarray(np.concatenate(between), dtype=jnp.result_type(float)),
+            differences=jnp.asarray(np.concatenate(differences), dtype=jnp.result_type(float)),
         )
 
     def from_unit(self, s: Array) -> Array:
@@ -471,12 +471,12 @@ class Box(eqx.Module):
         """
         natural = self._natural(vector)
         own = (natural - self.centre) * self.inverse_sd
-        return own if not self.between.shape[0] else jnp.concatenate([own, self.between @ natural])
+        return own if not self.differences.shape[0] else jnp.concatenate([own, self.differences @ natural])
 
     def prior_slopes(self) -> Array:
         """d `prior_residuals` / d unit, (P + Q, P)."""
         low, high = self._ends()
-        return jnp.concatenate([jnp.diag(self.inverse_sd), self.between]) * (high - low)
+        return jnp.concatenate([jnp.diag(self.inverse_sd), self.differences]) * (high - low)
 
     def slope(self, vector: Array) -> Array:
         """d physical / d unit, shape (P,): the width of the box in physical units at this point."""

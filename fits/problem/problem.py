@@ -55,7 +55,7 @@ UNITS = {
 PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.discrepancy")
 """How names begin of what stands in each place of `Parts`."""
 
-PER_PARAMETER = tuple(field for field in Box.__dataclass_fields__ if field != "between")
+PER_PARAMETER = tuple(field for field in Box.__dataclass_fields__ if field != "differences")
 """What a box holds of each parameter."""
 
 
@@ -334,17 +334,17 @@ class Joint(FittingProblem):
                 found[list(places[part])] = values[part]
             return found
 
-        between: list[Floats] = []  # rows of random walks over channels; of shared ones once
+        walks: list[Floats] = []  # rows of random walks over channels; of shared ones once
         for part, problem in self.parts.items():
-            for row in np.asarray(problem.model.box.between):
+            for row in np.asarray(problem.model.box.differences):
                 whole = np.zeros(len(names))
                 whole[list(places[part])] = row
-                between += [] if any(np.array_equal(whole, one) for one in between) else [whole]
+                walks += [] if any(np.array_equal(whole, one) for one in walks) else [whole]
         each = {key: jnp.asarray(gathered(f"model.box.{key}")) for key in PER_PARAMETER}
         models = tuple(problem.model for problem in self.parts.values())
         model = JointModel(
             parts=models,
-            box=Box(**each, between=jnp.asarray(np.array(between).reshape(-1, len(names)))),
+            box=Box(**each, differences=jnp.asarray(np.array(walks).reshape(-1, len(names)))),
             places=tuple(places.values()),
             varying=any(one.varying for one in models),
         )
@@ -397,7 +397,7 @@ def _same(one: Problem, other: Problem, name: str) -> bool:
     """Whether a parameter has the same bounds and prior in both."""
     i, j = one.names.index(name), other.names.index(name)
     mine, theirs = one.model.box, other.model.box
-    first, second = (np.asarray(box.between[:, place]) for box, place in ((mine, i), (theirs, j)))
+    first, second = (np.asarray(box.differences[:, place]) for box, place in ((mine, i), (theirs, j)))
     return np.array_equal(first[first != 0.0], second[second != 0.0]) and all(
         math.isclose(float(getattr(mine, field)[i]), float(getattr(theirs, field)[j]), rel_tol=1e-12)
         for field in PER_PARAMETER

@@ -238,8 +238,8 @@ def _over_samples(model: Model, vectors: Array, white: Array) -> tuple[Array, Ar
     """Of each vector, with white numbers (C, R) of its own for the discrepancy: log-densities of the data, and
     what measurements scatter about, by how much; (N, C) each."""
 
-    def one(given: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        vector, numbers = given
+    def one(row: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        vector, numbers = row
         predicted = expected = model.predict(vector)
         if model.process is not None:
             at = model.build(vector).correlation

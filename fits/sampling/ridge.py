@@ -141,5 +141,5 @@ def _unit(place: Floats) -> Floats:
     return np.clip(expit(inner) + (place - inner) * NEXT_TO_BOUND * (1.0 - NEXT_TO_BOUND), 0.0, 1.0)
 
 
-def _distance(place: Floats, found: list[_Known]) -> float:
-    return float(min(np.linalg.norm(known.place - place) for known in found))
+def _distance(place: Floats, points: list[_Known]) -> float:
+    return float(min(np.linalg.norm(known.place - place) for known in points))

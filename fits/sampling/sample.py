@@ -125,8 +125,8 @@ def settings(
 ) -> SamplerOptions:
     """The options that so many parameters are sampled with. ValueError for those by which they cannot be."""
     require_kind("options", options, SamplerOptions, None)
-    given: dict[str, Any] = {"ess": ess, "walkers": walkers, "max_steps": max_steps}
-    options = replace(options or SamplerOptions(), **{name: one for name, one in given.items() if one is not None})
+    changes: dict[str, Any] = {"ess": ess, "walkers": walkers, "max_steps": max_steps}
+    options = replace(options or SamplerOptions(), **{name: one for name, one in changes.items() if one is not None})
     if sampler not in get_args(Sampler):
         raise ValueError(f"sampler is {sampler!r}; it must be one of {', '.join(get_args(Sampler))}")
     if sampler == "nuts":

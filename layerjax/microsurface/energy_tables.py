@@ -39,7 +39,7 @@ from layerjax.microsurface.splines import read
 from layerjax.tables import load
 
 LARGEST_INDEX = 4.0
-"""Of the far side over the near one, or the other way round."""
+"""Ratio of the index on the far side to that on the near one, or its inverse."""
 
 FADED = 1e-5
 """Added to energies before their root is taken: below it they are as good as 0."""
@@ -80,7 +80,7 @@ class Warp(NamedTuple):
 
 
 DENSER = Warp((0.012, 0.4), 0.02)
-"""Of interfaces behind which the index is higher."""
+"""Tables of interfaces with the higher index below."""
 
 THINNER = Warp((5e-4, 0.5), 1e-3)
 """Of those behind which it is lower: the width goes with alpha times the index."""
@@ -171,7 +171,7 @@ def retained_share(cosine: Array, alpha: Array, ratio: Array) -> Array:
 def retained_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array, Array, Array]:
     """Where directions, widths and critical cosines lie on the axes of the table of retained light.
 
-    The cosine counts from the critical one, in what the width of the lobe is there, and goes on beyond 1.
+    The cosine counts from the critical one, in what the width of the lobe is there, and extends beyond 1.
     """
     width = RETAINED.cosine[1] * alpha * jnp.sqrt((1.0 - critical) * (1.0 + critical) + alpha * alpha)
     inverse = 1.0 / width

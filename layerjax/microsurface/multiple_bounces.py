@@ -1,6 +1,6 @@
 """What a rough surface gives back of the light that its first facet sends on to other facets.
 
-In the walk of Heitz et al. 2016 light that has met one facet and not left is given back to the near side in a share
+In the walk of Heitz et al. 2016 light that has met one facet and not left is reflected to the near side in a share
 that is smooth in the angle, the roughness and the index. It is written in polynomials; their coefficients are fitted to
 walks by `layerjax.precompute.microsurface`.
 """
@@ -44,7 +44,7 @@ def interface_bases(cosine: Array, alpha: Array, ior: Array) -> dict[str, Array]
     """Functions of which `interface_multiple_reflectance` is made, "reflected" and "refracted", on a new last axis."""
     lower = jnp.where(ior < 1.0, ior, 1.0 / ior)
     critical = (1.0 - lower) * (1.0 + lower)  # cosine of the critical angle, squared
-    # near equal indices light goes on straight, facet after facet: it turns back where they differ by this much
+    # near equal indices light passes facet after facet without a turn: it is reflected where they differ by this much
     turned = critical / (critical + 0.06 * cosine * (1.0 + 7.0 * cosine))
     root = jnp.sqrt(cosine)
     smooth = _products((root, alpha, safe_sqrt(critical)), (7, 5, 8), 1.5)

@@ -26,10 +26,10 @@ SLOPES = BASIS[:, 1:] * np.arange(1, 4)
 
 def design(places: np.ndarray, count: int) -> np.ndarray:
     """Values of the splines at places in [0, 1], (places, count)."""
-    first, beyond, _ = taps(jnp.asarray(places), count)
+    first, offset, _ = taps(jnp.asarray(places), count)
     matrix = np.zeros((places.size, count))
     columns = np.asarray(first)[:, None] + np.arange(4)
-    np.add.at(matrix, (np.arange(places.size)[:, None], columns), np.asarray(jnp.stack(weights(beyond), axis=-1)))
+    np.add.at(matrix, (np.arange(places.size)[:, None], columns), np.asarray(jnp.stack(weights(offset), axis=-1)))
     return matrix
 
 
@@ -42,7 +42,7 @@ def fitted(values: np.ndarray, counts: Sequence[int]) -> np.ndarray:
 
 
 def taps(place: Array, count: Array | int) -> tuple[Array, Array, Array]:
-    """Of a place in [0, 1] the first of the four coefficients that count, how far it is beyond it, and the steps.
+    """The first of the four coefficients that count at a place in [0, 1], how far the place is after it, and the steps.
 
     The distance is in steps, so many of which the axis has.
     """
@@ -52,9 +52,9 @@ def taps(place: Array, count: Array | int) -> tuple[Array, Array, Array]:
     return first.astype(jnp.int32), x - first, steps
 
 
-def weights(beyond: Array) -> list[Array]:
-    """Of the four coefficients that count, so far beyond the first of them."""
-    return [horner(powers, beyond) for powers in BASIS.tolist()]
+def weights(offset: Array) -> list[Array]:
+    """Weights of the four coefficients at a place, by its distance from the first of them."""
+    return [horner(powers, offset) for powers in BASIS.tolist()]
 
 
 def read(
@@ -63,7 +63,7 @@ def read(
     counts: Sequence[Array | int],
     places: Sequence[Array],
     columns: int = 1,
-    apart: int = 0,
+    column_stride: int = 0,
 ) -> list[Array]:
     """Splines at places along each of their axes, all of one shape: a value for each column.
 
@@ -72,26 +72,26 @@ def read(
         start: where the first table begins in it.
         counts: coefficients along each axis. Both may differ from place to place.
         places: in [0, 1]; what lies outside counts as the end.
-        columns: tables that are read at the same places, so many coefficients `apart`.
+        columns: tables that are read at the same places, with a `column_stride` of so many coefficients.
     """
     dtype = places[0].dtype
     sizes = [jnp.asarray(count, jnp.int32) for count in counts]
-    reader = _reader(len(places), columns, apart)
+    reader = _reader(len(places), columns, column_stride)
     found = reader(jnp.asarray(flat, dtype), jnp.asarray(start, jnp.int32), *sizes, *places)
     return unstacked(found) if columns > 1 else [found]
 
 
 @functools.cache
-def _reader(axes: int, columns: int, apart: int) -> Callable[..., Array]:
+def _reader(axes: int, columns: int, column_stride: int) -> Callable[..., Array]:
     @jax.custom_jvp
     def value(flat: Array, start: Array, *rest: Array) -> Array:
-        return _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=False)[0]
+        return _summed(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=False)[0]
 
     @value.defjvp
     @broadcasting
     def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
         flat, start, *rest = primals
-        found, *slopes = _summed(flat, start, rest[:axes], rest[axes:], columns, apart, sloped=True)
+        found, *slopes = _summed(flat, start, rest[:axes], rest[axes:], columns, column_stride, sloped=True)
         return found, _dot(slopes, tangents[2 + axes :])
 
     return value
@@ -103,7 +103,7 @@ def _summed(
     counts: Sequence[Array],
     places: Sequence[Array],
     columns: int,
-    apart: int,
+    column_stride: int,
     sloped: bool,
 ) -> list[Array]:
     """Values, (columns, ...) if there are several, and (if `sloped`) their derivatives along each axis."""
@@ -114,19 +114,19 @@ def _summed(
     corner = start + sum(first * stride for (first, _, _), stride in zip(found, strides, strict=True))
     corner = jnp.broadcast_to(corner, jnp.broadcast_shapes(*(place.shape for place in places)))
     if columns > 1:
-        corner = corner + apart * jnp.arange(columns, dtype=corner.dtype).reshape(-1, *(1,) * corner.ndim)
-    *outer, last = (beyond for _, beyond, _ in found)
+        corner = corner + column_stride * jnp.arange(columns, dtype=corner.dtype).reshape(-1, *(1,) * corner.ndim)
+    *outer, last = (offset for _, offset, _ in found)
 
     def step(sums: list[Array], given: tuple[Array, ...]) -> tuple[list[Array], None]:
         tap, basis, sloping = given
         place = corner + sum(tap[axis] * strides[axis] for axis in range(len(outer)))
         row = [flat.at[place + k].get(mode="promise_in_bounds", wrap_negative_indices=False) for k in range(4)]
         along = _dot(weights(last), row)
-        weight = [horner(basis[axis], beyond) for axis, beyond in enumerate(outer)]
+        weight = [horner(basis[axis], offset) for axis, offset in enumerate(outer)]
         added = [math.prod(weight) * along]
         if sloped:
-            for axis, beyond in enumerate(outer):
-                slope = horner(sloping[axis], beyond)
+            for axis, offset in enumerate(outer):
+                slope = horner(sloping[axis], offset)
                 added.append(math.prod([slope, *weight[:axis], *weight[axis + 1 :]]) * along)
             slopes = [horner(powers, last) for powers in SLOPES.tolist()]
             added.append(math.prod(weight) * _dot(slopes, row))

@@ -35,7 +35,7 @@ class Cap(NamedTuple):
     """Angle of v from the normal; the rim lies pi - tilt from the pole."""
 
     def inner(self) -> "Cap":
-        """With one more axis, for points."""
+        """The same with one more axis, for points."""
         return Cap(*(x[..., None] for x in self))
 
 

@@ -1,10 +1,10 @@
 """Quadrature of the facets that a direction sees, GGX or von Mises-Fisher, in coordinates about that direction.
 
-A facet is told by the angle theta_d between its normal and the direction, on which Fresnel's equations depend, and by
-an azimuth psi about the direction. So the critical angle is a line of constant theta_d: panels end there, with the root
-of the refracted cosine taken out. They also end where parallels begin to be cut, by facets that turn their backs or by
-light that is mirrored below the horizon. Points move smoothly with the width and the index, and so do the sums: no
-point crosses an edge of what is summed.
+A facet has coordinates: the angle theta_d between its normal and the direction, on which Fresnel's equations depend,
+and an azimuth psi about the direction. So the critical angle is a line of constant theta_d: panels end there, with the
+root of the refracted cosine taken out. They also end where parallels begin to be cut, by facets that turn their backs
+or by light that is mirrored below the horizon. Points move smoothly with the width and the index, and so do the sums:
+no point crosses an edge of what is summed.
 
 Both coordinates are fitted to the density of normals, so that the same points serve all widths. GGX: theta_d is
 stretched like a sinh about its peak, psi by the Moebius map under which the density is nearly even. vMF normals have no
@@ -30,7 +30,7 @@ VMF_REACH = 3.4
 """Widths alpha from their peak to where vMF normals end: 1e-5 of them lie beyond."""
 
 SOFT = 0.6
-"""Of that reach, how far within it an edge of a panel lies of which the root is wholly taken out."""
+"""Share of that reach within which an edge of a panel lies whose root is wholly removed."""
 
 LEAST_COSINE = 1e-9
 
@@ -119,7 +119,7 @@ def seen_facets(
 ) -> tuple[Vector, Array, Array]:
     """Normals m seen along w = (-sine, 0, cosine), m . w, and their shares of the visible area: (nodes, points) each.
 
-    They have y >= 0, and stand for their mirror images too. Left out are normals of which nothing goes the way asked
+    They have y >= 0, and stand for their mirror images too. Normals are omitted that send nothing the requested way
     for: the shares sum to 1 less those.
 
     Args:

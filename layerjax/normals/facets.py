@@ -105,11 +105,11 @@ def rule(wi: Vector, alpha: Array, nodes: int, distribution: Distribution) -> No
 
 
 def _plane(wi: Vector) -> tuple[Array, Array, Array]:
-    """Sine of wi, and the unit vector along which it leans, the x axis where it does not."""
+    """Sine of wi, and the unit vector along its tilt, the x axis where it has none."""
     planar = safe_sqrt(wi[0] * wi[0] + wi[1] * wi[1])
-    leans = planar > 0
-    inverse = 1.0 / jnp.where(leans, planar, 1.0)
-    return planar, jnp.where(leans, wi[0] * inverse, 1.0), jnp.where(leans, wi[1] * inverse, 0.0)
+    tilted = planar > 0
+    inverse = 1.0 / jnp.where(tilted, planar, 1.0)
+    return planar, jnp.where(tilted, wi[0] * inverse, 1.0), jnp.where(tilted, wi[1] * inverse, 0.0)
 
 
 def _azimuths(level: Array, swing: Array) -> tuple[Array, Array]:

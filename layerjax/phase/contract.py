@@ -25,8 +25,8 @@ class Flakes(NamedTuple):
 class PhaseFunction(Shown):
     """Where a collision sends the light: p(wi, wo), which integrates to 1 over wo, and the extinction sigma(w).
 
-    Directions come as components that point away from the collision (see `layerjax.directions`): light that goes
-    straight on has wo = -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and
+    Directions come as components that point away from the collision (see `layerjax.directions`): unscattered
+    light has wo = -wi. The kernel sigma(wi) p(wi, wo) must be symmetric in wi and wo, and the same for -wi and
     -wo. `pdf` and `sample` are all that a class must add; where sigma is not 1, `cross_section` too, and where p is not
     the same for all azimuths, `is_upright` and `mirrored`. All else is for speed, accuracy or further transports.
 
@@ -79,13 +79,13 @@ class PhaseFunction(Shown):
     def width(self) -> Parameter:
         """About the angle, in radians and up to 1, within which p changes: what a grid of directions must resolve.
 
-        Forward peaks of what has `moments` do not count: what a grid does not resolve of them goes straight on.
+        Forward peaks of what has `moments` do not count: what a grid does not resolve of them counts as ballistic.
         """
         return 1.0
 
     @property
     def onward_width(self) -> Parameter:
-        """About the angle, in radians and up to 1, within which a peak that goes straight on falls off.
+        """About the angle, in radians and up to 1, within which the ballistic part of a peak falls off.
 
         It counts where one looks through the medium, beside `width`.
         """

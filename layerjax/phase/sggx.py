@@ -102,5 +102,5 @@ def _axis(axis: Any) -> Any:
     bad = ~(np.isfinite(longest) & (longest > 0))[..., 0]
     if bad.any():
         raise ValueError(f"SGGX.axis: {concrete[bad][0].tolist()} is not a finite vector other than zero")
-    # whatever its length, it may be asked for in single precision
+    # whatever its length, it may be needed in single precision
     return floating("SGGX.axis", axis if np.all((longest > 1e-6) & (longest < 1e6)) else concrete / longest)

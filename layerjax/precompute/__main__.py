@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for NAME.npz (default: that of the tables that ship)")
     parser.add_argument("--coarse", action="store_true", help="a quick, less exact table, which needs --out")
     parser.add_argument(
-        "--work", type=Path, help="folder that long work (spongecake alone) goes on from (default: spongecake-data)"
+        "--work", type=Path, help="folder that long work (spongecake alone) is resumed from (default: spongecake-data)"
     )
     options = parser.parse_args()
     if options.coarse and options.out is None:

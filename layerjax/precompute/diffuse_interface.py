@@ -46,7 +46,7 @@ TABULATED_RANKS = ((2, 4), (3, 4), (4, 4), (5, 5), (6, 6), RANKS)
 """Ranks whose errors are recorded."""
 
 TAUS = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, 25) / 24)
-"""Transmittances at which functions are known, the last 1; for the reduction they count alike."""
+"""Transmittances at which functions are known, the last 1; for the reduction they count equally."""
 
 LEAST_WALKED = (1e-3, 0.01)
 """Cosine and alpha below which shares are taken to be constant: next to no light is concerned."""
@@ -290,12 +290,12 @@ def _shared(shares: np.ndarray, way: int, cosine: np.ndarray, alpha: np.ndarray,
     side = int(np.min(n) < 1.0)
     c, a, i = (jnp.asarray(x) for x in (cosine, alpha, n))
     places = diffuse.cosine_variable(c, i), diffuse.roughness_variable(a), index_variable(i)
-    weights = [_between(np.asarray(place), nodes) for place, nodes in zip(places, shares.shape[1:4], strict=True)]
+    weights = [_interpolation(np.asarray(place), nodes) for place, nodes in zip(places, shares.shape[1:4], strict=True)]
     found = np.einsum("pc,pa,pn,cant->pt", *weights, shares[side, :, :, :, way], optimize=True)
     return np.clip(found, 0.0, 1.0)
 
 
-def _between(place: np.ndarray, nodes: int) -> np.ndarray:
+def _interpolation(place: np.ndarray, nodes: int) -> np.ndarray:
     """Weights (points, nodes) of values at uniform nodes on [0, 1] in the cubic spline through them."""
     coefficients = _coefficients(np.eye(nodes), 0)
     index, weights = (np.asarray(x) for x in diffuse.spline(jnp.asarray(place), nodes + 2))

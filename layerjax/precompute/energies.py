@@ -39,7 +39,7 @@ Values = np.ndarray
 Report = Callable[[str], Any]
 
 POINTS = 24
-"""From pole to rim of the cap of facets."""
+"""Nodes from pole to rim of the cap of facets."""
 AT_ONCE = 4096
 METALS, LEAST_K, TOLERATED = 150, 0.3, 1e-3
 """That shares are fitted to, their least k, and the error of energy that counts as one of the usual numbers."""
@@ -47,7 +47,7 @@ NEXT = 0.03
 """Step of differences of cosines, in widths of a lobe."""
 LEAST_COSINE = 1e-6
 NARROWEST_WALKED = 0.01
-"""Alpha below which what is given back is that at this one, at a cosine that is as much larger."""
+"""Alpha below which the reflected share is that at this one, at a cosine that is as much larger."""
 
 
 def make(coarse: bool = False, report: Report = print) -> dict[str, np.ndarray]:
@@ -58,7 +58,7 @@ def make(coarse: bool = False, report: Report = print) -> dict[str, np.ndarray]:
     report(f"energies: interfaces, {time.perf_counter() - begin:.0f} s")
     columns = [part[name].ravel() for name in ("multiple", "single", "passed") for part in parts]
     made = {"dielectric": np.concatenate(columns)} | metals(dense) | {"retained": retained(dense)}
-    report(f"energies: metals and retained light, {time.perf_counter() - begin:.0f} s")
+    report(f"energies: metals and visible light, {time.perf_counter() - begin:.0f} s")
     return {name: values.astype(np.float32) for name, values in made.items()}
 
 
@@ -183,7 +183,7 @@ def retained(dense: float) -> Values:
         with np.errstate(divide="ignore"):
             return np.clip(np.arctanh(2.0 * share - 1.0), -tables.MOST, tables.MOST)
 
-    # beyond the normal straight on, for splines are no good at ends
+    # linear beyond the normal, as splines are inaccurate at ends
     upright, beside = odds(np.ones_like(beyond[:1])), odds(1.0 - NEXT * width)
     further = np.clip(upright + (upright - beside) / (NEXT * width) * (beyond - 1.0), -tables.MOST, tables.MOST)
     return fitted(np.where(beyond > 1.0, further, odds(beyond)), SHAPES["retained"]).ravel()

@@ -45,8 +45,8 @@ def multiply_scattered(points: Array, keys: Array, taus: Array, paths: int) -> A
 def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, paths: int) -> Array:
     """Shares (way out, absorption) of one point.
 
-    At every facet both reflection and refraction are followed out of the surface; the path goes on by one of them with
-    what does not leave.
+    At every facet both reflection and refraction are followed out of the surface; the path continues by one of them
+    with what does not leave.
     """
     shift, rest = jax.random.split(key)
     lattice = jnp.asarray(_lattice(paths), jnp.float32) + jax.random.uniform(shift, (STRATIFIED, 1), jnp.float32)
@@ -96,9 +96,9 @@ def _walk(cosine: Array, alpha: Array, ior: Array, key: Array, depths: Array, pa
     nothing = jnp.zeros((2, len(depths)), jnp.float32)
     start = 0, travel, 0.0 * one, one, jnp.zeros(paths, bool), nothing, jnp.float32(0.0)
     energy = jax.lax.while_loop(goes_on, event, start)[5]
-    straight = jnp.stack([jnp.zeros_like(depths), jnp.exp(-depths / cosine)])[..., 0]  # where all leaves at once
+    ballistic = jnp.stack([jnp.zeros_like(depths), jnp.exp(-depths / cosine)])[..., 0]  # where all leaves at once
     total = jnp.sum(energy[:, -1])
-    return jnp.where(total > 0, energy / total, straight)
+    return jnp.where(total > 0, energy / total, ballistic)
 
 
 def _lattice(paths: int) -> np.ndarray:

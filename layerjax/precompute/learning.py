@@ -1,4 +1,4 @@
-"""A training that goes on where it was interrupted: Adam, with a rate that falls as a cosine."""
+"""A training that resumes where it was interrupted: Adam, with a rate that falls as a cosine."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class Schedule:
     epochs: int = 300
     batch: int = 64
     rate: float = 2e-3
-    kept: int = 10
+    checkpoints: int = 10
 
 
 def learn(
@@ -40,8 +40,8 @@ def learn(
         loss: of a network and what `batch` answers.
         batch: what is learned from, for rows of the `count` that there are, with a source of random numbers.
         seed: numbers that, with that of the epoch, random numbers come from.
-        state: a file that the state is kept in, and that an interrupted training goes on from.
-        report: told of the progress in a line.
+        state: a file that the state is kept in, and that an interrupted training resumes from.
+        report: called with lines on the progress.
 
     Needs optax.
     """
@@ -69,7 +69,7 @@ def learn(
             net, memory, value = step(net, memory, *batch(random, rows))
             losses.append(value)
         curve[epoch] = np.mean(losses)
-        if (epoch + 1) % schedule.kept == 0 or epoch + 1 == schedule.epochs:
+        if (epoch + 1) % schedule.checkpoints == 0 or epoch + 1 == schedule.epochs:
             report(f"epoch {epoch + 1}/{schedule.epochs}, loss {curve[epoch]:.4f}")
             if state is not None:
                 temporary = state.with_suffix(".part")

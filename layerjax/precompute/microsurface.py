@@ -25,7 +25,7 @@ from layerjax.microsurface.multiple_bounces import conductor_basis, interface_ba
 
 SEED = 2016
 FACETS = 200
-"""Facets that walks meet at most; between nearly equal indices light goes straight on through many."""
+"""Facets that walks meet at most; between nearly equal indices light passes many."""
 ENOUGH = 2e-4
 """Walks end when no more than this is left on any surface."""
 LANES = 1 << 17

@@ -25,9 +25,9 @@ from layerjax.transport.statistical.diffuse import GRAIN
 from layerjax.transport.statistical.streams import ENTERING, INTERFACES, STREAMS, packed, polynomials
 
 POINTS = 16
-"""From pole to rim of the cap of facets."""
+"""Nodes from pole to rim of the cap of facets."""
 COSINES = 24
-"""Of a mean over diffuse light, on either side of the critical one."""
+"""Nodes of a mean over diffuse light, on either side of the critical cosine."""
 LEAST_ENTERING, LEAST_REST = 1e-3, 1e-6
 """Added to the shares of light that enters, and of all that first facets leave on the surface, that are divided by."""
 
@@ -105,7 +105,7 @@ def entering(side: str, dense: float) -> list[Values]:
 
 
 def _moments(cosine: Array, alpha: Array, ior: Array) -> Moments:
-    """Of light along directions (n,)."""
+    """The same of light along directions (n,)."""
     cap = make_cap(cosine, alpha)
     index = ior[..., None, None]
     passing = facets_in(cap, refracting(cap, ior), POINTS)

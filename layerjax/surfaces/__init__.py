@@ -1,7 +1,7 @@
 """Surface BSDFs, one a file: usable alone (``Stack([], base=surface)``) or as the base under layers.
 
 In go parameters, and directions as components in the frame of the surface; out come BRDF values, directions drawn and
-their densities, as `Surface` promises. A dielectric `interface` is no `Surface`: light passes it, and a stack holds it
+their densities, as `Surface` states. A dielectric `interface` is no `Surface`: light passes it, and a stack holds it
 as a layer.
 """
 

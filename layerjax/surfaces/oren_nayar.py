@@ -36,7 +36,7 @@ class OrenNayar(Surface):
                        | "classic"
     ========= ======== =================== =================== ===========================================
 
-    Not smooth where the azimuths of wi and wo differ by pi/2, and (classic and Fujii alike) where theta_i = theta_o.
+    Not smooth where the azimuths of wi and wo differ by pi/2, and (classic and Fujii) where theta_i = theta_o.
     """
 
     albedo: Parameter = parameter("OrenNayar.albedo")

@@ -1,6 +1,6 @@
 """Ways of carrying light through a stack: each is one `Transport` and takes the same `Stack`.
 
-In go a stack and directions; out come BSDF values, directions drawn, densities and energies, as `contract` promises. A
+A transport takes a stack and directions, and returns BSDF values, samples, densities and energies, see `contract`. A
 transport is a file, or a folder where one file is too small; `layerjax.evaluate` and its like choose and call them.
 """
 

@@ -110,7 +110,7 @@ def interaction_probability(state: FirstOrder, w: Vector) -> Channels | None:
 
 
 def onward_probability(state: FirstOrder, scaled: FirstOrder, w: Vector) -> Channels | None:
-    """Probability that light along w goes straight through the scaled media and not the others; None: that is 0."""
+    """Probability that light passes the scaled media without a collision, but not the others; None: it is 0."""
     if state.layered or state.opaque:
         return None
     w = sanitised(w, jnp.abs(w[2]) > horizon(w[2].dtype))

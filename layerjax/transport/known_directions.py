@@ -1,6 +1,6 @@
 """What is known of the directions of a batch before anything is compiled: which cosines occur, and where.
 
-Measurements come along few directions, of which many share a cosine. A transport that is told so can follow light along
+Measurements come along few directions, of which many share a cosine. A transport that knows them can follow light along
 just these.
 """
 
@@ -16,7 +16,7 @@ from jax import Array
 from layerjax._numerics import at_most, horizon
 
 MOST_COSINES = 256
-"""More distinct cosines on a side are not worth knowing."""
+"""With more distinct cosines on a side nothing is gained by knowing them."""
 
 MOST_PAIRS = 20_000
 """Larger batches are not looked at."""

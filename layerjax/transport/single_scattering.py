@@ -105,7 +105,7 @@ def layer_lobes(slab: Media, wi: Vector, wo: Vector, side: Side) -> dict[int, Ch
 
 
 def is_valid_pair(wi: Vector, wo: Vector, side: Side, opaque: bool) -> Array:
-    """Whether a pair is one that is asked for: no direction in the tangent plane, and none below an opaque base."""
+    """Whether a pair is among the requested ones: no direction in the tangent plane, and none below an opaque base."""
     edge = horizon(wi[2].dtype)
     if opaque or side == "reflection":
         return (wi[2] > edge) & (wo[2] > edge)
@@ -197,7 +197,7 @@ def _collision(medium: Medium, wi: Vector, wo: Vector, half: tuple[Vector, Array
 def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     """Probability of each lobe and the lobe: first collision in that layer (Sec. 4.6) times the share that survives it.
 
-    The base is the last choice; without one the light that collides nowhere is left out, and the rest normalised.
+    The base is the last choice; without one the light that collides nowhere is omitted, and the rest normalised.
     """
     edge = horizon(wi[2].dtype)
     valid = wi[2] > edge if slab.base is not None else jnp.abs(wi[2]) > edge

@@ -99,8 +99,12 @@ def carried():
 
 
 class Slopes(NamedTuple):
-    """Compiled derivatives of the values along some pairs, for vectors of either precision. weight: (N,), of pairs."""
+    """Compiled derivatives of the values along some pairs, for vectors of either precision. weight: (N,), of pairs.
 
+    first: what values hold beside the sums that are cut off where they are negative.
+    """
+
+    first: Callable[..., Any]
     forward: Callable[..., Any]
     reverse: Callable[..., Any]
     weight: jax.Array
@@ -130,7 +134,12 @@ def slopes_of(stack, build, transport):
     def reverse(vector):
         return jax.grad(lambda v: jnp.vdot(weight.astype(v.dtype), reflected(v)))(vector)
 
-    return Slopes(jax.jit(forward), jax.jit(reverse), weight)
+    def first(vector):
+        if isinstance(transport, lj.AddingDoubling) and not any(isinstance(one, lj.Interface) for one in stack.layers):
+            return lj.evaluate(build(vector), *directions[vector.dtype], lj.SingleScattering())[:, 0]
+        return 0.0
+
+    return Slopes(first, jax.jit(forward), jax.jit(reverse), weight)
 
 
 def wrong_in_double(slopes, vector, point, same, compared):
@@ -160,7 +169,7 @@ def wrong_in_single(slopes, vector, point, drawn, compared):
         # numbers that are rounded belong to another stack: where nothing is absorbed, thick media tell them apart
         rounding += 4 * float(slopes.weight @ np.abs(slopes.forward(vector * (1 - eps), direction)[1] - slope))
     # what ringing takes below 0 is cut off, and its slope with it, unless it may be rounding: more in single precision
-    lit = np.asarray(slopes.values(vector)) > 0
+    lit = np.asarray(slopes.values(vector)) > slopes.first(vector) * (1.0 + 1e-9)
     off = float(slopes.weight @ np.where(lit, np.abs(ahead - slope), 0.0))
     if not finite:
         yield "not finite in single precision"

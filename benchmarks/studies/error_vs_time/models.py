@@ -49,12 +49,12 @@ MODELS = (
         },
     ),
     Model(
-        "solver, directions known",
+        "adding-doubling, fixed directions",
         {f"{nodes} nodes": lj.AddingDoubling(nodes=nodes, modes=3 * nodes // 2) for nodes in (6, 12, 24)},
         called=True,
         albedos=False,  # of all directions: by tables, as above
     ),
-    Model("solver as it chooses", {"default": lj.AddingDoubling()}, called=True),
+    Model("adding-doubling, automatic resolution", {"default": lj.AddingDoubling()}, called=True),
     Model("random walk", {f"{2**k:,} paths": lj.RandomWalk(paths=2**k) for k in (8, 11, 14)}),
 )
 """What is compared. A model joins by a line here."""

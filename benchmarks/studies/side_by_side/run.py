@@ -23,40 +23,52 @@ from fits._files import write_bytes, write_text
 DOCS = Path(__file__).parents[3] / "docs"
 PAGE, PICTURE = "which_transport.md", "which_transport.png"
 TARGETS = (0.3, 0.1, 0.03, 0.01, 0.001)
-"""Relative L2 errors that are asked for."""
+"""Relative L2 errors, the targets of the page."""
 ENOUGH = 0.75
 """Share of a family's stacks on which a model has to reach the error."""
 
 TEXT = """\
 # Which transport when
 
-Every transport of layerjax on the same stacks, beside the truth. All numbers are those of
-[error against run time](../benchmarks/results/error-vs-time.md), measured on {processor}, {cores} cores;
-`python -m benchmarks side-by-side` makes this page from its file again.
+## How to choose
+
+| you want | take |
+|---|---|
+| a reliable value or gradient of any stack | `"auto"`, the default: all orders of scattering, error about 1e-3 |
+| many pairs of directions of one stack | `lj.prepare(stack)` once, then `lj.evaluate(prepared, wi, wo)` |
+| the first fit of media over a base, or of thin or dark ones | `SingleScattering` |
+| textures of media: one stack a texel, a few percent of error | `SpongeCake` |
+| textures of coats over metal or paint, some percent of error | `Statistical` |
+| an independent check, with standard errors | `RandomWalk` |
+| a comparison with Guo et al. 2015 or Weidlich & Wilkie 2007 | `ENDF`, `WeidlichWilkie` |
+
+The rest of this page has the measurements behind the table, from
+[error against run time](../benchmarks/results/error-vs-time.md): {processor}, {cores} cores. `python -m benchmarks
+side-by-side` generates the page from that file.
 
 ![BSDF in the plane of incidence by every transport, one stack of each family](which_transport.png)
 
-*One stack of each family in the plane of incidence, light at 50 degrees from the left: every transport that carries
-it, the truth as a wide grey line.*
+*One stack of each family in the plane of incidence, light at 50 degrees from the left, by every transport that supports
+it. The wide grey line is the reference.*
 
-## What each carries
+## Support
 
 {carried}
-## The cheapest that is good enough
+## The fastest transport for a given error
 
-The transport (and resolution) that costs least a value among those whose relative L2 error of the BSDF stays below the
-target on at least {enough:.0f} % of a family's stacks; in brackets nanoseconds a value, with what a stack costs once
-spread over {values:,} values. Stacks whose truth is not known to the target are left out: how many are judged stands
-beside it where they are not all. A dash: none does; the walk then needs more paths than were tried.
+For each family of stacks and each target: the transport and resolution with the lowest cost among those whose relative
+L2 error of the BSDF is below the target on at least {enough:.0f} % of the family's stacks. In brackets: nanoseconds a
+value, including the preparation of a stack divided by {values:,} values. Stacks whose reference is less accurate than
+the target are omitted; "18 of 21" says how many remain. A dash: none of the measured resolutions reaches the target.
 
 {cheapest}
 ## Single stacks
 
-Relative L2 error in percent at the finest resolution measured, and nanoseconds a value as above. `<=`: the truth is not
-known any better. A dash: not carried.
+Relative L2 error in percent at the finest measured resolution, and nanoseconds a value as above. `<=`: the reference is
+no more accurate than this. A dash: not supported.
 
 {examples}
-## In words
+## Summary
 
 {words}
 """
@@ -126,12 +138,14 @@ WORDS = {
         "of vMF normals, whose tails are far shorter: the other stacks of the suite measure that"
     ),
     "Weidlich & Wilkie": "coats over a base without inter-reflection, to compare with what was used before",
-    "adding-doubling": "everything, exactly; the choice for stacks that are asked for more than a few hundred values",
-    "solver, directions known": (
-        "the same along directions that `evaluate` can see beforehand, as in a fit: under an interface light is "
-        "followed along them, and read off no table"
+    "adding-doubling": "everything, exactly; the choice for stacks that are evaluated at more than a few hundred pairs",
+    "adding-doubling, fixed directions": (
+        "the same where `evaluate` knows the directions beforehand, as in a fit: under an interface light is traced "
+        "along them and not interpolated in a table"
     ),
-    "solver as it chooses": "the same at the resolution that a stack is given by default, for errors of about 1e-3",
+    "adding-doubling, automatic resolution": (
+        "the same at the resolution that is chosen for each stack by default, for errors of about 1e-3"
+    ),
     "random walk": "everything, with standard errors; to check the others",
 }
 
@@ -191,7 +205,7 @@ def carried(models: Sequence[Model]) -> str:
     for probe in PROBES:
         transports = [next(iter(model.steps.values())) for model in models]
         lines.append([probe.words, *("yes" if supports(transport, probe.stack) else "-" for transport in transports)])
-    return table(("a stack of", *names), lines)
+    return table(("stack", *names), lines)
 
 
 def cheapest(rows: Sequence[Row], limits: Mapping[str, float]) -> str:

@@ -3,7 +3,7 @@
 After Wang et al. 2022, Sec. 5: slabs of one or two media with random parameters, and the BSDF of all orders but the
 first. The paper walks it; here `AddingDoubling` solves it, without noise. Materials come in shards of one structure
 (kinds of media, level or tilted) that a program is compiled for once; a shard is a file, made from the seed and its
-number alone, so that an interrupted run goes on where it was.
+number alone, so that an interrupted run resumes where it was.
 """
 
 from collections.abc import Iterator
@@ -160,12 +160,12 @@ def draw_layers(
     tilted = (kinds != KINDS.index("hg")) & (random.uniform(size=media) < TILTED)
     size = (count, media)
 
-    def between(low: float, high: float) -> NDArray[np.float64]:
+    def uniform_in(low: float, high: float) -> NDArray[np.float64]:
         return np.exp(random.uniform(np.log(low), np.log(high), size))
 
-    alpha = between(*widths[bool(tilted.any())])
+    alpha = uniform_in(*widths[bool(tilted.any())])
     alpha = np.where(kinds == 2, random.uniform(*MEAN_COSINES, size), alpha)
-    thickness = np.where(random.uniform(size=size) < DEEP, between(*DEEPEST), between(*DEPTHS))
+    thickness = np.where(random.uniform(size=size) < DEEP, uniform_in(*DEEPEST), uniform_in(*DEPTHS))
     albedo = np.where(random.uniform(size=size) < LOSSLESS, 1.0, 1.0 - 0.95 * random.uniform(size=size) ** 2)
     f0 = np.where(random.uniform(size=size) < 0.5, 1.0, random.uniform(0.02, 1.0, size))
     cosine = np.where(random.uniform(size=size) < 0.4, 0.0, random.uniform(size=size))  # in the plane, or anywhere

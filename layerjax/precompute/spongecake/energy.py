@@ -47,7 +47,7 @@ LEAST = 1e-3
 """Energies much smaller are not put right."""
 
 STIFFNESS = 1e-4
-"""What keeps a coefficient at 0 that the directions do not tell, beside the mean of those they do."""
+"""Ridge, relative to the mean of the others, for coefficients that the directions do not determine."""
 
 
 class Balance(NamedTuple):
@@ -80,13 +80,13 @@ def balance(media: tuple[Medium, ...], networks: Mapping[int, eqx.nn.MLP], rule:
     stiffness = STIFFNESS * (jnp.trace(normal) / normal.shape[0] + LEAST)
     solution = jnp.linalg.inv(normal + stiffness * jnp.eye(normal.shape[0], dtype=dtype)) @ sure.T
 
-    def again(coefficients: Array, _: None) -> tuple[Array, None]:
+    def step(coefficients: Array, _: None) -> tuple[Array, None]:
         found = sum(jnp.sum(value * jnp.exp(terms @ coefficients), axis=-1) for terms, value in there)
         found = found * jnp.exp(here @ coefficients)
         apart = jnp.tanh(jnp.log((wanted + LEAST) / (found + LEAST)))
         return coefficients + 0.5 * solution @ apart, None
 
-    coefficients, _ = jax.lax.scan(again, jnp.zeros(here.shape[-1], dtype), length=rule.rounds)
+    coefficients, _ = jax.lax.scan(step, jnp.zeros(here.shape[-1], dtype), length=rule.rounds)
     return Balance(wi, wanted, here @ coefficients)
 
 

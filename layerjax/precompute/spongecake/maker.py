@@ -1,7 +1,7 @@
 """Makes the networks of `layerjax.transport.spongecake.transport`: data from `AddingDoubling`, then training.
 
 Networks of the second lobe come first, then those that put its energy right, which are learned beside the former. The
-shards of data and the state of a training lie in a folder that the work goes on from when it is interrupted.
+shards of data and the state of a training lie in a folder from which interrupted work resumes.
 """
 
 import hashlib
@@ -79,12 +79,12 @@ def _second_lobe(media: int, plan: Plan, work: Path, report: Report) -> tuple[eq
         for there in data.make(work, wanted, media, split, SEED):
             report(f"media {media}: {split} {there}/{wanted}")
 
-    def told(line: str) -> None:
+    def say(line: str) -> None:
         report(f"media {media}: {line}")
 
     with jax.enable_x64(False):
         learned = data.load(work, count, media, "train", SEED)
-        net, curve = training.train(media, learned, SEED, schedule, work / _state(media, plan), told)
+        net, curve = training.train(media, learned, SEED, schedule, work / _state(media, plan), say)
         batch = training.batch_of(data.load(work, tested, media, "test", SEED))
         apart = np.sqrt(np.sum(training.errors(net, batch)[0] ** 2, axis=1))
     relative = [apart / np.sqrt(np.sum(size**2, axis=1)) for size in (batch.size, batch.size_multiple)]
@@ -100,14 +100,14 @@ def _bend(media: int, net: eqx.nn.MLP, plan: Plan, work: Path, report: Report) -
     for there in bending.make(own, count + tested, media, {media: net}, SEED):
         report(f"media {media}: energy: {there}/{count + tested}")
     bent = bending.load(own, count + tested, media, SEED)
-    learned, unseen = bending.rows_of(bent, slice(count)), bending.rows_of(bent, slice(count, None))
+    learned, held_out = bending.rows_of(bent, slice(count)), bending.rows_of(bent, slice(count, None))
 
-    def told(line: str) -> None:
+    def say(line: str) -> None:
         report(f"media {media}: energy: {line}")
 
     with jax.enable_x64(False):
-        bend, curve = bending.train(media, learned, SEED, plan.schedule, own / _state(media, plan), told)
-        error = np.percentile(np.abs(bending.errors(bend, unseen)), PERCENTILES)
+        bend, curve = bending.train(media, learned, SEED, plan.schedule, own / _state(media, plan), say)
+        error = np.percentile(np.abs(bending.errors(bend, held_out)), PERCENTILES)
     report(f"media {media}: energy: missing energy, median and 95th percentile: {error.round(4).tolist()}")
     return pack(bend) | _record(media, plan, curve, error)
 
@@ -123,5 +123,5 @@ def _record(media: int, plan: Plan, curve: NDArray, error: NDArray) -> dict[str,
 
 
 def _state(media: int, plan: Plan) -> str:
-    """Name of the file that a training goes on from."""
+    """Name of the file that a training resumes from."""
     return f"state-{media}-{SEED}-{plan.train[media - 1]}-{plan.schedule.epochs}-{plan.schedule.batch}.eqx"

@@ -47,7 +47,7 @@ SPREAD = 0.2
 
 
 class Parts(NamedTuple):
-    """What the second lobe has beyond the paper's: to show what each is worth. `apart`: weights of the two sides."""
+    """What the second lobe has beyond the paper's: to measure the gain of each. `apart`: weights of the two sides."""
 
     blur: bool = True
     rim: bool = True
@@ -255,8 +255,8 @@ def _slab(media: Numbers, alpha: Array, thickness: Array, blur: Array, albedo: A
 
 def _values(values: Callable[[Vector, Vector, Side], Channels], media: int, wi: Array, wo: Array) -> Array:
     """Values of the only channel for each pair of sides, (s, i, o). wi: (s, i, 3). wo: (s, i, o, 3)."""
-    asked: tuple[Side, ...] = ("reflection", "all", "transmission")  # from below there is nothing less than all
-    pairs = [(split(wi[n, :, None]), split(wo[n]), asked[side]) for n, side in enumerate(sides_of(media))]
+    sides: tuple[Side, ...] = ("reflection", "all", "transmission")  # from below there is nothing less than all
+    pairs = [(split(wi[n, :, None]), split(wo[n]), sides[side]) for n, side in enumerate(sides_of(media))]
     return jnp.stack([values(*pair)[0] for pair in pairs])
 
 

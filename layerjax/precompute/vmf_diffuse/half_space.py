@@ -29,8 +29,8 @@ class HalfSpace:
     """Discrete half-space of one roughness.
 
     Attributes:
-        cosines: (nodes,) cosines u > 0: Gauss nodes, then those asked for.
-        weights: (nodes,) weights of an integral du, 0 for those asked for.
+        cosines: (nodes,) cosines u > 0: Gauss nodes, then the requested ones.
+        weights: (nodes,) weights of an integral du, 0 for the requested ones.
         facing, averted: (nodes,) sigma(u) and sigma(-u).
         up, mixed, down: (modes, nodes, nodes) K_m(u, u'), (-1)^m K_m(u, -u') and K_m(-u, -u').
     """

@@ -118,7 +118,7 @@ def _design(space: HalfSpace, spread: float, mode: int) -> tuple[np.ndarray, np.
 
 
 def _spread_out(space: HalfSpace, spread: float) -> np.ndarray:
-    """Weights of cosines that count each decade alike, down to grazing within the layer."""
+    """Weights of cosines that count each decade equally, down to grazing within the layer."""
     width = flake_width(spread)
     layer = 1.0 if np.isinf(width) else width / (1.0 + width)
     return space.weights / (space.cosines + GRAZING * layer)

@@ -45,7 +45,7 @@ def all_orders_brdf(wi: Vector, wo: Vector, albedo: Channels, roughness: Array) 
     Errors against the half-space, for all roughnesses and cosines down to 1e-6: directional albedo 0.25 %, so that at
     albedo 1 it lies within 0.25 % of 1; root mean square over the projected hemispheres 0.25 %; single values 3 % where
     both cosines are above 0.1. They fall with roughness, to 0.05 % at 0.1 (single values 1.6 %). Modes cancel where
-    light goes on forward at grazing, and what they leave below 0 is cut off. Reciprocal to rounding.
+    light is scattered forward at grazing, and what they leave below 0 is cut off. Reciprocal to rounding.
 
     At roughness 0 it is albedo / pi. Towards roughness 1 the derivative with respect to roughness would grow without
     bound; it ends within 1e-6 (see `layerjax.surfaces.vmf_diffuse.flakes.concentration`). That with respect to albedo

@@ -56,7 +56,7 @@ class VMFDiffuse(Surface):
     and normal incidence). Derivatives by roughness would diverge at 0 (as r^-1/2 near grazing) and at 1 (where alpha
     does): roughness counts from 1e-8, and within 1e-6 of 1 the flakes' concentration is linear in it, so that both are
     large and lead into the range. The derivative by albedo diverges at 1 as (1 - c)^-1/2 (the physical one does too);
-    at 1 itself that term is left out.
+    at 1 itself that term is omitted.
     """
 
     albedo: Parameter = parameter("VMFDiffuse.albedo")
@@ -74,16 +74,16 @@ class VMFDiffuse(Surface):
         return all_orders_brdf(wi, wo, albedos, self.roughness)
 
     def sample(self, wi: Vector, u1: Array, u2: Array) -> Vector:
-        # a cosine lobe that leans towards the light, as the flakes do that it meets; uniform for a share, because
+        # a cosine lobe that is tilted towards the light, as the flakes do that it meets; uniform for a share, because
         # f cos stays finite where the cosine goes to 0. A weight is below 2 times the albedo.
         share, axis = self._proposal(wi)
         uniform = u1 < share
         v1 = jnp.where(uniform, safe_div(u1, share), (u1 - share) / (1.0 - share))
         x, y, z = sample_cosine(v1, u2)
         first, second = frame(axis)
-        leaning = add(combine(x, first, y, second), scale(z, axis))
+        tilted_axis = add(combine(x, first, y, second), scale(z, axis))
         flat, phi = safe_sqrt(1.0 - v1 * v1), 2.0 * jnp.pi * u2
-        return select(uniform, (flat * jnp.cos(phi), flat * jnp.sin(phi), v1), leaning)
+        return select(uniform, (flat * jnp.cos(phi), flat * jnp.sin(phi), v1), tilted_axis)
 
     def pdf(self, wi: Vector, wo: Vector) -> Array:
         share, axis = self._proposal(wi)

@@ -39,7 +39,7 @@ from layerjax.transport.endf.warping import (
 
 
 def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> list[Channels]:
-    """BTDF of every lobe: light that goes straight, and after one round trip or more.
+    """BTDF of every lobe: light without a round trip, and after one or more.
 
     wi is above the horizon, and so is `under`, the mirror image of where the light goes.
     """
@@ -54,7 +54,7 @@ def transmissions(coat: Coat, options: Options, wi: Vector, under: Vector) -> li
 def _by_mean_directions(
     coat: Coat, top: UpperSide, base: LowerSide, options: Options, wi: Vector, under: Vector
 ) -> list[Channels]:
-    """All terms at the mean direction, straight on from wi."""
+    """All terms at the mean direction, that of light which is not deflected."""
     h, _ = half_vector(wi, under, same_side=True)
     inner, enters = entered(wi, top.ior)
     level = fresnel.dielectric(wi[2], top.ior)

@@ -1,4 +1,4 @@
-"""Straight flight of the walk: to the next collision, or to the surface or the way out that lies before it."""
+"""Free flight of the walk: to the next collision, or to the surface or the way out that lies before it."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from layerjax.transport.random_walk.scene import Scene, choose
 from layerjax.transport.random_walk.state import PathState
 
 
-def fly(scene: Scene, path: PathState, free: Array, u: Array) -> tuple[PathState, Array, Array | None]:
+def free_flight(scene: Scene, path: PathState, free: Array, u: Array) -> tuple[PathState, Array, Array | None]:
     """To the next collision if it lies in the region: the path there, whether it does, and the medium."""
     last = len(scene.media) - 1
     if last < 0:

@@ -80,7 +80,7 @@ def goniophotometer(
         key: a JAX random key; the same key gives the same result.
         paths: number of paths for each wi, >= 2.
         polar, azimuth: number of bins, equal in |cos(theta)| and in phi.
-        orders: number of orders told apart.
+        orders: number of orders that are distinguished.
         microfacets: see `RandomWalk`.
         lanes: number of paths that are under way at a time.
 
@@ -145,10 +145,10 @@ def _measure(
 
     energy, by_order = estimate(cells), estimate(slots[..., 1:, :, :])
     albedo = estimate(slots[..., 1:, :, :].sum(axis=-3))
-    straight = estimate(slots[..., 0, :, :].sum(axis=-3))
+    ballistic = estimate(slots[..., 0, :, :].sum(axis=-3))
     cosines = jnp.linspace(0.0, 1.0, polar + 1, dtype=dtype)
     azimuths = jnp.linspace(0.0, 2.0 * jnp.pi, azimuth + 1, dtype=dtype)
-    return Goniogram(*energy, *by_order, *albedo, *straight, cosines, azimuths)
+    return Goniogram(*energy, *by_order, *albedo, *ballistic, cosines, azimuths)
 
 
 def _recorder(polar: int, azimuth: int, orders: int) -> Record:

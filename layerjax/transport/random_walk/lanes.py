@@ -55,9 +55,9 @@ def average(
     padding = groups * together - n
     quota = quotas(paths, width)
     words = key_words(key)
-    padded, asked = jax.tree.map(lambda x: jnp.pad(x, (0, padding)), (directions, valid))
-    known = tuple(upright(w, asked) for w in padded)
-    grouped = jax.tree.map(lambda x: x.reshape(groups, together), (known, asked))
+    padded, valid_rows = jax.tree.map(lambda x: jnp.pad(x, (0, padding)), (directions, valid))
+    known = tuple(upright(w, valid_rows) for w in padded)
+    grouped = jax.tree.map(lambda x: x.reshape(groups, together), (known, valid_rows))
 
     def group(question: tuple[Array, Any]) -> tuple[Array, Array]:
         index, (vectors, owed) = question

@@ -2,7 +2,7 @@
 
 The physics of a facet is that of `layerjax.microsurface.heitz_walk`, whose heights and directions are counted from the
 side of the surface that the ray is on. Here a path keeps its place on a surface of the stack, and sends what it can to
-the direction that light is asked for.
+the requested direction of the light.
 """
 
 from typing import NamedTuple
@@ -67,7 +67,7 @@ def width(scene: Scene, surface: Array | None) -> Array:
     return jnp.where(is_base(scene, surface), scene.base.alpha, roughness(scene, surface))
 
 
-def fly(w: Vector, height: Array, alpha: Array, free_path: Array) -> tuple[Array, Array]:
+def free_flight(w: Vector, height: Array, alpha: Array, free_path: Array) -> tuple[Array, Array]:
     """Next height of a ray after a free path (in mean free paths), and whether it has left the surface."""
     reached = next_height(w, height, alpha, free_path)
     return reached, (w[2] > 0) & (reached <= 0)

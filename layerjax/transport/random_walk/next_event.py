@@ -24,7 +24,7 @@ from layerjax.transport.random_walk.state import Aim, Arrival, Event, PathState,
 
 
 class Goal(NamedTuple):
-    """The direction that light is asked for, lane by lane, and what follows from it once."""
+    """The requested direction of the light, lane by lane, and what follows from it once."""
 
     wo: Vector
     above: Array
@@ -79,7 +79,7 @@ def start_aiming(path: PathState, goal: Goal) -> PathState:
 
 
 def make_target(goal: Goal, path: PathState, arrival: Arrival) -> Target:
-    """Where the light of an event is asked for: wo, or, behind the exit interface, the aim."""
+    """Where the light of an event should go: wo, or, behind the exit interface, the aim."""
     if path.region is None:
         return Target(goal.wo, None, None)
     assert arrival.at_surface is not None
@@ -101,7 +101,7 @@ def meet_exit(
     *,
     multiple: bool,
 ) -> tuple[Aim, Array]:
-    """Refraction at the exit interface, asked for by aim and by walk.
+    """Refraction at the exit interface, requested by aim and by walk.
 
     Args:
         entry: direction of travel with which the path came to the surface.
@@ -147,7 +147,7 @@ def meet_opposite(
 
     Args:
         surface, from_above, hit: what is met, from where, and what happened there.
-        target: the direction that its light is asked for.
+        target: the requested direction of its light.
         at_opposite: whether it is that surface.
 
     Returns:
@@ -197,15 +197,15 @@ def contribution(
     rates = goal.rates
     if path.aim is not None and target.direct is not None:
         direct = target.direct
-        straight, aimed = factors[0], path.aim.weight
+        unaimed, aimed = factors[0], path.aim.weight
         if event.exit_weight is not None:
             assert arrival.at_surface is not None
-            straight = straight * jnp.where(arrival.at_surface, event.exit_weight, 1.0)
+            unaimed = unaimed * jnp.where(arrival.at_surface, event.exit_weight, 1.0)
         if event.density is not None:
             rivals = path.aim.density if event.rivals is None else path.aim.density * event.rivals
             total = event.density + rivals
             aimed = aimed * path.aim.density / jnp.where(total > 0, total, 1.0)  # balance heuristic
-        factors = tuple(jnp.where(direct, straight, aimed * outer) for outer in goal.outer_transmittance)
+        factors = tuple(jnp.where(direct, unaimed, aimed * outer) for outer in goal.outer_transmittance)
         exit_level = choose(goal.exit, [jnp.int32(level) for level in scene.levels[: len(scene.interfaces)]])
         ends = [jnp.where(direct, end, jnp.where(exit_level > j, 1.0, 0.0)) for j, end in enumerate(ends)]
         rates = [jnp.where(direct, a, b) for a, b in zip(rates, path.aim.rates, strict=True)]
@@ -258,7 +258,7 @@ def _passed(scene: Scene, path: PathState, ends: list[Any], rates: list[Array]) 
 
 
 def _counted(path: PathState, arrival: Arrival, target: Target, orders: str) -> Array:
-    """Whether there is an event whose light can arrive at wo, and is of an order that is asked for."""
+    """Whether there is an event whose light can arrive at wo, and is of a requested order."""
     counted = arrival.collides if arrival.at_surface is None else arrival.collides | arrival.at_surface
     direct, through = target.direct, target.through_exit
     if direct is not None:

@@ -70,13 +70,13 @@ class Arrival(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Where the light of an event is asked for."""
+    """Where the light of an event should go."""
 
     direction: Vector
     direct: Array | None
     """Whether that is wo itself, with no interface between; None: it always is."""
     through_exit: Array | None
-    """Whether it is the aim of the path, whose light goes on to wo through the exit interface; None: it never is."""
+    """Whether it is the aim of the path, whose light continues to wo through the exit interface; None: it never is."""
 
 
 class Event(NamedTuple):

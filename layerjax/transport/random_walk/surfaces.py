@@ -84,7 +84,7 @@ def bounce(
     """One reflection or refraction of light that travels along `travel` onto a surface.
 
     Args:
-        target: a direction of travel away from the surface that the scattered light is asked for, or None.
+        target: a direction of travel away from the surface requested of the scattered light, or None.
         refracts: lanes that are to refract wherever that is possible (their `kept` then lacks the transmittance).
     """
     wi = _facing(turned(travel, from_above, -1.0))

@@ -34,7 +34,7 @@ class RandomWalk(RandomTransport):
     interface opposite. The same key and the same shapes give the same numbers, bit for bit.
 
     Args:
-        paths: number of paths for each pair of directions (for each direction, if an albedo is asked for), >= 2.
+        paths: number of paths for each pair of directions (for each direction of an albedo), >= 2.
         microfacets: ``"single"``, one reflection or refraction at a rough surface (Walter et al. 2007), which loses
             what is masked; ``"multiple"``, light is followed on it until it leaves (Heitz et al. 2016).
         orders: ``"all"``; ``"first"``, paths of one event; ``"multiple"``, of two and more. An event is a collision, a

@@ -1,7 +1,7 @@
 """The random walk: one event a step, on many paths at a time.
 
 A path starts as light along wi and follows energy: it flies to a collision, to a surface or out of the stack, is
-scattered there, and goes on. With a target direction wo, each event adds what it sends there
+scattered there, and continues. With a target direction wo, each event adds what it sends there
 (`layerjax.transport.random_walk.next_event`). Behind more than one interface only the walk itself arrives, which is
 unbiased as well.
 
@@ -24,7 +24,7 @@ from layerjax.directions import Vector, scale, select
 from layerjax.microsurface import Microfacets
 from layerjax.surfaces import Conductor
 from layerjax.transport.random_walk import microsurface, surfaces
-from layerjax.transport.random_walk.flight import boundary, fly
+from layerjax.transport.random_walk.flight import boundary, free_flight
 from layerjax.transport.random_walk.next_event import (
     contribution,
     make_goal,
@@ -51,7 +51,7 @@ class Walk:
     Args:
         scene: the stack.
         wi: where the light comes from, path by path.
-        wo: where it is asked for, or None for a walk that only follows it.
+        wo: where light should go, or None for a walk that only follows it.
         microfacets: whether light that stays on a rough surface is followed.
         orders: which orders count (see `layerjax.RandomWalk`).
         count_orders: whether to count events although all orders count.
@@ -88,7 +88,7 @@ class Walk:
 
     def step(self, path: PathState, u: list[Array]) -> tuple[PathState, Step]:
         """One event: a collision, a bounce at a surface, or the way out. The caller restarts paths that end."""
-        path, arrival = self._fly(path, u)
+        path, arrival = self._free_flight(path, u)
         outside = (arrival.escapes, path.direction, weights(path), path.order)
         target = None if self.goal is None else make_target(self.goal, path, arrival)
         path, event = self._scatter(path, arrival, target, u)
@@ -134,13 +134,13 @@ class Walk:
             facet=microsurface.away(direction) if self.multiple else None,
         )
 
-    def _fly(self, path: PathState, u: list[Array]) -> tuple[PathState, Arrival]:
+    def _free_flight(self, path: PathState, u: list[Array]) -> tuple[PathState, Arrival]:
         """The path where its flight ends. One that draws an aim, or is on a rough surface, is at a surface already."""
         scene = self.scene
         free = jnp.ones(u[0].shape, bool)
         free = free if path.aiming is None else free & ~path.aiming
         free = free if path.facet is None else free & ~path.facet.on
-        path, collides, medium = fly(scene, path, free, u[0])
+        path, collides, medium = free_flight(scene, path, free, u[0])
         arrives, escapes, surface = boundary(scene, path, free & ~collides)
         if path.order is not None:
             path = path._replace(order=path.order + (collides | arrives))
@@ -252,11 +252,13 @@ class Walk:
         entry = select(begins, travel, facet.entry)
         entered_above = jnp.where(begins, from_above, facet.entered_above)
         alpha = microsurface.width(scene, surface)
-        first, _ = microsurface.fly(surfaces.turned(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5]))
+        first, _ = microsurface.free_flight(
+            surfaces.turned(travel, from_above), jnp.zeros_like(u[0]), alpha, -jnp.log(u[5])
+        )
         height = jnp.where(begins, first, facet.height)
         walked, height = microsurface.bounce(scene, surface, from_above, travel, height, towards, (u[1], u[2], u[4]))
         side = from_above ^ walked.crosses
-        height, left = microsurface.fly(surfaces.turned(walked.direction, side), height, alpha, -jnp.log(u[6]))
+        height, left = microsurface.free_flight(surfaces.turned(walked.direction, side), height, alpha, -jnp.log(u[6]))
         if scene.interfaces:  # nothing is refracted between equal indices: light passes at the first facet
             left = left | (walked.crosses & (scene.surface_ior(surface, from_above) == 1.0))
         faceted = microsurface.has_facets(scene, surface)
@@ -273,10 +275,10 @@ class Walk:
         if self.fades:
             after, survives = _play_roulette(after, u[3])
             ends = ends | ~survives
-        # whether the event is over: on a rough surface it goes on from facet to facet
+        # whether the event is over: on a rough surface it continues from facet to facet
         over = None if event.leaves is None else event.leaves | ~jnp.asarray(arrival.at_surface)
         if self.orders == "first" and path.order is not None:
-            done = path.order >= (1 if self.goal is not None else 2)  # without a goal it has to fly out yet
+            done = path.order >= (1 if self.goal is not None else 2)  # without a goal it has yet to leave
             ends = ends | (done if over is None else done & over)
         if path.inverse_density is not None and event.next_density is not None:
             inverse = self._inverse_density(after, arrival, event.next_density)
@@ -286,7 +288,7 @@ class Walk:
             assert event.leaves is not None
             ready = path.aiming & event.leaves
             begun = self._start(u[7])._replace(aim=path.aim, relay=path.relay)
-            if self.relays and path.aim is not None:  # the ray that has passed the exit goes on to draw the relay
+            if self.relays and path.aim is not None:  # the ray that has passed the exit continues and draws the relay
                 assert self.goal is not None
                 ready = ready & ~((arrival.surface == self.goal.exit) & (after.region == self.goal.inner))
             after = jax.tree.map(lambda new, old: jnp.where(ready, new, old), begun, after)

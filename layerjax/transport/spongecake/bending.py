@@ -40,7 +40,7 @@ POWER = 16
 """c is this power of a polynomial. Even: c is never negative; a power of two: four products make it."""
 
 DEGREE = 3
-"""Of the polynomial in the cosine."""
+"""Degree of the polynomial in the cosine."""
 
 FADING = 4
 """Power of what survives a collision (in each medium) by which c - 1 fades."""
@@ -134,7 +134,7 @@ def terms_of(turning: bool) -> int:
 
 
 def _degrees(turning: bool) -> tuple[int, ...]:
-    """Of the polynomials that azimuthal terms are multiplied by, the constant one first."""
+    """Degrees of the polynomials that multiply azimuthal terms, that of the constant one first."""
     return (DEGREE, DEGREE - 1, DEGREE - 1, DEGREE - 2, DEGREE - 2) if turning else (DEGREE,)
 
 

@@ -2,12 +2,12 @@
 
 Single scattering of flakes depends on wi and wo by their half vector, which turns ever faster as wo comes to lie
 opposite wi: the lobe of fibers has a dark seam there, and that of surface flakes nothing at all. Light that has met
-several flakes knows no half vector, and goes on that way: the paper's failure case (its Fig. 22). So the density of
+several flakes knows no half vector, and continues that way: the paper's failure case (its Fig. 22). So the density of
 flakes is blurred by b, with s = wi + wo in place of h,
 
     D_b = 1 / (pi sqrt(det S) q^2),    q = (s' S^-1 s + b) / (s' s + b),
 
-which is D at b = 0, reciprocal, and leads over to a lobe straight on.
+which is D at b = 0, reciprocal, and turns into a forward lobe.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""From the parameters of one medium or two to those of a second lobe (Wang et al. 2022, Sec. 5).
+"""Maps the parameters of one medium or two to those of a second lobe (Wang et al. 2022, Sec. 5).
 
 The multiple scattering of a slab looks like its single scattering with other parameters, and a constant. A multilayer
 perceptron of three hidden layers of 128 finds these: for every medium alpha' (g' of a Henyey-Greenstein medium), tau'
@@ -89,7 +89,7 @@ def network(media: int, key: Array) -> eqx.nn.MLP:
 
 
 def perceptron(inputs: int, outputs: int, key: Array) -> eqx.nn.MLP:
-    """A network that answers next to 0 whatever it is asked."""
+    """A network whose output is next to 0 for every input."""
     fresh = eqx.nn.MLP(inputs, outputs, WIDTH, DEPTH, activation=jax.nn.silu, key=key)
     last = fresh.layers[-1]
     small = (0.1 * last.weight, jnp.zeros(outputs))
@@ -166,7 +166,7 @@ def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array)
 
 
 def geometry(medium: Numbers) -> Array:
-    """What networks are told of a medium apart from what it absorbs, (GEOMETRY_FEATURES,)."""
+    """Inputs of networks that describe a medium but for its absorption, (GEOMETRY_FEATURES,)."""
     alpha = at_least(medium.alpha, LEAST_ALPHA)
     is_hg = medium.kind[2]
     tilt = (1.0 - is_hg) * medium.axis[2] * medium.axis[2]
@@ -179,7 +179,7 @@ def geometry(medium: Numbers) -> Array:
 
 
 def between(media: Numbers) -> list[Array]:
-    """What networks are told of how two axes lie to each other, one array or none."""
+    """Inputs of networks that describe the angle of two axes, one array or none."""
     if len(media.thickness) == 1:
         return []
     flakes = (1.0 - media.kind[0, 2]) * (1.0 - media.kind[1, 2])

@@ -24,6 +24,7 @@ from fits.prediction.cross_validation import (
     without,
 )
 from fits.prediction.importance import Evidence, evidence, posterior_draws
+from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import predict
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform, Normal
@@ -98,6 +99,23 @@ def test_held_out_data_are_predicted_by_the_others(found: Fit) -> None:
         expected = stats.norm.logpdf(data.values[rows, 0], columns @ mean, width)
         np.testing.assert_allclose(left.log_density[rows, 0], expected, atol=0.05)
     assert left.elpd == pytest.approx(left.elpd_by_group.sum())
+
+
+def test_errors_by_few_draws_are_told(found: Fit) -> None:
+    """Beside the exact densities of the regression; and more draws are taken until they are as small as asked for."""
+    data, exact = measurements(), []
+    rough = [cross_validate(found, draws=64, seed=seed, options=ComparisonOptions(most_draws=64)) for seed in range(8)]
+    for rows in rough[0].rows:
+        mean, covariance = regression(np.setdiff1d(np.arange(len(data)), rows))
+        columns = np.stack([np.ones(rows.size), data.wo[rows, 2]], axis=-1)
+        width = np.sqrt(np.sum(columns @ covariance * columns, axis=-1) + SIGMA**2)
+        exact.append(stats.norm.logpdf(data.values[rows, 0], columns @ mean, width).sum())
+    off = np.stack([(one.elpd_by_group - exact) / one.errors for one in rough])  # 24 of them
+    assert 0.5 < np.sqrt(np.mean(off**2)) < 1.5
+    finer = cross_validate(found, draws=64, options=ComparisonOptions(monte_carlo_error=0.1))
+    assert np.all(finer.errors <= 0.1)
+    assert np.max(rough[0].errors) > 0.1
+    assert finer.elpd == pytest.approx(sum(exact), abs=4.0 * finer.error)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -251,8 +269,8 @@ def test_fits_without_a_noise_model_are_refused() -> None:
 def test_what_is_worse_everywhere_is_distinguished(gaps: tuple[float, ...], clear: bool) -> None:
     """Three groups of ten measurements, over which a gap is spread evenly."""
     rows = tuple(np.split(np.arange(30), 3))
-    best = CrossValidation(("1", "2", "3"), rows, np.zeros((30, 1)), True)
-    other = CrossValidation(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True)
+    best = CrossValidation(("1", "2", "3"), rows, np.zeros((30, 1)), True, np.zeros(3))
+    other = CrossValidation(("1", "2", "3"), rows, -np.repeat(gaps, 10)[:, None] / 10.0, True, np.zeros(3))
     known = Evidence(0.0, 0.1, 0.1)
     seen = rank_models({"best": best, "other": other}, {"best": known, "other": known})["other"]
     assert (seen.clear_diff > 0.0) == clear

@@ -243,7 +243,7 @@ def test_shared_channels_are_smooth_once_in_a_joint_fit(exact: np.ndarray) -> No
         problem(paint(Free((4.0,) * 4, 0.1, 50.0, LogUniform(), random_walk_sd=steps)), exact) for steps in (0.1, 0.2)
     )
     joint = Joint({"one": posed, "two": posed}, shared=["layers"])
-    np.testing.assert_allclose(joint.model.box.between, posed.model.box.between)
-    assert Joint({"one": posed, "two": posed}).model.box.between.shape == (6, 8)
+    np.testing.assert_allclose(joint.model.box.differences, posed.model.box.differences)
+    assert Joint({"one": posed, "two": posed}).model.box.differences.shape == (6, 8)
     with pytest.raises(ValueError, match="has other bounds or another prior in 'two' than in 'one'"):
         Joint({"one": posed, "two": other}, shared=["layers"])

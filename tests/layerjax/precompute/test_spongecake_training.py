@@ -101,7 +101,7 @@ def test_a_shard_is_made_once_and_always_the_same(tmp_path, monkeypatch):
 def test_an_interrupted_training_ends_as_if_it_had_not_been(tmp_path):
     samples = drawn(1, shards=1)
     lines: list[str] = []
-    schedule = Schedule(epochs=4, batch=8, kept=2)
+    schedule = Schedule(epochs=4, batch=8, checkpoints=2)
     state = tmp_path / "state.eqx"
     whole, curve = training.train(1, samples, 3, schedule, state, lines.append)
     assert len(lines) == 2
@@ -114,7 +114,7 @@ def test_an_interrupted_training_ends_as_if_it_had_not_been(tmp_path):
         raise Interrupted
 
     with pytest.raises(Interrupted):
-        training.train(1, samples, 3, Schedule(epochs=4, batch=8, kept=1), state, interrupt)
+        training.train(1, samples, 3, Schedule(epochs=4, batch=8, checkpoints=1), state, interrupt)
     assert not state.exists()  # it was reported before it was written: nothing is half there
     steps = iter([False, True])
 
@@ -123,7 +123,7 @@ def test_an_interrupted_training_ends_as_if_it_had_not_been(tmp_path):
             raise Interrupted
 
     with pytest.raises(Interrupted):
-        training.train(1, samples, 3, Schedule(epochs=4, batch=8, kept=1), state, later)
+        training.train(1, samples, 3, Schedule(epochs=4, batch=8, checkpoints=1), state, later)
     again, same = training.train(1, samples, 3, schedule, state, lines.append)
     np.testing.assert_array_equal(curve, same)
     assert eqx.tree_equal(whole, again)
@@ -154,7 +154,7 @@ def test_energies_are_balanced_once_and_always_the_same(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one, other)
     assert again.log.shape == (4, 3 * 4)
     # log c is what coefficients of these very terms make of the directions; what they miss is told by energies
-    net, curve = bending.train(1, again, 3, Schedule(epochs=150, batch=4, kept=150), None, lambda line: None)
+    net, curve = bending.train(1, again, 3, Schedule(epochs=150, batch=4, checkpoints=150), None, lambda line: None)
     assert np.max(np.abs(bending.errors(net, again))) < 0.2 * np.max(np.abs(again.energy * again.log))
     assert curve[-1] < curve[0]
 
