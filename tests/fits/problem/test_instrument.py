@@ -257,7 +257,7 @@ def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -
     words = verdicts.identifiability(found)
     assert words["base.k"] == "limited by the instrument: correlated with base.alpha"
     lines, _, sound = verdicts.verdict(found)
-    assert "base.alpha and base.k are limited by the instrument" in lines[2]
+    assert "base.k and base.alpha are limited by the instrument" in lines[2]
     assert not sound
     # few rays again, as given: the error is told, and is what they lack
     few = fits.fit(FREE, data, transport=SINGLE, noise=NOISE, instrument=replace(seen, rings=1), starts=4)
