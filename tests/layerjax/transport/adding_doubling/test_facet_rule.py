@@ -100,10 +100,14 @@ def test_energies(ratio, alpha):
 @pytest.mark.parametrize("alpha", [slow(1e-4), slow(0.05), slow(0.1), 0.3, slow(0.5), slow(1.0), slow(15.0)])
 @pytest.mark.parametrize("ratio", [0.7, slow(0.95), slow(1.0), 1.5, slow(2.5)])
 def test_energies_of_vmf_normals(ratio, alpha):
-    """Right to 1e-4, midpoints among it. Masking of wide normals, a fit, kinks where it reaches 1: to 5e-4."""
+    """Right to 1e-4, midpoints among it. Masking of wide normals, a fit, kinks where it reaches 1: to 6e-4.
+
+    That fit alone would make up to 2 % of the light where nothing is reflected: as much passes as is there.
+    """
     found = np.asarray(energies(COSINES, ratio, alpha, "vmf")).T
-    expected = np.array([walked(cosine, ratio, alpha, "vmf") for cosine in COSINES])
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 if alpha < 1.0 else 5e-4)
+    reflected, refracted, lost = np.array([walked(cosine, ratio, alpha, "vmf") for cosine in COSINES]).T
+    expected = np.stack([reflected, np.minimum(refracted, 1.0 - reflected), np.maximum(lost, 0.0)], axis=-1)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 if alpha < 1.0 else 6e-4)
 
 
 def test_energies_of_vmf_normals_have_the_slopes_of_their_differences():
