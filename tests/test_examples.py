@@ -12,6 +12,7 @@ from fits.maps.store import open_map
 from tests.helpers.places import ROOT
 
 
+@pytest.mark.slow
 def test_a_mixture_is_told_from_a_metal(capsys: pytest.CaptureFixture[str]) -> None:
     example = runpy.run_path(str(ROOT / "examples" / "kinds_of_readings.py"))
     example["mixture"]()

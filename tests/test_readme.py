@@ -15,14 +15,20 @@ LATER = {"which_stack", "renderers"}
 """Pages whose code begins with results of the commands above it, or needs an extra."""
 
 
+LONG = {"evaluating-0", "own_data-0", "transports-0", "convergence-0"}
+"""Blocks that compile for long: derivatives of media with an axis over a metal, a fit of 16 starts, and the solver
+beside walks."""
+
+
 def blocks(language, pages=PAGES):
     """What stands in fences of that language, with the name of the page and which of its blocks it is."""
     found = [(page.stem, re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)) for page in pages]
+    named = [
+        (f"{name}-{index}", block) for name, texts in found if name not in LATER for index, block in enumerate(texts)
+    ]
     return [
-        pytest.param(textwrap.dedent(block), id=f"{name}-{index}")
-        for name, texts in found
-        if name not in LATER
-        for index, block in enumerate(texts)
+        pytest.param(textwrap.dedent(block), id=of, marks=[pytest.mark.slow] * (language == "python" and of in LONG))
+        for of, block in named
     ]
 
 

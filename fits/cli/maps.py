@@ -37,7 +37,7 @@ def fit_map(arguments: Namespace) -> int:
         prior = SpatialPrior(arguments.spatial_prior, scales.get("", scales), arguments.spatial_rounds)
     use_jax()
     from fits.maps.fit_map import fit_map as run
-    from fits.maps.report import tables
+    from fits.maps.report import summary
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
@@ -65,12 +65,12 @@ def fit_map(arguments: Namespace) -> int:
                 progress=progress,
             ),
         )
-    found, common = tables.summarise(map), replace(tables.common_table(map), title="Common to all texels")
-    show(tables.count_table(found), tables.quartile_table(found, map), *([common] if common.rows else []))
+    found, common = summary.summarise(map), replace(summary.common_table(map), title="Common to all texels")
+    show(summary.count_table(found), summary.quartile_table(found, map), *([common] if common.rows else []))
     if prior is not None:
-        show(tables.smoothing_words(map))
+        show(summary.smoothing_words(map))
     show(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
-    whole = found.there == found.texels and found.fitted > 0
+    whole = found.done == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 
 
@@ -81,15 +81,14 @@ def report_map(arguments: Namespace) -> int:
     path = Path(arguments.directory)
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
     require_free_place(out, arguments.force)
-    from fits.maps.report import page, tables
-    from fits.maps.report.verdicts import verdict
+    from fits.maps.report import page, summary
     from fits.maps.store import open_map
 
     map = open_map(arguments.directory)
     with show_progress() as progress:
         found = page.report(map, out, arguments.force, progress)
-    quartiles = [tables.quartile_table(found, map)] if found.fitted else []
-    show(tables.count_table(found), *quartiles, *verdict(found, map)[0], f"Report: {out}")
+    quartiles = [summary.quartile_table(found, map)] if found.fitted else []
+    show(summary.count_table(found), *quartiles, *summary.verdict(found, map)[0], f"Report: {out}")
     return DONE
 
 

@@ -1,14 +1,19 @@
 """Parallel execution of independent tasks: by threads, by processes of this machine, or by a Dask cluster.
 
-A function, data that all tasks share, and the tasks go in; results come out as they finish. A task that fails does not
-affect the others; the tasks of a worker that is killed are repeated.
+A function, data that all tasks have in common, and the tasks go in; results come out as they finish. A task that fails
+does not affect the others; the tasks of a worker that is killed are repeated.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from itertools import islice
 from typing import Any
 
 from fits.engines.failures import Failure as Failure
+from fits.engines.failures import attempt
+
+Work = Callable[[Any, Any], Any]
 
 
 @contextmanager
@@ -29,7 +34,7 @@ def connected(client: Any) -> Iterator[Any]:
 
 
 def run(
-    work: Callable[[Any, Any], Any],
+    work: Work,
     shared: Any,
     tasks: Iterable[Any],
     *,
@@ -44,8 +49,7 @@ def run(
         shared: data of all tasks; each worker receives them once.
         tasks: any number of them.
         processes: 1: threads of this process, one a core; the first task runs by itself, as it compiles. More: so many
-            processes, each on a core of its own with one thread: a script then needs
-            ``if __name__ == "__main__":``.
+            processes with one thread each: a script then needs ``if __name__ == "__main__":``.
         client: a `distributed.Client`, or the address of a scheduler (``"tcp://..."``), in place of processes. Its
             workers have layerjax installed and one thread each (``--nthreads 1``).
         threads: threads of this process; None: one a core. With 1 the calling thread executes the tasks.
@@ -70,6 +74,26 @@ def run(
         from fits.engines.processes import run_processes
 
         return run_processes(work, shared, tasks, processes)
-    from fits.engines.threads import run_threads
+    return _run_threads(work, shared, tasks, threads)
 
-    return run_threads(work, shared, tasks, threads)
+
+def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None) -> Iterator[tuple[int, Any]]:
+    """Threads of JAX run beside each other, for they leave Python while they compute."""
+    from fits.problem.compilation import cores
+
+    pending, most = iter(enumerate(tasks)), threads or cores()
+    # the first by itself: it compiles the program, which keeps one core busy
+    for index, task in islice(pending, None if most == 1 else 1):
+        yield index, attempt(work, shared, task)
+    running: dict[Future[Any], int] = {}
+    pool = ThreadPoolExecutor(most)
+    try:
+        while True:
+            for index, task in islice(pending, most - len(running)):
+                running[pool.submit(attempt, work, shared, task)] = index
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # waits for the tasks that have begun

@@ -1,7 +1,7 @@
 """Execution of tasks by the workers of a dask.distributed cluster.
 
-A worker takes one task at a time, or a group of short ones. Workers with several threads share a process between tasks,
-which some libraries do not support.
+A worker takes one task at a time, or a group of short ones. Workers with several threads use a process for several
+tasks, which some libraries do not support.
 """
 
 import asyncio
@@ -10,8 +10,8 @@ import threading
 import time
 import uuid
 import warnings
-from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -22,17 +22,12 @@ from fits.engines.worker import configure, precision
 IN_FLIGHT = 4
 """Tasks that are submitted for each thread of a worker."""
 
-TIMEOUT = 60.0
-"""Seconds to wait for the first worker."""
+TIMEOUT, RECOUNT = 60.0, 5.0
+"""Seconds to wait for the first worker, and after which workers are counted again: some clusters grow."""
 
-RECOUNT = 5.0
-"""Seconds after which workers are counted again: some clusters grow."""
-
-GROUP_SECONDS = 0.5
-"""Seconds of work that go to a worker at a time if single tasks are shorter, as submitting takes milliseconds."""
-
-SHORTEST = 1e-3
-"""Least seconds that a task counts as."""
+GROUP_SECONDS, SHORTEST = 0.5, 1e-3
+"""Seconds of work that go to a worker at a time if single tasks are shorter, as submitting takes milliseconds; and the
+least that a task counts as."""
 
 RETRIES = 3
 """Retries of a task that fails neither by its own error nor by the death of its worker."""
@@ -40,13 +35,8 @@ RETRIES = 3
 WITH_PORT = ("tcp", "tls", "ws", "wss", "ucx")
 """Schemes of a scheduler's address, besides those of threads of this process."""
 
-REPEAT, REPEAT_LATER = object(), object()
-"""Outcomes of tasks that are repeated, at once or at the end."""
 
-
-def run_distributed(
-    work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], client: Any
-) -> Iterator[tuple[int, Any]]:
+def run_distributed(work: Any, shared: Any, tasks: list[Any], client: Any) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`."""
     _require_client(client)
     import cloudpickle
@@ -60,8 +50,6 @@ def run_distributed(
 
 
 def _results(payload: bytes, tasks: list[bytes], client: Any) -> Iterator[tuple[int, Any]]:
-    if not tasks:
-        return
     with connected(client) as connection:
         run = _Run(connection, payload, tasks)
         try:
@@ -78,17 +66,14 @@ def _require_client(client: Any) -> None:
         from distributed.comm.addressing import parse_address, parse_host_port
     except ImportError:
         raise ValueError('client= needs distributed: pip install "layerjax[distributed]"') from None
-    wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
-    if not isinstance(client, str | Client) or getattr(client, "asynchronous", False):
-        raise ValueError(f"client is {client!r}; it must be {wanted}")
+    valid = isinstance(client, Client) and not client.asynchronous
     if isinstance(client, str):
-        try:
+        with suppress(ValueError):  # a client would wait a minute for a host that there cannot be
             scheme, place = parse_address(client)
-            host = parse_host_port(place)[0] if scheme in WITH_PORT else place if scheme == "inproc" else ""
-        except ValueError:  # a client would wait a minute for it
-            host = ""
-        if not host:
-            raise ValueError(f"client is {client!r}; it must be {wanted}")
+            valid = bool(parse_host_port(place)[0] if scheme in WITH_PORT else scheme == "inproc" and place)
+    if not valid:
+        wanted = "a distributed.Client, or the address of a scheduler, such as tcp://node1:8786"
+        raise ValueError(f"client is {client!r}; it must be {wanted}")
 
 
 @contextmanager
@@ -100,63 +85,75 @@ def connected(client: Any) -> Iterator[Any]:
     if not isinstance(client, str):
         yield client
         return
-    address = client
     try:
-        client = Client(address, set_as_default=False)
+        new = Client(client, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise OSError(f"{address}: there is no scheduler ({one_line(error)})") from None
+        raise OSError(f"{client}: there is no scheduler ({one_line(error)})") from None
     try:
-        yield client
+        yield new
     finally:
         with suppress(Exception):
-            client.close(timeout=1)
+            new.close(timeout=1)
 
 
 class _Run:
-    """Tasks that are submitted to a scheduler."""
+    """Tasks that are submitted to a scheduler; running: the indices of those that each future executes."""
 
     def __init__(self, client: Any, payload: bytes, tasks: list[bytes]):
         self.client, self.payload, self.tasks = client, payload, tasks
         self.name = f"layerjax-{uuid.uuid4().hex[:12]}"
         self.running: dict[Any, list[int]] = {}
+        self.submitted = 0
         self.seconds: float | None = None
-        self.losses: Counter[int] = Counter()
-        self.suspects: list[int] = []
         self.shared: Any = None
         self.room, self.counted = 1, float("-inf")
 
     def results(self) -> Iterator[tuple[int, Any]]:
-        """Results of all tasks; those that ran on workers which died too often are repeated at the end, one by one."""
-        with self._naming_scheduler():
-            self.client.wait_for_workers(1, timeout=TIMEOUT)
-        yield from self._execute(list(range(len(self.tasks))), single=False)
-        for index in self.suspects:
-            yield from self._execute([index], single=True)
-
-    def _execute(self, indices: list[int], single: bool) -> Iterator[tuple[int, Any]]:
-        from distributed import as_completed
-
-        pending = deque(indices)
-
-        def submit() -> list[Any]:
+        """Results of all tasks; those that ran on workers which died too often are repeated at the end, one by one:
+        another task may have killed the worker."""
+        if self.tasks:
             with self._naming_scheduler():
-                return [self._submit(self._group(pending)) for _ in range(self._room() - len(self.running)) if pending]
+                self.client.wait_for_workers(1, timeout=TIMEOUT)
+        suspects: list[int] = []
+        yield from self._execute(range(len(self.tasks)), suspects)
+        for index in suspects:
+            yield from self._execute([index], None)
 
-        completed = as_completed(submit(), loop=self.client.loop)
+    def _execute(self, indices: Iterable[int], suspects: list[int] | None) -> Iterator[tuple[int, Any]]:
+        from distributed import KilledWorker, as_completed
+
+        pending, completed = deque(indices), as_completed(loop=self.client.loop)
+
+        def submit() -> None:
+            with self._naming_scheduler():
+                while pending and len(self.running) < self._room():
+                    completed.add(self._submit(self._group(pending)))
+
+        submit()
         for future in completed:
-            group = self.running.pop(future)
-            outcomes = self._outcomes(future, group, single)
+            group, outcomes = self.running.pop(future), []
+            try:
+                seconds, outcomes = future.result()
+                each = seconds / len(group)
+                self.seconds = each if self.seconds is None else 0.5 * (self.seconds + each)
+            except KilledWorker as killed:
+                if suspects is None:
+                    died = getattr(killed, "allowed_failures", MOST_DEATHS) + 1
+                    outcomes = [Failure(f"its worker died {died} times")]
+                else:
+                    suspects += group
+            except (futures.CancelledError, asyncio.CancelledError):
+                self._require_scheduler()
+                outcomes = [Failure("the scheduler has cancelled it")] * len(group)
+            except ImportError as error:
+                lacking = f"the workers of {self._address()} lack what this process has: {one_line(error)}"
+                raise ValueError(lacking) from None
+            except OSError:
+                self._require_scheduler()
+                raise  # of the task: the disk is full
             future.release()
-            with self._naming_scheduler():
-                for index, outcome in zip(group, outcomes, strict=True):
-                    if outcome is REPEAT:
-                        completed.add(self._submit([index]))
-            completed.update(submit())
-            yield from (
-                (index, outcome)
-                for index, outcome in zip(group, outcomes, strict=True)
-                if outcome is not REPEAT and outcome is not REPEAT_LATER
-            )
+            submit()
+            yield from zip(group, outcomes, strict=False)
 
     def _group(self, pending: deque[int]) -> list[int]:
         """The next tasks that are submitted together: several short ones, while there are enough for all workers."""
@@ -165,56 +162,22 @@ class _Run:
             size = max(1, min(int(GROUP_SECONDS / max(self.seconds, SHORTEST)), len(pending) // self._room()))
         return [pending.popleft() for _ in range(size)]
 
-    def _outcomes(self, future: Any, group: list[int], single: bool) -> list[Any]:
-        """For each finished task its result, its failure, or that it is repeated."""
-        from distributed import KilledWorker
-
-        try:
-            seconds, outcomes = future.result()
-            each = seconds / len(group)
-            self.seconds = each if self.seconds is None else 0.5 * (self.seconds + each)
-            return list(outcomes)
-        except KilledWorker as killed:
-            if single:
-                return [Failure(f"its worker died {getattr(killed, 'allowed_failures', MOST_DEATHS) + 1} times")]
-            self.suspects += group  # another task may have killed the worker
-            return [REPEAT_LATER] * len(group)
-        except (futures.CancelledError, asyncio.CancelledError):
-            self._require_scheduler()
-            self.shared = None  # it may be lost as well
-            return [self._lost(index) for index in group]
-        except ImportError as error:
-            raise ValueError(
-                f"the workers of {self._address()} lack what this process has: {one_line(error)}"
-            ) from None
-        except OSError:
-            self._require_scheduler()
-            raise  # of the task: the disk is full
-
-    def _lost(self, index: int) -> Any:
-        self.losses[index] += 1
-        return REPEAT if self.losses[index] < MOST_DEATHS else Failure(f"it was lost {MOST_DEATHS} times")
-
     def _submit(self, group: list[int]) -> Any:
         if self.shared is None:  # a task, not scattered data: it is repeated if the workers that hold it are killed
+            from distributed import wait
+
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", message="Sending large graph")
-                self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.losses.total()}")
-            self._spread()
-        first = group[0]
-        name = f"{self.name}-{first}-{self.losses[first]}-{self.suspects.count(first)}"
+                self.shared = self.client.submit(bytes, self.payload, key=f"{self.name}-shared-{self.submitted}")
+            with suppress(Exception):  # a scheduler prefers workers that hold the data; those that die get them later
+                wait([self.shared], timeout=TIMEOUT)
+                self.client.replicate([self.shared])
+        self.submitted += 1
         arguments = (self.shared, self.name, [self.tasks[index] for index in group], precision())
-        future = self.client.submit(perform, *arguments, key=name, retries=RETRIES, pure=False)
+        key = f"{self.name}-{self.submitted}"
+        future = self.client.submit(perform, *arguments, key=key, retries=RETRIES, pure=False)
         self.running[future] = group
         return future
-
-    def _spread(self) -> None:
-        """Replicate the shared data to all workers: a scheduler prefers workers that hold the data of a task."""
-        from distributed import wait
-
-        with suppress(Exception):  # of workers that die meanwhile; others receive it later
-            wait([self.shared], timeout=TIMEOUT)
-            self.client.replicate([self.shared])
 
     def _room(self) -> int:
         """The number of tasks that may be submitted at a time."""
@@ -235,12 +198,11 @@ class _Run:
         """Errors of the connection name the scheduler."""
         try:
             yield
-        except TimeoutError:
-            self._require_scheduler()
-            raise OSError(f"{self._address()}: no worker came within {TIMEOUT:g} s") from None
         except (OSError, RuntimeError, ValueError) as error:
             self._require_scheduler()
-            raise OSError(f"{self._address()}: {one_line(error)}") from None
+            no_worker = f"no worker came within {TIMEOUT:g} s"
+            words = no_worker if isinstance(error, TimeoutError) else one_line(error)
+            raise OSError(f"{self._address()}: {words}") from None
 
 
 _jobs: dict[str, Any] = {}
@@ -248,21 +210,16 @@ _jobs_lock = threading.Lock()
 
 
 def perform(payload: bytes, name: str, tasks: list[bytes], double: bool | None) -> tuple[float, list[Any]]:
-    """Execute tasks in a worker; returns their seconds and outcomes. The worker is configured, and unpacks the shared
+    """Execute tasks in a worker; returns their seconds and outcomes. The worker is configured, and unpacks the common
     data, once for each run of this name."""
+    from distributed import get_worker
+
     start = time.monotonic()
     with _jobs_lock:
         if name not in _jobs:
-            configure(double, _threads())
+            configure(double, int(get_worker().state.nthreads))
             _jobs.clear()
             _jobs[name] = pickle.loads(payload)
         work, shared = _jobs[name]
     outcomes = [attempt(work, shared, pickle.loads(task)) for task in tasks]
     return time.monotonic() - start, outcomes
-
-
-def _threads() -> int:
-    """Threads of this worker."""
-    from distributed import get_worker
-
-    return int(get_worker().state.nthreads)

@@ -1,49 +1,44 @@
-"""Execution of tasks by processes of this machine, each on a core of its own; tasks of a killed one are repeated."""
+"""Execution of tasks by processes of this machine with one thread each; tasks of a killed one are repeated.
+
+The standard library's pool of processes ends as a whole when one of them is killed. Here each has a pipe of its own:
+one that is closed says that its process has died, and with which task.
+"""
 
 import os
 import pickle
 import signal
 import sys
-import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from multiprocessing import connection, current_process, get_context, resource_tracker
 from typing import Any
 
 from fits.engines.failures import MOST_DEATHS, Failure
 from fits.engines.worker import READY, Raised, environment, serve
 
-AGAIN = 78
+SCRIPT_REPEATED = 78
 """Exit code of a worker that runs its parent's script to the point where that starts workers."""
 
 MOST_FALSE_STARTS = 10
-"""Worker processes in a row that may die before they are ready: no task has caused that."""
-
-PATIENCE = 5.0
-"""Seconds that a worker has to end when no task remains."""
-
-_environ = threading.Lock()
+"""Worker processes that may die before they are ready: no task has caused that."""
 
 
-def run_processes(
-    work: Callable[[Any, Any], Any], shared: Any, tasks: list[Any], processes: int
-) -> Iterator[tuple[int, Any]]:
+def run_processes(work: Any, shared: Any, tasks: list[Any], processes: int) -> Iterator[tuple[int, Any]]:
     """See `fits.engines.run`."""
-    end_if_again()
-    payload = _pickled((work, shared), "what tasks share")
-    packed = [_pickled(task, "a task") for task in tasks]
-    return _results(payload, packed, min(processes, len(tasks)))
+    end_repeated_script()
+    payload = _pickled((work, shared), "what tasks have in common")
+    return _results(payload, [_pickled(task, "a task") for task in tasks], min(processes, len(tasks)))
 
 
-def end_if_again() -> None:
+def end_repeated_script() -> None:
     """End a worker process that runs its parent's script, which has no guard, to where that starts workers.
 
     To be called before anything that must not be repeated.
     """
     if getattr(current_process(), "_inheriting", False):
-        sys.exit(AGAIN)
+        sys.exit(SCRIPT_REPEATED)
 
 
 def _pickled(what: Any, called: str) -> bytes:
@@ -56,149 +51,117 @@ def _pickled(what: Any, called: str) -> bytes:
         ) from None
 
 
-class _Worker:
-    """A process on a core, this end of the pipe to it, and the index of its current or first task."""
+def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
+    pending, deaths, false_starts = iter(range(len(tasks))), Counter[int](), 0
+    workers: dict[Any, _Worker] = {}  # by their pipes
 
-    def __init__(self, core: int | None, index: int):
-        self.core, self.index, self.ready = core, index, False
+    def start(indices: Iterator[int]) -> None:
+        for index in indices:
+            worker = _Worker(index)
+            workers[worker.pipe] = worker
+
+    try:
+        start(islice(pending, count))
+        while workers:
+            results = []
+            for pipe in connection.wait(list(workers)):
+                worker = workers[pipe]
+                index, message = worker.index, worker.receive()
+                if message == READY:
+                    worker.send(payload, tasks[index])
+                elif message is None:  # it has died: another takes its task, unless that has killed too many
+                    del workers[pipe]
+                    code = worker.process.exitcode or 0
+                    if worker.ready:
+                        deaths[index] += 1
+                    else:
+                        false_starts += 1
+                        if code > 0 or false_starts == MOST_FALSE_STARTS:
+                            raise ValueError(_cannot_start(code, false_starts))
+                    lost = deaths[index] == MOST_DEATHS
+                    start(islice(pending, 1) if lost else iter([index]))
+                    if lost:
+                        results.append((index, Failure(f"its worker died {MOST_DEATHS} times ({_death(code)})")))
+                else:
+                    results.append((index, _outcome(message)))
+                    if (following := next(pending, None)) is None:
+                        workers.pop(pipe).end()
+                    else:
+                        worker.index = following
+                        worker.send(tasks[following])
+            yield from results
+    finally:
+        for worker in workers.values():
+            worker.end()
+
+
+def _outcome(message: bytes) -> Any:
+    outcome = pickle.loads(message)
+    if isinstance(outcome, Raised):
+        raise outcome.error
+    return outcome
+
+
+class _Worker:
+    """A process, this end of the pipe to it, and the index of its current or first task."""
+
+    def __init__(self, index: int):
+        self.index, self.ready = index, False
         self.pipe, theirs = connection.Pipe()
-        self.process = get_context("spawn").Process(target=serve, args=(theirs, core), daemon=True)
+        self.process = get_context("spawn").Process(target=serve, args=(theirs,), daemon=True)
         try:
             with _worker_environment():
                 self.process.start()
         finally:
             theirs.close()  # the worker's end: once it is closed the worker has ended
 
-    def send(self, task: bytes) -> None:
+    def send(self, *messages: bytes) -> None:
         with suppress(OSError):  # it has ended, as its pipe will show
-            self.pipe.send_bytes(task)
+            for message in messages:
+                self.pipe.send_bytes(message)
 
     def receive(self) -> bytes | None:
         """Its message; None: it has ended."""
         try:
-            return self.pipe.recv_bytes()
+            message: bytes = self.pipe.recv_bytes()
+            self.ready = True
+            return message
         except (EOFError, OSError):
-            self.process.kill()
-            self.process.join()
+            self.end()
             return None
 
     def end(self) -> None:
+        """Kill it, if it has not ended."""
         self.pipe.close()
         self.process.kill()
         self.process.join()
 
 
-class _Pool:
-    """Workers, and the tasks that remain."""
-
-    def __init__(self, payload: bytes, tasks: list[bytes]):
-        self.payload, self.tasks = payload, tasks
-        self.remaining = iter(range(len(tasks)))
-        self.deaths: Counter[int] = Counter()
-        self.false_starts = 0
-        self.workers: list[_Worker] = []
-        self.finished: list[_Worker] = []
-
-    def start(self, core: int | None, index: int) -> None:
-        self.workers.append(_Worker(core, index))
-
-    def receive(self, worker: _Worker) -> tuple[int, Any] | None:
-        """Receive a worker's message, or its death, and send its next task; returns a finished task."""
-        index, message = worker.index, worker.receive()
-        if message is None:
-            return self._replace(worker)
-        if message == READY:
-            worker.ready, self.false_starts = True, 0
-            worker.send(self.payload)
-            worker.send(self.tasks[index])
-            return None
-        outcome = pickle.loads(message)
-        if isinstance(outcome, Raised):
-            raise outcome.error
-        following = next(self.remaining, None)
-        if following is None:
-            worker.pipe.close()  # it ends by itself
-            self.workers.remove(worker)
-            self.finished.append(worker)
-        else:
-            worker.index = following
-            worker.send(self.tasks[following])
-        return index, outcome
-
-    def _replace(self, worker: _Worker) -> tuple[int, Any] | None:
-        """Replace a worker that has died by another with the same task, unless that has killed too many."""
-        self.workers.remove(worker)
-        worker.pipe.close()
-        code, index = worker.process.exitcode or 0, worker.index
-        if not worker.ready:
-            self.false_starts += 1
-            if code > 0 or self.false_starts == MOST_FALSE_STARTS:
-                raise ValueError(_cannot_start(code, self.false_starts))
-            self.start(worker.core, index)
-            return None
-        self.deaths[index] += 1
-        lost = self.deaths[index] >= MOST_DEATHS
-        following = next(self.remaining, None) if lost else index
-        if following is not None:
-            self.start(worker.core, following)
-        return (index, Failure(f"its worker died {MOST_DEATHS} times ({_death(code)})")) if lost else None
-
-    def end(self, patience: float) -> None:
-        """End all workers; finished ones have so many seconds to end by themselves."""
-        end = time.monotonic() + patience
-        for worker in self.finished:
-            worker.process.join(max(0.0, end - time.monotonic()))
-        for worker in (*self.workers, *self.finished):
-            worker.end()
-
-
-def _results(payload: bytes, tasks: list[bytes], count: int) -> Iterator[tuple[int, Any]]:
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    pool, patience = _Pool(payload, tasks), 0.0
-    try:
-        for number, index in zip(range(count), pool.remaining, strict=False):
-            pool.start(cores[number % len(cores)], index)
-        while pool.workers:
-            messages = connection.wait([worker.pipe for worker in pool.workers])
-            workers = [worker for worker in pool.workers if worker.pipe in messages]
-            yield from [done for worker in workers if (done := pool.receive(worker)) is not None]
-        patience = PATIENCE
-    finally:
-        pool.end(patience)
-
-
 @contextmanager
 def _worker_environment() -> Iterator[None]:
-    """Start processes with the environment of a worker, and with Ctrl-C blocked, which is for the parent."""
+    """Start a process with the environment of a worker, and with Ctrl-C blocked, which is for the parent."""
     resource_tracker.ensure_running()  # its start would unblock the signal
-    masks = hasattr(signal, "pthread_sigmask")
-    with _environ:
-        before = dict(os.environ)
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if masks else None
-        try:
-            os.environ.update(environment())
-            yield
-        finally:
-            for name in set(os.environ) - set(before):
-                del os.environ[name]
-            os.environ.update(before)
-            if blocked is not None:
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    has_masks, before = hasattr(signal, "pthread_sigmask"), dict(os.environ)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT}) if has_masks else None
+    try:
+        os.environ.update(environment())
+        yield
+    finally:
+        for name in set(os.environ) - set(before):
+            del os.environ[name]
+        os.environ.update(before)
+        if blocked is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 def _cannot_start(code: int, tried: int) -> str:
     if code <= 0:
-        return f"{tried} worker processes in a row died as they started ({_death(code)})"
-    guard = 'the statements of the script must be under `if __name__ == "__main__":`'
-    if code == AGAIN:
-        return f"each worker process runs the script that starts it: {guard}, or processes must be 1"
-    return f"a worker process cannot start (exit code {code}, its message is above): {guard}"
+        return f"{tried} worker processes died as they started ({_death(code)})"
+    why = "it runs the script that starts it" if code == SCRIPT_REPEATED else f"exit code {code}, its message is above"
+    guard = 'the statements of the script must be under `if __name__ == "__main__":`, or processes must be 1'
+    return f"a worker process cannot start ({why}): {guard}"
 
 
 def _death(code: int) -> str:
-    if code >= 0:
-        return f"exit code {code}"
-    with suppress(ValueError):
-        name = signal.Signals(-code).name
-        return f"{name}, which systems send when memory is short" if name == "SIGKILL" else name
-    return f"signal {-code}"
+    killed = ", which systems send when memory is short" if code == -signal.SIGKILL else ""
+    return f"exit code {code}" if code >= 0 else f"{signal.Signals(-code).name}{killed}"

@@ -1,4 +1,4 @@
-"""Configuration of workers: one thread on one core, the precision of the parent, a cache of compiled programs.
+"""Worker processes: one thread each, the precision of the parent, a cache of compiled programs.
 
 Processes receive most of it by their environment, which JAX and LAPACK read on import. A worker of a cluster has
 imported JAX and is configured by a call.
@@ -19,13 +19,10 @@ from typing import Any, NamedTuple
 from fits.engines.compile_cache import FOLDER, LEAST, LEAST_COMPILE, compile_cache, keep_programs
 from fits.engines.failures import attempt
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 XLA_THREADS = "NPROC"
-"""The variable from which XLA reads its number of threads."""
+"""The variable from which XLA reads its number of threads; XLA_FLAGS would change results."""
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
-THRESHOLD = 1 << 25
-"""Bytes: the largest value that glibc itself adapts the second of them to."""
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", XLA_THREADS)
 
 READY = b""
 """First message of a worker."""
@@ -39,19 +36,18 @@ class Raised(NamedTuple):
 
 def environment() -> dict[str, str]:
     """Environment variables of a worker process that differ from those of its parent."""
-    variables = dict.fromkeys((*ONE_THREAD, XLA_THREADS), "1")  # not by XLA_FLAGS, which change results
-    if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several share one accelerator
+    variables = dict.fromkeys(ONE_THREAD, "1")
+    if "XLA_PYTHON_CLIENT_PREALLOCATE" not in os.environ:  # several use one accelerator
         variables["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
-    jax = sys.modules.get("jax")
-    directory: str | None = os.environ.get(FOLDER.upper())
-    if jax is not None:
+    folder, least = os.environ.get(FOLDER.upper()), None
+    if (jax := sys.modules.get("jax")) is not None:
         variables["JAX_ENABLE_X64"] = str(int(jax.config.jax_enable_x64))
-        directory = jax.config.values[FOLDER]
-        if directory:
-            variables[LEAST.upper()] = str(jax.config.values[LEAST])
-    if not directory and (directory := compile_cache()):
-        variables[LEAST.upper()] = str(LEAST_COMPILE)
-    return variables | ({FOLDER.upper(): directory} if directory else {})
+        folder, least = jax.config.values[FOLDER], jax.config.values[LEAST]
+    if not folder:
+        folder, least = compile_cache(), LEAST_COMPILE
+    if least is not None:
+        variables[LEAST.upper()] = str(least)
+    return variables | ({FOLDER.upper(): folder} if folder else {})
 
 
 def precision() -> bool | None:
@@ -66,21 +62,14 @@ def configure(double: bool | None, threads: int) -> None:
     import jax
 
     quieten()
-    _keep_memory()
+    if "MALLOC_TRIM_THRESHOLD_" in os.environ:  # of dask: to return memory costs more than a short task; no glibc: none
+        with suppress(OSError, AttributeError):
+            for parameter in (-1, -3):  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD
+                ctypes.CDLL(None).mallopt(parameter, 1 << 25)
     os.environ.setdefault(XLA_THREADS, str(threads))
     if double is not None:
         jax.config.update("jax_enable_x64", double)
     keep_programs()
-
-
-def _keep_memory() -> None:
-    """Do not return memory to the system after every computation, as dask configures its workers: to allocate it again
-    costs more than the overhead of short tasks."""
-    if "MALLOC_TRIM_THRESHOLD_" in os.environ:
-        with suppress(OSError, AttributeError):  # of another C library
-            mallopt = ctypes.CDLL(None).mallopt
-            mallopt(M_TRIM_THRESHOLD, THRESHOLD)
-            mallopt(M_MMAP_THRESHOLD, THRESHOLD)
 
 
 def quieten() -> None:
@@ -90,8 +79,8 @@ def quieten() -> None:
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
 
 
-def serve(pipe: "connection.Connection", core: int | None) -> None:
-    """Main loop of a worker process: it receives `work` with the shared data, then tasks, and sends their results,
+def serve(pipe: "connection.Connection") -> None:
+    """Main loop of a worker process: it receives `work` with the common data, then tasks, and sends their results,
     until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted as well, and ends its workers
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -103,46 +92,22 @@ def serve(pipe: "connection.Connection", core: int | None) -> None:
         while True:
             task = pipe.recv_bytes()
             try:
-                if call is None:
-                    call = pickle.loads(payload)
-                    _pin(core)
-                work, shared = call
-                outcome = attempt(work, shared, pickle.loads(task))
+                work, common = call = call or pickle.loads(payload)
+                message = pickle.dumps(attempt(work, common, pickle.loads(task)))
             except Exception as error:
                 error.add_note(f"in a worker process:\n{traceback.format_exc()}")
-                outcome = Raised(error)
-            pipe.send_bytes(_packed(outcome))
+                message = _packed(error)
+            pipe.send_bytes(message)
 
 
-def _packed(outcome: Any) -> bytes:
+def _packed(error: Exception) -> bytes:
     try:
-        packed = pickle.dumps(outcome)
-        if isinstance(outcome, Raised):
-            pickle.loads(packed)  # some errors can be packed only
+        packed = pickle.dumps(Raised(error))
+        pickle.loads(packed)  # some errors can be packed only
         return packed
-    except Exception as error:
-        if isinstance(outcome, Raised):
-            text = f"{type(outcome.error).__name__}: {outcome.error}"
-            return pickle.dumps(Raised(RuntimeError(f"{text}\n{''.join(outcome.error.__notes__)}")))
-        text = f"the result of a task, a {type(outcome).__name__}, cannot be pickled: {error}"
-        return pickle.dumps(Raised(ValueError(text)))
-
-
-def _pin(core: int | None) -> None:
-    """Pin all threads, and those that they will start, to one core, after XLA has started its compilation threads, one
-    a core that it may run on: with a single one, half a gigabyte of programs would queue up behind it."""
-    if "jax" in sys.modules:
-        import jax
-
-        jax.block_until_ready(jax.jit(jax.numpy.sin)(1.0))
-    if core is None:
-        return
-    threads = [0]
-    with suppress(OSError, ValueError):
-        threads = [int(name) for name in os.listdir("/proc/self/task")]
-    for thread in threads:
-        with suppress(OSError):
-            os.sched_setaffinity(thread, {core})
+    except Exception:
+        text = "\n".join((f"{type(error).__name__}: {error}", *error.__notes__))
+        return pickle.dumps(Raised(RuntimeError(text)))
 
 
 def _end_with_parent() -> None:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from fits.maps.options import MapOptions
 from fits.maps.search import fit_first, search, starts_at
-from fits.maps.texels import Fits, Integers, Texels, Truths, fit_texels, widths, with_own_directions
+from fits.maps.texels import Fits, Integers, Texels, fit_texels, held_by_bounds, widths, with_own_directions
 from fits.optimise.multi_start import start_points
-from fits.optimise.uncertainty import LARGEST_ERROR, LEAST_GRADIENT, ON_BOUND, UNKNOWN_BEYOND
+from fits.optimise.uncertainty import LARGEST_ERROR, UNKNOWN_BEYOND
 from fits.problem.parameters import is_free
 from fits.problem.problem import Problem
 
@@ -55,22 +55,22 @@ def with_common(problem: Problem, values: Mapping[str, float]) -> Problem:
     return replace(problem, stack=stack, scale=scale, noise=replace(problem.noise, relative=relative, floor=floor))
 
 
-def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> tuple[Problem, Common]:
-    """The problem with its common parameters held where they suit the whole pilot best.
+def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> Common:
+    """The common parameters where they suit the whole pilot best.
 
-    problem: a prototype with `Free` numbers that are common, and others that are not.
+    problem: with `Free` numbers that are common, and others that are not; with the model of a map.
     """
-    size, places = options.chunk_size, np.flatnonzero(np.isin(problem.names, problem.common_names))
-    own = np.setdiff1d(np.arange(len(problem.names)), places)
-    names = [problem.names[place] for place in places]
+    size, is_common = options.chunk_size, np.isin(problem.names, problem.common_names)
+    places, own = np.flatnonzero(is_common), np.flatnonzero(~is_common)
 
-    def values_at(at: Floats) -> Floats:
-        whole = np.full(len(problem.names), 0.5)
-        whole[places] = at
-        return np.asarray(problem.model.box.from_unit(jnp.asarray(whole)), float)
+    def values_at(at: Floats) -> dict[str, float]:
+        unit = np.full(len(problem.names), 0.5)
+        unit[places] = at
+        vector = np.asarray(problem.model.box.from_unit(jnp.asarray(unit)), float)
+        return {problem.names[place]: float(vector[place]) for place in places}
 
     def held_at(at: Floats) -> Problem:
-        held = with_common(problem, dict(zip(names, map(float, values_at(at)[places]), strict=True)))
+        held = with_common(problem, values_at(at))
         return with_own_directions(held) if pilot.wi is not None else held
 
     # begin at the mean of what a few texels say of them, weighted by their information
@@ -79,10 +79,9 @@ def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> tuple[Pr
     information = np.sum(np.square(first.root), axis=1)[:, places]
     at = np.average(first.unit[:, places], axis=0, weights=information + np.finfo(float).tiny)
     held = held_at(at)
-    vectors = fit_first(held, points[:, own], pilot, size).distinct()
-    starts = starts_at(held, vectors, points[1:, own], pilot.wi is not None, size)
-    found = search(held, starts, pilot, size, options).fits
-    pilot, units = pilot.rows(found.finite), found.unit[found.finite]
+    starts = starts_at(held, fit_first(held, points[:, own], pilot, size).distinct(), pilot.wi is not None, size)
+    fits = search(held, starts, pilot, size, options).fits
+    pilot, units = pilot.rows(fits.finite), fits.unit[fits.finite]
 
     def joint_at(at: Floats, units: Floats) -> _Joint:
         whole = np.empty((pilot.number, len(problem.names)))
@@ -98,24 +97,25 @@ def fit_common(problem: Problem, pilot: Texels, options: MapOptions) -> tuple[Pr
             break
         for halving in range(HALVINGS):
             trial = np.clip(at + 0.5**halving * step, 0.0, 1.0)
-            there = fit_texels(held_at(trial), units, pilot, size, fresh=False).unit
-            tried = joint_at(trial, there)
+            followed = fit_texels(held_at(trial), units, pilot, size, fresh=False).unit
+            tried = joint_at(trial, followed)
             if tried.cost < joint.cost:
                 break
         else:
             converged = bool(np.all(np.abs(step) <= np.nan_to_num(error)))  # rounding ends all progress
             break
-        at, units, joint = trial, there, tried
-    vector = values_at(at)
-    errors = joint.step(at)[1] * widths(problem, vector)[places]
-    values, spread = (dict(zip(names, map(float, part), strict=True)) for part in (vector[places], errors))
-    return held_at(at), Common(values, spread, converged)
+        at, units, joint = trial, followed, tried
+    values, error = values_at(at), joint.step(at)[1]
+    vector = np.full(len(problem.names), 1.0)
+    vector[places] = list(values.values())
+    errors = error * widths(problem, vector)[places]
+    return Common(values, dict(zip(values, errors.tolist(), strict=True)), converged)
 
 
 class _Joint(NamedTuple):
-    """The joint problem with what is a texel's own eliminated, of S common parameters in the unit box.
+    """The joint problem of M texels, with S common parameters in the unit box and those that are a texel's own.
 
-    cost: of all texels. gradient: (S,). information: (S, S).
+    cost: of all texels. gradient: (S,). information: (S, S), of the common parameters, with the others free.
     """
 
     cost: float
@@ -125,7 +125,7 @@ class _Joint(NamedTuple):
     def step(self, at: Floats) -> tuple[Floats, Floats]:
         """A Gauss-Newton step from there and standard errors, in boxes: 0 and NaN for what a bound holds, 0 and
         infinite for what the data do not know."""
-        free = np.flatnonzero(~_held(at, self.gradient))
+        free = np.flatnonzero(~held_by_bounds(at, self.gradient))
         step, error = np.zeros(len(at)), np.full(len(at), np.nan)
         if free.size:
             sizes, directions = np.linalg.eigh(self.information[np.ix_(free, free)])
@@ -137,30 +137,25 @@ class _Joint(NamedTuple):
         return step, error
 
 
-def _held(unit: Floats, gradient: Floats) -> Truths:
-    """Which parameters a bound holds."""
-    least = LEAST_GRADIENT
-    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
-
-
-def _joint(problem: Problem, places: Integers, own: Integers, found: Fits) -> _Joint:
+def _joint(problem: Problem, places: Integers, rest: Integers, fits: Fits) -> _Joint:
     """What M texels say together, from what each says of all parameters."""
-    box, count, gradient = problem.model.box, len(found.cost), np.array(found.gradient)
+    box, count, gradient = problem.model.box, len(fits.cost), np.array(fits.gradient)
     # a prior of common parameters counts once in all, and not once a texel
     slopes = np.array(box.prior_slopes(), float)
-    residual = np.asarray(box.prior_residuals(jnp.asarray(found.vector[0])), float)
+    residual = np.asarray(box.prior_residuals(jnp.asarray(fits.vector[0])), float)
     of_common = np.abs(slopes[:, places]).sum(axis=1) > 0
     gradient[:, places] -= (count - 1) / count * slopes[of_common][:, places].T @ residual[of_common]
-    cost = float(found.cost.sum()) - (count - 1) * 0.5 * float(residual[of_common] @ residual[of_common])
+    cost = float(fits.cost.sum()) - (count - 1) * 0.5 * float(residual[of_common] @ residual[of_common])
     slopes[of_common] /= np.sqrt(count)
-    information = np.einsum("mki,mkj->mij", found.root, found.root) + slopes.T @ slopes
+    information = np.einsum("mki,mkj->mij", fits.root, fits.root) + slopes.T @ slopes
     # the Schur complement, texel by texel
-    held = _held(found.unit[:, own], gradient[:, own])
-    inner = np.where(held[:, :, None] | held[:, None, :], 0.0, information[:, own[:, None], own])
-    beside = np.where(held[:, :, None], 0.0, information[:, own[:, None], places])
-    slope = np.where(held, 0.0, gradient[:, own])
-    solved = np.linalg.pinv(inner, hermitian=True) @ np.concatenate([beside, slope[:, :, None]], axis=2)
-    reduced = np.einsum("mis,mit->st", beside, solved[:, :, :-1])
-    across = np.einsum("mis,mi->s", beside, solved[:, :, -1])
+    held = held_by_bounds(fits.unit[:, rest], gradient[:, rest])
+    inner = np.where(held[:, :, None] | held[:, None, :], 0.0, information[:, rest[:, None], rest])
+    across = np.where(held[:, :, None], 0.0, information[:, rest[:, None], places])
+    slope = np.where(held, 0.0, gradient[:, rest])
+    solved = np.linalg.pinv(inner, hermitian=True) @ np.concatenate([across, slope[:, :, None]], axis=2)
+    reduced = np.einsum("mis,mit->st", across, solved[:, :, :-1])
     whole = information[:, places[:, None], places].sum(axis=0)
-    return _Joint(cost, gradient[:, places].sum(axis=0) - across, whole - reduced)
+    return _Joint(
+        cost, gradient[:, places].sum(axis=0) - np.einsum("mis,mi->s", across, solved[:, :, -1]), whole - reduced
+    )

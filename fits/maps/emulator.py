@@ -1,15 +1,16 @@
 """An emulator in the place of a dear transport: Chebyshev series over the bounds of all parameters at once.
 
-What the exact transport says of the data is smooth in every parameter. An emulator pays where thousands
-of texels are fitted with the same directions: a value with its derivatives then takes tens of microseconds. Values are
-kept as logarithms, of which a few directions in the space of the data hold all (a singular value decomposition), and
-each channel has the coordinates of the parameters that matter to it alone. Lines through the box say how many terms
-each series needs, and solutions elsewhere whether they were enough.
+What the exact transport says of the data is smooth in every parameter, or in its logarithm where its bounds span a
+large factor. An emulator pays where thousands of texels are fitted with the same directions: a value with its
+derivatives then takes tens of microseconds. Values are kept as logarithms, of which a few directions in the space of
+the data hold all (a singular value decomposition), and each channel has the coordinates of the parameters that matter
+to it alone. Lines through the box say how many terms each series needs, and solutions elsewhere whether they were
+enough.
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import qmc
 
-from fits.maps.options import USUAL, MapOptions
+from fits.maps.options import DEFAULT, MapOptions
 from fits.problem.compilation import cores, in_shares
 from fits.problem.model import Model
 from fits.problem.problem import Problem
@@ -33,8 +34,11 @@ Truths = NDArray[np.bool_]
 CORNERS, LINE_NODES, CHECKS, ROUNDS = 12, 33, 64, 3
 """Lines through the box beside its middle, nodes on each, points that are checked, and emulators tried."""
 
-OFFSETS = (0.0, 0.01, 0.1, 1.0, 10.0)
-"""Multiples of a datum's mean over the box that are added before the logarithm; values must be above 0 without."""
+OFFSET = 1.0
+"""Multiple of a datum's mean over the box that is added before the logarithm, whose series is then shortest."""
+
+LOGARITHMIC_ABOVE = 5.0
+"""Ratio of the bounds of a parameter from which its logarithm is the coordinate."""
 
 MORE = 1.25
 """Times as many terms are taken where an emulator does not hold, and so many fewer at first than the lines ask for."""
@@ -69,6 +73,17 @@ class Emulator(eqx.Module):
     high: Array
     places: Array
     highest: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> "Emulator":
+        """The emulator of these arrays, of all but the highest order."""
+        orders = np.asarray(arrays["orders"])
+        parts = {one.name: jnp.asarray(arrays[one.name]) for one in fields(cls) if one.name != "highest"}
+        return cls(**parts, highest=int(orders.max()))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What `of` takes."""
+        return {one.name: np.asarray(getattr(self, one.name)) for one in fields(self) if one.name != "highest"}
 
     def values(self, vector: Array) -> Array:
         """BSDF of the data, (N, C), in 1/sr, with these parameters (P,)."""
@@ -156,21 +171,13 @@ class _Space:
     high: Floats
     logarithmic: Truths
 
-    def ends(self) -> tuple[Floats, Floats]:
-        """Scale and offset of the coordinates, (D,) each."""
-        safe = (np.where(self.logarithmic, end, 1.0) for end in (self.low, self.high))
-        logs = map(np.log, safe)
-        low, high = (np.where(self.logarithmic, log, end) for log, end in zip(logs, (self.low, self.high), strict=True))
-        return low, high
-
     def vectors(self, points: Floats) -> Floats:
         """Parameters (G, P) at points (G, D) of [-1, 1]."""
-        low, high = self.ends()
-        coordinates = low + 0.5 * (points + 1.0) * (high - low)
+        coordinates = self.low + 0.5 * (points + 1.0) * (self.high - self.low)
         physical = np.where(self.logarithmic, np.exp(np.where(self.logarithmic, coordinates, 0.0)), coordinates)
         vectors = np.tile(self.problem.start, (len(points), 1))
         for of_channel in self.places:
-            vectors[:, of_channel] = np.clip(physical, self.low, self.high)
+            vectors[:, of_channel] = np.clip(physical, self.problem.low[of_channel], self.problem.high[of_channel])
         return vectors
 
     def values(self, points: Floats) -> tuple[Floats, Floats]:
@@ -180,34 +187,33 @@ class _Space:
         return values, sigma
 
 
-def emulate(problem: Problem, options: MapOptions = USUAL) -> tuple[Emulator | None, str]:
+def emulate(problem: Problem, options: MapOptions = DEFAULT) -> tuple[Emulator | None, str]:
     """An emulator of a problem's transport over the box of its parameters, if one that holds can be made; in words."""
     places = _places(problem)
     if isinstance(places, str):
         return None, places
     tolerance, low, high = 0.5 * options.emulator_error, problem.low[places].min(0), problem.high[places].max(0)
-    space = _Space(problem, places, low, high, np.zeros(len(low), bool))
-    chosen = _chosen(space, tolerance)
-    if chosen is None:
+    logarithmic = (low > 0.0) & (high > LOGARITHMIC_ABOVE * low)
+    low, high = (np.where(logarithmic, np.log(np.where(logarithmic, end, 1.0)), end) for end in (low, high))
+    space = _Space(problem, places, low, high, logarithmic)
+    needed, offset = _needed_terms(space, tolerance)
+    if max(needed) == LINE_NODES:
         return None, f"no series of less than {LINE_NODES} terms a parameter holds"
-    needed, logarithmic, offset = chosen
-    space = replace(space, logarithmic=logarithmic)
     terms = tuple(max(2, int(count / MORE)) for count in needed)
     for _ in range(ROUNDS):
         solves = int(np.prod(terms))
         if solves > options.emulator_max_solves:
             break
-        options.tell("emulator", 0, solves, " x ".join(map(str, terms)))
-        emulator = _made(space, terms, offset, tolerance)
-        # the largest error at points that it has not seen, in standard deviations of the data
+        options.report("emulator", 0, solves, " x ".join(map(str, terms)))
+        emulator = _make(space, terms, offset, tolerance)
+        # the largest error at points that were not solved for it, in standard deviations of the data
         points = 2.0 * qmc.Sobol(len(low), rng=np.random.default_rng(1)).random(CHECKS) - 1.0
         values, sigma = space.values(points)
         ready = problem.with_model(with_emulator(problem.model, emulator))
         error = float(np.max(np.abs(np.asarray(ready.call(_emulated, space.vectors(points))) - values) / sigma))
         if error <= options.emulator_error:
-            return emulator, (
-                f"an emulator of {len(emulator.orders):,} terms from {solves:,} solutions, error {error:.2g} sd"
-            )
+            count = len(emulator.orders)
+            return emulator, f"an emulator of {count:,} terms from {solves:,} solutions, error {error:.2g} sd"
         terms = tuple(int(np.ceil(MORE * count)) for count in terms)
     solves = int(np.prod(terms))
     return None, f"an emulator of {solves:,} solutions would be needed, of {options.emulator_max_solves:,} allowed"
@@ -219,58 +225,39 @@ def _places(problem: Problem) -> Integers | str:
     if model.optics is not None:
         return "an instrument stands between the transport and the data"
     common: list[int] = []
-    own: dict[str, dict[int, int]] = {}
+    channelwise: dict[str, dict[int, int]] = {}
     for place, name in enumerate(problem.names[: model.moving]):
-        if found := re.fullmatch(r"(.*)\[(\d+)\]", name):
-            own.setdefault(found[1], {})[int(found[2])] = place
+        if parts := re.fullmatch(r"(.*)\[(\d+)\]", name):
+            channelwise.setdefault(parts[1], {})[int(parts[2])] = place
         elif name != "scale":
             common.append(place)
     channels = range(model.values.shape[-1])
-    if any(set(places) != set(channels) for places in own.values()):
+    if any(set(places) != set(channels) for places in channelwise.values()):
         return "numbers of channels do not match those of the data"
-    if not common and not own:
+    if not common and not channelwise:
         return "no parameter of the stack is free"
-    return np.array([[*common, *(places[channel] for places in own.values())] for channel in channels])
+    return np.array([[*common, *(places[channel] for places in channelwise.values())] for channel in channels])
 
 
-def _chosen(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Truths, Floats] | None:
-    """How many terms each coordinate needs, which are logarithms, and the offset (N, C), by lines through the box."""
+def _needed_terms(space: _Space, tolerance: float) -> tuple[tuple[int, ...], Floats]:
+    """How many terms each coordinate needs, `LINE_NODES` where fewer do not suffice, and the offset (N, C), by lines
+    through the middle of the box and some of its corners, near which series are worst."""
     count, nodes = len(space.low), _nodes(LINE_NODES)
-    # through its middle and some of its corners, near which series are worst
     corners = np.random.default_rng(0).permuted(np.arange(2**count))[:CORNERS]
     through = np.concatenate([np.zeros((1, count)), 2.0 * (corners[:, None] >> np.arange(count) & 1) - 1.0])
-    found: list[dict[bool, Any]] = []
+    lines = np.broadcast_to(through[None, :, None], (count, len(through), LINE_NODES, count)).copy()
     for coordinate in range(count):
-        lines = np.repeat(through, LINE_NODES, axis=0)
-        lines[:, coordinate] = np.tile(nodes, len(through))
-        ways = [False, True] if space.low[coordinate] > 0.0 else [False]
-        found.append({})
-        for way in ways:
-            both = replace(space, logarithmic=way & (np.arange(count) == coordinate)).values(lines)
-            found[-1][way] = [part.reshape(-1, LINE_NODES, *part.shape[1:]) for part in both]
-    means = [np.mean(np.abs(values), axis=(0, 1)) for ways in found for values, _ in ways.values()]
-    best = None
-    for offset in OFFSETS:
-        shift = offset * np.mean(means, axis=0)
-        terms = [{way: _terms(lines, shift, tolerance) for way, lines in ways.items()} for ways in found]
-        logs = [min(ways, key=ways.__getitem__) for ways in terms]
-        needed = tuple(ways[way] for ways, way in zip(terms, logs, strict=True))
-        if max(needed) < LINE_NODES and (best is None or np.prod(needed) < np.prod(best[0])):
-            best = needed, np.array(logs), shift
-    return best
-
-
-def _terms(lines: Sequence[Floats], offset: Floats, tolerance: float) -> int:
-    """Terms that a series needs for values with these standard deviations on lines, (lines, nodes, N, C) each; as many
-    as there are nodes where none suffice."""
-    values, sigma = lines
+        lines[coordinate, ..., coordinate] = nodes
+    values, sigma = (part.reshape(*lines.shape[:3], *part.shape[1:]) for part in space.values(lines.reshape(-1, count)))
+    offset = OFFSET * np.mean(np.abs(values), axis=(0, 1, 2))
     if np.any(values + offset <= 0.0):
-        return LINE_NODES
-    series = np.abs(_series(np.log(values + offset), 1))
-    tails = np.cumsum(series[:, ::-1], axis=1)[:, ::-1]  # of what is omitted from each term on
-    influence = np.max((values + offset) / sigma, axis=1, keepdims=True)
-    enough = np.flatnonzero(np.max(tails * influence, axis=(0, 2, 3)) < tolerance)
-    return max(2, int(enough[0])) if enough.size else LINE_NODES
+        return (LINE_NODES,), offset
+    series = np.abs(_series(np.log(values + offset), 2))
+    tails = np.cumsum(series[:, :, ::-1], axis=2)[:, :, ::-1]  # of what is omitted from each term on
+    influence = np.max((values + offset) / sigma, axis=2, keepdims=True)
+    errors = np.max(tails * influence, axis=(1, 3, 4))
+    terms = [np.append(np.flatnonzero(error < tolerance), LINE_NODES)[0] for error in errors]
+    return tuple(max(2, int(one)) for one in terms), offset
 
 
 def _nodes(count: int) -> Floats:
@@ -280,12 +267,12 @@ def _nodes(count: int) -> Floats:
 
 def _series(values: Floats, axis: int) -> Floats:
     """Coefficients of Chebyshev series along an axis from values at the polynomial's zeros."""
-    found = fft.dct(values, type=2, axis=axis) / values.shape[axis]
-    np.moveaxis(found, axis, 0)[0] *= 0.5
-    return np.asarray(found)
+    coefficients = np.asarray(fft.dct(values, type=2, axis=axis)) / values.shape[axis]
+    np.moveaxis(coefficients, axis, 0)[0] *= 0.5
+    return coefficients
 
 
-def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
+def _make(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: float) -> Emulator:
     def grid(axes: list[Any]) -> NDArray[Any]:
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(terms))
 
@@ -306,19 +293,9 @@ def _made(space: _Space, terms: tuple[int, ...], offset: Floats, tolerance: floa
     order = np.argsort(sizes)
     kept = np.ones(len(sizes), bool)
     kept[order[np.sqrt(np.cumsum(sizes[order] ** 2)) <= 0.2 * tolerance]] = False
-    orders, (low, high) = grid([np.arange(count) for count in terms])[kept], space.ends()
-    return Emulator(
-        orders=jnp.asarray(orders),
-        coefficients=jnp.asarray(series[:, kept]),
-        directions=jnp.asarray(directions),
-        mean=jnp.asarray(mean.T),
-        offset=jnp.asarray(offset.T),
-        logarithmic=jnp.asarray(space.logarithmic),
-        low=jnp.asarray(low),
-        high=jnp.asarray(high),
-        places=jnp.asarray(space.places),
-        highest=int(orders.max()),
-    )
+    arrays = {"orders": grid([np.arange(count) for count in terms])[kept], "coefficients": series[:, kept]}
+    arrays |= {"directions": directions, "mean": mean.T, "offset": offset.T, "logarithmic": space.logarithmic}
+    return Emulator.of(arrays | {"low": space.low, "high": space.high, "places": space.places})
 
 
 def _compressed(values: Floats, influence: Floats, tolerance: float) -> tuple[Floats, Floats]:

@@ -1,12 +1,11 @@
 """A fit for every texel of a map, chunk by chunk, into a store.
 
 A pilot sample of the texels is fitted first, from many starts (see `fits.maps.pilot`). Every texel then begins where
-the likeliest of the pilot's ended, and is begun again only where its chi-square says that it ended poorly (see
+the likeliest of the pilot's ended, and is fitted again only where its chi-square says that it ended poorly (see
 `fits.maps.search`). With a spatial prior the whole map is fitted again beside that (see `fits.maps.spatial`).
 """
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,14 +19,14 @@ import layerjax as lj
 from fits._files import locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, run
-from fits.engines.compile_cache import programs_kept
-from fits.engines.processes import end_if_again
-from fits.maps.inputs import Block, MapData, Measured, map_data, words
-from fits.maps.options import USUAL, VERDICTS, MapOptions
-from fits.maps.pilot import Job, described, fit_pilot, load, save
-from fits.maps.search import neighbours, reduced_chi_square, search
+from fits.engines.compile_cache import keep_programs
+from fits.engines.processes import end_repeated_script
+from fits.maps.inputs import Block, MapData, Measured, block_words, map_data
+from fits.maps.options import DEFAULT, VERDICTS, MapOptions
+from fits.maps.pilot import Job, assemble, fit_pilot, make_prototype, pilot_texels
+from fits.maps.search import neighbours_of, reduced_chi_square, search
 from fits.maps.spatial import smooth_map
-from fits.maps.store import FLAGS, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume, throw_away
+from fits.maps.store import FLAGS, PILOT, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
 from fits.problem.noise import Noise
@@ -54,7 +53,7 @@ def fit_map(
     transport: Transport = "auto",
     sigma: Any = None,
     mask: Any = None,
-    options: MapOptions = USUAL,
+    options: MapOptions = DEFAULT,
 ) -> FittedMap:
     """Fit a stack to the measurements of every texel of a map, into a zarr store that grows chunk by chunk.
 
@@ -76,8 +75,9 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
-    if several := options.processes > 1 and client is None:
-        end_if_again()
+    if options.processes > 1 and client is None:
+        end_repeated_script()
+        keep_programs()  # workers run the program that has fitted the pilot
     data = map_data(values, geometry, sigma, mask)
     require_kind("noise", noise, Noise, None)
     if options.instrument is not None and data.geometry is None:
@@ -88,9 +88,8 @@ def fit_map(
     path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
-    kept = programs_kept() if several else nullcontext()  # workers run the program that has fitted the pilot
-    with locked(Path(f"{path}.lock"), str(path)), connected(client) as reached, kept:
-        return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), reached)
+    with locked(Path(f"{path}.lock"), str(path)), connected(client) as connection:
+        return _fit(path, data, stack, noise, transport, replace(options, chunk_size=size), connection)
 
 
 def _fit(
@@ -104,30 +103,26 @@ def _fit(
     if options.instrument is not None:  # the floor of a map's noise stands in one place
         noise = with_floor(noise or Noise(), options.instrument)
         options = replace(options, instrument=replace(options.instrument, floor=None))
-    given = (data, stack, noise, transport, options)
-    pilot = None if store is None else load(store, *given)
-    if pilot is None:
-        pilot = fit_pilot(*given)
+    texels = pilot_texels(data, options.pilot_texels)
+    problem = make_prototype(texels, data, stack, noise, transport, options)
+    kept = None if store is None else store.load_group(PILOT)
+    if kept is None:
+        arrays, about = fit_pilot(problem, texels, data.shape, options)
         if store is None:
-            throw_away(path)  # not before it is known that there can be another
-            about: dict[str, Any] = {"version": lj.__version__, "stack": repr(stack), "options": options.numbers()}
-            about |= {"samples": data.samples, "channels": list(pilot.problem.data.channels), **described(pilot)}
-            store = create(
-                path,
-                names=pilot.problem.names,
-                units=pilot.problem.units,
-                shape=data.shape,
-                chunk=tile(data.shape, options.chunk_size),
-                attributes=about | {"fingerprints": identity, "measurements": measurements},
-            )
-        save(pilot, store)
-        pilot = load(store, *given)  # as a run that is resumed has it
+            names = [name for name in problem.names if name not in about["common"]]
+            about |= {"names": names, "units": {name: problem.units[name] for name in names}, "shape": data.shape}
+            about |= {"chunk": tile(data.shape, options.chunk_size), "options": options.numbers(), "stack": repr(stack)}
+            about |= {"samples": data.samples, "channels": list(problem.data.channels), "version": lj.__version__}
+            store = create(path, about | {"fingerprints": identity, "measurements": measurements})
+        store.save_group(PILOT, arrays, {})
+        kept = store.load_group(PILOT)
     assert store is not None
-    assert pilot is not None
+    assert kept is not None
+    pilot = assemble(problem, data.geometry is None, kept[0], store.attributes, options)
 
     # 3. all chunks
-    source = data if client is None and options.processes == 1 else data.portable
-    job = Job(str(path.resolve()), pilot, replace(options, progress=None), source)
+    is_sent = not data.in_file and (client is not None or options.processes > 1)
+    job = Job(str(path.resolve()), pilot, replace(options, progress=None), None if is_sent else data)
     if failures := _fit_chunks(store, job, data, client, options):
         named = [*failures[:NAMED], *([f"and {len(failures) - NAMED} more"] if len(failures) > NAMED else [])]
         raise ValueError(f"{path}: {'; '.join(named)}; all other chunks are done, and another run does these")
@@ -145,28 +140,28 @@ def _identity(stack: Any, noise: Noise | None, transport: Any, samples: int, opt
         leaves, structure = jax.tree.flatten(tree, is_leaf=is_free)
         return [portable_repr(structure), *leaves]
 
-    said = {"stack": stack, "noise": noise, "transport": transport, **options.model}
-    said = {name: parts_of(one) for name, one in said.items()}
+    parts = {"stack": stack, "noise": noise, "transport": transport, **options.model}
+    parts = {name: parts_of(one) for name, one in parts.items()}
     if not isinstance(transport, str | lj.Transport):
         start = jax.tree.map(
             lambda leaf: jnp.asarray(leaf.arrays()[0]) if is_free(leaf) else leaf, stack, is_leaf=is_free
         )
         angles = np.linspace(5.0, 75.0, samples)
         wi, wo = direction(angles, 0.0 * angles), direction(angles[::-1], 20.0 * angles)
-        said["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
+        parts["transport"] += [np.asarray(jax.jit(transport)(with_values(start), wi, wo), np.float32)]
     numbers = {name: one for name, one in options.numbers().items() if name not in VERDICTS}
-    return fingerprint(**said, **numbers, precision=str(np.dtype(jnp.result_type(float))))
+    return fingerprint(**parts, **numbers, precision=str(np.dtype(jnp.result_type(float))))
 
 
 def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
     """The shape of a chunk of at most so many texels, as square as the last axes of a map allow."""
-    sides, left_over = [1] * len(shape), texels
+    sides, remaining = [1] * len(shape), texels
     if len(shape) > 1:
         sides[-1] = min(shape[-1], max(math.isqrt(texels), texels // shape[-2]))
-        left_over //= sides[-1]
+        remaining //= sides[-1]
     for axis in reversed(range(max(1, len(shape) - 1))):
-        sides[axis] = max(1, min(shape[axis], left_over))
-        left_over //= sides[axis]
+        sides[axis] = max(1, min(shape[axis], remaining))
+        remaining //= sides[axis]
     return tuple(sides)
 
 
@@ -174,38 +169,34 @@ def tile(shape: tuple[int, ...], texels: int) -> tuple[int, ...]:
 
 
 def _fit_chunks(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> list[str]:
-    """Fit the chunks that are left; what became of those that could not be."""
+    """Fit the chunks that are left; the failures of those that could not be done."""
     blocks, failures, tasks = store.unfinished(), [], []
     for block in blocks:
         try:
-            tasks.append((block, job.sent(data, block)))
+            tasks.append((block, data.read(block) if job.data is None else None))
         except ValueError as error:
             failures.append(str(error))
     total = sum(1 for _ in blocks_of(store.shape, store.chunk))
     done, poor, fitted = total - len(blocks), 0, 0
-    options.tell("map", done, total)
+    options.report("map", done, total)
     for index, result in run(work, job, tasks, processes=options.processes, client=client):
         if isinstance(result, Failure):
-            failures.append(f"chunk {words(tasks[index][0])}: {result.error}")
+            failures.append(f"chunk {block_words(tasks[index][0])}: {result.error}")
         else:
             fitted, poor = fitted + result["fitted"], poor + result["poor"]
         done += 1
-        options.tell("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
-    left = store.unfinished()
+        options.report("map", done, total, f"{100.0 * poor / fitted:.1f} % poor" if fitted else "")
     if client is None:  # of a cluster, some may still write what others have done
         store.clean()
-    return failures or [f"chunk {words(block)}: was written, and is not there" for block in left]
+    return failures
 
 
 def work(job: Job, task: tuple[Block, Measured | None]) -> dict[str, int]:
-    """Fit a chunk and write it, if a worker that was killed has not; returns how many texels have which flag."""
-    block, sent = task
-    flags = job.store.whole(block)
-    if flags is None:
-        results = fit_chunk(job, job.measured(block, sent))
-        job.store.write(block, results)
-        flags = results["flags"]
-    return {meaning: int(np.sum(flags & bit > 0)) for meaning, bit in FLAGS.items()}
+    """Fit a chunk and write it; returns how many texels have which flag."""
+    block, measured = task
+    results = fit_chunk(job, job.measured(block, measured))
+    job.store.write(block, results)
+    return {meaning: int(np.sum(results["flags"] & bit > 0)) for meaning, bit in FLAGS.items()}
 
 
 def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
@@ -221,14 +212,14 @@ def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
     fitted = np.flatnonzero(mask & enough)
     if len(fitted):
         rows = texels.rows(fitted)
-        among = np.full(texels.number + 1, -1)  # places among the texels that are fitted; the last is none
-        among[fitted] = np.arange(len(fitted))
-        beside = among[neighbours(shape)[fitted]]
-        found, start, poor, restarted = search(problem, job.pilot.starts, rows, size, job.options, beside)
-        finite, (errors, at_bound, unidentified) = found.finite, standard_errors(problem, found, rows)
-        numbers = {"reduced_chi_square": reduced_chi_square(found, rows)}
+        places = np.full(texels.number + 1, -1)  # among the texels that are fitted; the last is none
+        places[fitted] = np.arange(len(fitted))
+        neighbours = places[neighbours_of(shape)[fitted]]
+        best, start, poor, restarted = search(problem, job.pilot.starts, rows, size, job.options, neighbours)
+        finite, (errors, at_bound, unidentified) = best.finite, standard_errors(problem, best, rows)
+        numbers = {"reduced_chi_square": reduced_chi_square(best, rows)}
         for place, name in enumerate(names):
-            numbers |= {f"values/{name}": found.vector[:, place], f"errors/{name}": errors[:, place]}
+            numbers |= {f"values/{name}": best.vector[:, place], f"errors/{name}": errors[:, place]}
         for name, array in numbers.items():
             results[name][fitted] = np.where(finite, array, np.nan)
         bits = 1 << np.arange(len(names), dtype=np.uint64)
@@ -237,7 +228,7 @@ def fit_chunk(job: Job, measured: Measured) -> dict[str, NDArray[Any]]:
         for meaning, holds in {
             "fitted": finite,
             "failed": ~finite,
-            "converged": finite & found.converged,
+            "converged": finite & best.converged,
             "at_bound": finite & at_bound.any(axis=1),
             "poor": finite & poor,
             "restarted": restarted,

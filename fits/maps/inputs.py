@@ -5,11 +5,10 @@ channel. It may be far larger than memory. Arrays of numpy, .npy files, HDF5, za
 xarray, whose numbers are read when they are accessed.
 """
 
-import base64
 import math
 import os
 import re
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -24,23 +23,26 @@ from xarray.core import indexing
 from fits._files import require_there
 from fits.data.formats.csv import read_directions
 from fits.data.geometry import Floats, Geometry, Pairs, direction
+from fits.engines.failures import one_line
 from fits.store import fingerprint
 
 Block = tuple[slice, ...]
 """A selection of the leading axes of a map, the first ones of an array; other axes are taken whole."""
 
+Arrays = dict[str, xr.DataArray]
+
 SAMPLE, CHANNEL = "sample", "channel"
 """Names of the axes of measurements and of channels in xarray; by them they are found wherever they stand."""
 
 VECTORS, ANGLES = ("wi", "wo"), ("theta_i", "phi_i", "theta_o", "phi_o")
-KINDS = ".npy, .h5, .hdf5 or .zarr"
+FILES = (".npy", ".h5", ".hdf5", ".zarr")
 NORMAL = (0.0, 0.0, 1.0)
 
 UNREADABLE = "?"
 """In the place of the fingerprint of a block that cannot be read."""
 
-WHOLE, BLOCKS, LONGEST = 2**23, 64, 64
-"""Numbers of a map that is fingerprinted whole, blocks that are of any, and texels of one of a larger map."""
+WHOLE, BLOCKS = 2**23, 64
+"""Numbers of a map that is fingerprinted as a whole; and blocks that are of any."""
 
 
 # ---- arrays, wherever they are ----
@@ -57,38 +59,54 @@ class _Stored(BackendArray):
         return indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
 
     def _read(self, key: Any) -> Any:
-        if isinstance(self.array, np.memmap) and self.array.filename is not None:
-            needed, there = self.array.offset + self.array.nbytes, os.path.getsize(self.array.filename)
-            if there < needed:  # to read beyond the end would kill the process
-                raise ValueError(f"the file has {there:,} bytes, must have {needed:,} (truncated?)")
         return np.asarray(self.array[key])
 
 
-def _array(given: Any, where: str) -> xr.DataArray:
+def _array(source: Any, where: str) -> xr.DataArray:
     """An array of numpy, h5py, zarr or xarray, or what numpy makes one of, under the name that errors call it."""
-    if isinstance(given, xr.DataArray | xr.Variable):
-        variable = given if isinstance(given, xr.Variable) else given.variable
+    if isinstance(source, xr.DataArray | xr.Variable):
+        variable = source if isinstance(source, xr.Variable) else source.variable
     else:
-        if isinstance(given, np.ma.MaskedArray):
-            given = np.ma.filled(given.astype(np.float64), np.nan)
-        array = given if hasattr(given, "dtype") and hasattr(given, "shape") else np.asarray(given)
-        lazy, dims = indexing.LazilyIndexedArray(_Stored(array)), [f"dim_{axis}" for axis in range(len(array.shape))]
-        variable = xr.Variable(dims, lazy, _packing(array) if array.dtype.kind in "biuf" else {})
-        variable = xr.conventions.decode_cf_variable(where, variable, decode_times=False)
+        if isinstance(source, np.ma.MaskedArray):
+            source = np.ma.filled(source.astype(np.float64), np.nan)
+        array = source if hasattr(source, "dtype") and hasattr(source, "shape") else np.asarray(source)
+        attributes = dict(getattr(array, "attrs", {}))  # factor, offset, and the number that stands for nothing
+        names = [name for name in ("_FillValue", "scale_factor", "add_offset") if name in attributes]
+        packing = {name: np.ravel(attributes[name])[0] for name in names}
+        dims = [f"dim_{axis}" for axis in range(len(array.shape))]
+        variable = xr.Variable(dims, indexing.LazilyIndexedArray(_Stored(array)), packing)
+        if array.dtype.kind in "biuf":
+            variable = xr.conventions.decode_cf_variable(where, variable, decode_times=False)
     if variable.dtype.kind not in "biuf":
         raise ValueError(f"{where} holds {variable.dtype}, must hold real numbers")
     return xr.DataArray(variable, name=where)
 
 
 def _read(array: xr.DataArray, block: Block = ()) -> Floats:
-    """A block of it, float64, a copy. ValueError, which names file and block: it cannot be read."""
+    """A block of it, float64, a copy, along the axes of texels that it has. ValueError, which names file and block: it
+    cannot be read."""
+    parts = {name: part for name, part in zip(_texel_axes(len(block)), block, strict=True) if name in array.dims}
     try:
-        return np.array(array.variable[(*block, ...)].values, dtype=np.float64)
+        return np.array(array.variable.isel(parts).values, dtype=np.float64)
     except MemoryError:
         raise
     except Exception as error:  # codecs raise what they like
-        part = f"block {words(block)}" if block else "it"
-        raise ValueError(f"{array.name}: {part} cannot be read: {_reason(error)}") from None
+        part = f"block {block_words(block)}" if block else "it"
+        raise ValueError(f"{array.name}: {part} cannot be read: {one_line(error)}") from None
+
+
+def _texel_axes(rank: int) -> tuple[str, ...]:
+    """Names of the axes of a map."""
+    return tuple(f"axis_{axis}" for axis in range(rank))
+
+
+def _with_axes(array: xr.DataArray, sizes: Mapping[str, int], *choices: tuple[str, ...]) -> xr.DataArray:
+    """The array with the names of its axes, by its shape; ValueError if that is none of these."""
+    shapes = {tuple(sizes[name] for name in names): names for names in choices}
+    if array.shape not in shapes:
+        allowed = " or ".join(map(str, shapes))
+        raise ValueError(f"{array.name} has shape {array.shape}, must be {allowed} for these values and directions")
+    return array.rename(dict(zip(array.dims, shapes[array.shape], strict=True)))
 
 
 def _ordered(array: xr.DataArray, dims: tuple[Hashable, ...]) -> xr.DataArray:
@@ -96,91 +114,80 @@ def _ordered(array: xr.DataArray, dims: tuple[Hashable, ...]) -> xr.DataArray:
     return array.transpose(*(name for name in dims if name in array.dims), ...)
 
 
-def _packing(array: Any) -> dict[str, float]:
-    """What attributes of a stored array say of its numbers: factor, offset, and the number that stands for nothing."""
-    said = dict(getattr(array, "attrs", {}))
-    if "_ARRAY_DIMENSIONS" in said:  # as xarray writes zarr's format 2
-        said["_FillValue"] = array.fill_value
-    if isinstance(said.get("_FillValue"), str):  # and format 3
-        said["_FillValue"] = np.frombuffer(base64.b64decode(said["_FillValue"]), "<f8")
-    names = ("_FillValue", "scale_factor", "add_offset")
-    return {name: np.ravel(said[name])[0] for name in names if said.get(name) is not None}
+def _arrays(source: Any, wanted: str) -> Arrays:
+    """The arrays of a file, a group, a Dataset or a mapping; or one array by the wanted name, and those beside it."""
+    if isinstance(source, str | os.PathLike):
+        return _arrays_of_file(str(source), wanted)
+    coordinates = _members(source.coords, f"{wanted}/") if isinstance(source, xr.Dataset | xr.DataArray) else {}
+    if isinstance(source, Mapping) or hasattr(source, "array_keys"):  # Datasets of xarray and groups are such
+        return coordinates | _members(source, f"{wanted}/")
+    return coordinates | {wanted: _array(source, wanted)}
 
 
-class _Source(NamedTuple):
-    """Arrays by name, which of them was given (None: that is to be chosen), and what errors call them together."""
-
-    arrays: dict[str, xr.DataArray]
-    name: str | None
-    where: str
-
-    def chosen(self, wanted: str) -> xr.DataArray:
-        """The array that was given, or that of the wanted name, or the only one."""
-        name = self.name if self.name is not None else wanted
-        if name not in self.arrays and len(self.arrays) != 1:
-            there = f"there are {', '.join(sorted(self.arrays)[:9])}" if self.arrays else "there is none"
-            raise ValueError(f"{self.where}: no array {wanted!r}, {there}; PATH:/NAME chooses another")
-        return self.arrays[name if name in self.arrays else next(iter(self.arrays))]
-
-
-def _find(given: Any, wanted: str) -> _Source:
-    """The arrays of a file, a group, a Dataset or a mapping; or one array, with those that stand beside it."""
-    if isinstance(given, str | os.PathLike):
-        return _in_file(str(given))
-    beside = _members(given.coords, f"{wanted}/") if isinstance(given, xr.Dataset | xr.DataArray) else {}
-    if isinstance(given, Mapping) or hasattr(given, "array_keys"):  # Datasets of xarray and groups are such
-        return _Source(beside | _members(given, f"{wanted}/"), None, wanted)
-    return _Source(beside | {wanted: _array(given, wanted)}, wanted, wanted)
-
-
-def _members(group: Any, where: str) -> dict[str, xr.DataArray]:
+def _members(group: Any, where: str) -> Arrays:
     """The arrays of numbers in a group; whatever else lies there is skipped."""
-    items = group.arrays() if hasattr(group, "array_keys") else group.items()
+    if hasattr(group, "array_keys"):  # of zarr; with the names of axes where it has them, as xarray writes it
+        try:
+            options: dict[str, Any] = {"consolidated": False, "chunks": None, "decode_times": False}
+            group = xr.open_zarr(group.store, group=group.path, **options).variables
+        except (KeyError, ValueError):
+            group = dict(group.arrays())
     return {
         str(name): _array(one, f"{where}{name}")
-        for name, one in items
+        for name, one in group.items()
         if not isinstance(one, Mapping) and (not hasattr(one, "dtype") or one.dtype.kind in "biuf")
     }
 
 
-def _in_file(given: str) -> _Source:
-    """What a file holds, or the group in which an array lies that is named as ``file.h5:/name``."""
-    inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", given, re.IGNORECASE)
-    path, name = (inside[1], inside[2].strip("/")) if inside else (given, "")
+def _arrays_of_file(source: str, wanted: str) -> Arrays:
+    """The arrays of a file; or that which is named as ``file.h5:/name``, by the wanted name, and those beside it."""
+    inside = re.fullmatch(r"(.+\.(?:h5|hdf5|zarr)):/(.*)", source, re.IGNORECASE)
+    path, name = (inside[1], inside[2].strip("/")) if inside else (source, "")
     require_there(path)
     suffix = Path(path).suffix.lower()
-    is_zarr = suffix == ".zarr" or any((Path(path) / file).is_file() for file in ("zarr.json", ".zarray", ".zgroup"))
-    if not is_zarr and (os.path.isdir(path) or suffix not in (".npy", ".h5", ".hdf5")):
+    if any((Path(path) / file).is_file() for file in ("zarr.json", ".zarray", ".zgroup")):
+        suffix = ".zarr"
+    if suffix not in FILES or (suffix != ".zarr" and os.path.isdir(path)):
         raise ValueError(
-            f"{path}: a map is one array, in {KINDS}; files of measurements are for layerjax fit and layerjax fit-many"
+            f"{path}: a map is one array, in one of {', '.join(FILES)}; files of measurements are for layerjax fit and "
+            "layerjax fit-many"
         )
     folder, _, last = name.rpartition("/")
     try:
-        root = _open(path, suffix)
-        found, parent = (root[name], root[folder or "/"]) if name else (root, None)
+        root: Any = _open(path, suffix)
+        node = root[name] if name else root
+        is_array = hasattr(node, "dtype")
+        group = (root[folder] if folder else root) if name and is_array else node
+        place = f"{path}:/{folder if is_array else name}".rstrip("/") + "/"
     except KeyError:
         raise ValueError(f"{path}: holds no {name!r}") from None
     except Exception as error:  # codecs raise what they like
-        raise ValueError(f"{path}: cannot be read: {_reason(error)}") from None
-    if not hasattr(found, "dtype"):
-        return _Source(_members(found, f"{path}:/{name}/" if name else f"{path}:/"), None, given)
-    beside = _members(parent, f"{path}:/{folder}/" if folder else f"{path}:/") if name else {}
-    return _Source(beside | {last: _array(found, given)}, last, given)
+        raise ValueError(f"{path}: cannot be read: {one_line(error)}") from None
+    arrays = {} if is_array and not name else _members(group, place)
+    if is_array:
+        arrays[wanted] = arrays[last] if last in arrays else _array(node, source)
+    return arrays
 
 
 def _open(path: str, suffix: str) -> Any:
     if suffix == ".npy":
-        with open(path, "rb") as file:
-            if file.read(6) != b"\x93NUMPY":
-                raise ValueError("it is no .npy file")  # numpy takes it for a pickle, and tells how to load it unsafely
         return np.load(path, mmap_mode="r", allow_pickle=False)
-    if suffix in (".h5", ".hdf5"):
-        import h5py
+    if suffix == ".zarr":
+        import zarr
 
-        return h5py.File(path, "r")
-    import zarr
+        return zarr.open(path, mode="r")
+    import h5py
 
-    return zarr.open(path, mode="r")
+    return h5py.File(path, "r")
+
+
+def _choose(arrays: Arrays, wanted: str, source: Any) -> xr.DataArray:
+    """The array of the wanted name, or the only one."""
+    if wanted not in arrays and len(arrays) != 1:
+        where = source if isinstance(source, str | os.PathLike) else wanted
+        names = f"there are {', '.join(sorted(arrays)[:9])}" if arrays else "there is none"
+        raise ValueError(f"{where}: no array {wanted!r}, {names}; PATH:/NAME chooses another")
+    return arrays[wanted] if wanted in arrays else next(iter(arrays.values()))
 
 
 # ---- the measurements of a map ----
@@ -202,43 +209,54 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MapData:
-    """The measurements of a map, opened and not loaded.
+    """The measurements of a map, opened and not loaded; axes of the arrays are named.
 
-    values: (..., N, C) or (..., N). directions: by name, of `VECTORS` or `ANGLES`. shape: of the map. samples: N.
-    channels: C. geometry: the directions, if all texels have the same. given: as `map_data` was called.
+    directions: by name, of `VECTORS` or `ANGLES`. shape: of the map. samples: N. channels: C. geometry: the directions,
+    if all texels have the same. arguments: of `map_data`.
     """
 
     values: xr.DataArray
-    directions: Mapping[str, xr.DataArray]
+    directions: Arrays
     sigma: xr.DataArray | None
     mask: xr.DataArray | None
     shape: tuple[int, ...]
     samples: int
     channels: int
     geometry: Geometry | None
-    given: tuple[Any, Any, Any, Any]
+    arguments: tuple[Any, Any, Any, Any]
+
+    def __reduce__(self) -> Any:  # open files do not outlive their process, another one opens them again
+        values, geometry, sigma, mask = self.arguments
+        geometry = geometry if self.geometry is None else (self.geometry.wi, self.geometry.wo)
+        sigma = None if self.sigma is None else sigma  # a noise model need not have it
+        arguments = (values, geometry, sigma, mask)
+        return map_data, tuple(os.path.abspath(one) if isinstance(one, str | os.PathLike) else one for one in arguments)
+
+    @property
+    def in_file(self) -> bool:
+        """Whether another process can read the values by itself."""
+        return isinstance(self.arguments[0], str | os.PathLike)
 
     def read(self, block: Block = ()) -> Measured:
         """The measurements of a block; what stands in masked texels is not looked at.
 
         ValueError: they cannot be read, or a standard deviation or a direction of a texel that takes part is none.
         """
-        over = (*block, *[slice(None)] * (len(self.shape) - len(block)))
-        block = tuple(slice(*one.indices(size)[:2]) for one, size in zip(over, self.shape, strict=True))
+        whole = (*block, *[slice(None)] * (len(self.shape) - len(block)))
+        block = tuple(slice(*one.indices(size)[:2]) for one, size in zip(whole, self.shape, strict=True))
         mask, sigma, wi, wo = self.read_mask(block), None, None, None
         if self.sigma is not None:
-            sigma = self._filled(self.sigma, block)
+            sigma = self._expanded(self.sigma, block)
             if np.any(bad := (sigma <= 0.0) & mask[..., None, None]):
                 raise ValueError(
-                    f"{self.sigma.name}: sigma is {sigma[bad][0]:g} in block {words(block)}, must be above 0, or NaN "
-                    "where it is unknown"
+                    f"{self.sigma.name}: sigma is {sigma[bad][0]:g} in block {block_words(block)}, must be above 0, or "
+                    "NaN where it is unknown"
                 )
             sigma = np.where(sigma > 0.0, sigma, np.nan)
         if self.geometry is None:
-            axes = 2 if "wi" in self.directions else 1
-            found = {name: _read(one, block if one.ndim > axes else ()) for name, one in self.directions.items()}
-            wi, wo = _unit_vectors(found, mask, f" in block {words(block)}")
-        return Measured(self._filled(self.values, block), sigma, mask, wi, wo)
+            directions = {name: _read(one, block) for name, one in self.directions.items()}
+            wi, wo = _unit_vectors(directions, mask, f" in block {block_words(block)}")
+        return Measured(self._expanded(self.values, block), sigma, mask, wi, wo)
 
     def read_mask(self, block: Block) -> NDArray[np.bool_]:
         """Which texels of a block take part: all if there is no mask."""
@@ -246,14 +264,11 @@ class MapData:
             return np.ones([one.stop - one.start for one in block], bool)
         return _read(self.mask, block) != 0.0
 
-    def _filled(self, one: xr.DataArray, block: Block) -> Floats:
+    def _expanded(self, array: xr.DataArray, block: Block) -> Floats:
         """A block of values or their deviations at its full shape, (block shape, N, C)."""
-        rank, over = len(self.shape), tuple(part.stop - part.start for part in block)
-        if one.ndim > 1:  # of standard deviations, axes of texels may be 1
-            block = tuple(slice(0, 1) if n == 1 else part for part, n in zip(block, one.shape, strict=False))
-        found = _read(one, block if one.ndim > 1 else ())
-        found = found if one.ndim == rank + 2 else found[..., None]
-        return np.array(np.broadcast_to(found, (*over, self.samples, self.channels)))
+        sizes = {name: one.stop - one.start for name, one in zip(_texel_axes(len(block)), block, strict=True)}
+        variable = xr.Variable(array.dims, _read(array, block))
+        return np.array(variable.set_dims({**sizes, SAMPLE: self.samples, CHANNEL: self.channels}).values)
 
     def fingerprints(self) -> list[str]:
         """What distinguishes these measurements from others: of shape and directions, and of blocks from all over the
@@ -261,39 +276,22 @@ class MapData:
         common = () if self.geometry is None else (self.geometry.wi, self.geometry.wo)
         parts: list[Any] = [[self.shape, self.samples, self.channels, *common]]
         for block in self._blocks():
-            try:
-                found = self.read(block)
+            try:  # one of the many NaNs, and one zero of the two
+                parts.append(
+                    [one if one is None else np.where(np.isnan(one), np.nan, one + 0.0) for one in self.read(block)]
+                )
             except ValueError:
                 parts.append(UNREADABLE)
-                continue
-            # one of the many NaNs, and one zero of the two
-            parts.append([None if one is None else np.where(np.isnan(one), np.nan, one + 0.0) for one in found])
         return [one if one == UNREADABLE else fingerprint(part=one)["part"] for one in parts]
 
-    def _blocks(self) -> Iterator[Block]:
-        """At most 64 of them: all of a map, slab by slab, or of a larger one runs along its last axis."""
+    def _blocks(self) -> list[Block]:
+        """At most 64 of them: slabs that hold all of a map, or of a larger one single texels."""
         texels = math.prod(self.shape)
         if texels * self.samples * self.channels <= WHOLE:
-            ends = np.linspace(0, self.shape[0], min(BLOCKS, self.shape[0]) + 1).astype(int)
-            yield from ((slice(int(low), int(high)),) for low, high in pairwise(ends))
-            return
-        for place in np.linspace(0, texels - 1, BLOCKS).astype(int):
-            *rest, last = map(int, np.unravel_index(place, self.shape))
-            yield (*(slice(at, at + 1) for at in rest), slice(last, min(last + LONGEST, self.shape[-1])))
-
-    @property
-    def portable(self) -> tuple[Any, Any, Any, Any] | None:
-        """What another process opens them from by `map_data`; None where the values are not in a file."""
-        values, geometry, sigma, mask = self.given
-        if not isinstance(values, str | os.PathLike):
-            return None
-        geometry = geometry if self.geometry is None else (self.geometry.wi, self.geometry.wo)
-        sigma = None if self.sigma is None else sigma  # a noise model need not have it
-        values, geometry, sigma, mask = (
-            os.path.abspath(one) if isinstance(one, str | os.PathLike) else one
-            for one in (values, geometry, sigma, mask)
-        )
-        return values, geometry, sigma, mask
+            ends = np.linspace(0, self.shape[0], min(BLOCKS, self.shape[0]) + 1).astype(int).tolist()
+            return [(slice(low, high),) for low, high in pairwise(ends)]
+        places = np.unravel_index(np.linspace(0, texels - 1, BLOCKS).astype(int), self.shape)
+        return [tuple(slice(at, at + 1) for at in place) for place in np.transpose(places).tolist()]
 
 
 def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = None) -> MapData:
@@ -309,126 +307,101 @@ def map_data(values: Any, geometry: Any = None, sigma: Any = None, mask: Any = N
         geometry: `fits.Geometry` (or measurements, for where they were taken), a pair (wi, wo) of arrays, (N, 3) or
             (..., N, 3), a csv of directions, or a mapping or file with the arrays `wi`, `wo`, or `theta_i`, `phi_i`,
             `theta_o`, `phi_o`, (N,) or (..., N), in degrees; None: these stand beside the values.
-        sigma: standard deviations in 1/sr, above 0, (..., N, C) or (..., N), where axes of texels may be 1, or (N,).
-            NaN leaves a value out.
+        sigma: standard deviations in 1/sr, above 0, (..., N, C), (..., N) or (N,). NaN leaves a value out.
         mask: (...), truth values or whole numbers: which texels take part, others being 0.
 
     Raises:
         ValueError: an array is not there or no such array, or shapes do not fit together.
     """
-    every = _find(values, "values")
-    found = every.chosen("values")
-    if 0 in found.shape:
-        raise ValueError(f"{found.name} has shape {found.shape}, must hold something along every axis")
-    last = [name for name in (SAMPLE, CHANNEL) if name in found.dims]
-    found = found.transpose(..., *last)
-    along = tuple(name for name in found.dims if name != CHANNEL)
-    directions, samples, over = _directions(geometry, every.arrays, along)
-    shape, channels = _split_axes(found, samples)
-    if over not in ((), shape):
-        raise ValueError(f"geometry has directions of its own for a map of {over}, the measurements are of {shape}")
-    deviations = None if sigma is None else _ordered(_find(sigma, "sigma").chosen("sigma"), found.dims)
-    part = None if mask is None else _ordered(_find(mask, "mask").chosen("mask"), found.dims)
-    _require_fitting(deviations, part, (*shape, samples, channels))
-    common = None
-    if not over:
-        read = {name: _read(one) for name, one in directions.items()}
-        common = Geometry(*_unit_vectors(read, np.ones((), bool), ""))
-    given = values, geometry, sigma, mask
-    whole = MapData(found, directions, deviations, part, shape, samples, channels, common, given)
-    if common is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is refused now
-        whole.read()
-    return whole
+    arrays = _arrays(values, "values")
+    array = _choose(arrays, "values", values)
+    if 0 in array.shape:
+        raise ValueError(f"{array.name} has shape {array.shape}, must hold something along every axis")
+    array = array.transpose(..., *(name for name in (SAMPLE, CHANNEL) if name in array.dims))
+    directions = _directions(geometry, arrays, tuple(name for name in array.dims if name != CHANNEL))
+    components = ("xyz",) if "wi" in directions else ()
+    samples = next(iter(directions.values())).shape[-1 - len(components)]
+
+    # the last axes are those of measurements and channels, or of measurements
+    if array.ndim > 2 and array.shape[-2] == samples and (CHANNEL in array.dims or SAMPLE not in array.dims):
+        shape, channels = array.shape[:-2], array.shape[-1]
+    elif array.ndim > 1 and array.shape[-1] == samples and CHANNEL not in array.dims:
+        shape, channels = array.shape[:-1], 1
+    else:
+        raise ValueError(
+            f"{array.name} has shape {array.shape}, the geometry {samples} pairs of directions: values must be "
+            f"(..., {samples}, C), or (..., {samples}) for one channel, with an axis or more of texels"
+        )
+    texels = _texel_axes(len(shape))
+    sizes = dict(zip(texels, shape, strict=True)) | {SAMPLE: samples, CHANNEL: channels, "xyz": 3}
+    each, common = (*texels, SAMPLE, *components), (SAMPLE, *components)
+    directions = {name: _with_axes(one, sizes, common, each) for name, one in directions.items()}
+
+    def other(source: Any, wanted: str, *choices: tuple[str, ...]) -> xr.DataArray | None:
+        if source is None:
+            return None
+        chosen = _ordered(_choose(_arrays(source, wanted), wanted, source), array.dims)
+        return _with_axes(chosen, sizes, *choices)
+
+    deviations = other(sigma, "sigma", (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE), (SAMPLE,))
+    part = other(mask, "mask", texels)
+    if part is not None and part.dtype.kind == "f":
+        raise ValueError(f"{part.name} holds {part.dtype}, a mask must hold truth values or whole numbers")
+    array = _with_axes(array, sizes, (*texels, SAMPLE, CHANNEL), (*texels, SAMPLE))
+    view = None
+    if all(one.dims == common for one in directions.values()):
+        vectors = {name: _read(one) for name, one in directions.items()}
+        view = Geometry(*_unit_vectors(vectors, np.ones((), bool), ""))
+    data = MapData(array, directions, deviations, part, shape, samples, channels, view, (values, geometry, sigma, mask))
+    if view is None and not isinstance(geometry, str | os.PathLike | None):  # what is wrong in memory is refused now
+        data.read()
+    return data
 
 
-def _directions(
-    given: Any, beside: dict[str, xr.DataArray], dims: tuple[Hashable, ...]
-) -> tuple[dict[str, xr.DataArray], int, tuple[int, ...]]:
-    """Arrays of directions by name, how many there are, and the shape of the map if texels have their own, else ()."""
-    wanted = f"{' and '.join(VECTORS)}, or {', '.join(ANGLES)} in degrees"
-    is_path = isinstance(given, str | Path) and Path(given).is_file()
-    if is_path and Path(given).suffix.lower() not in (".npy", ".h5", ".hdf5"):
-        given = read_directions(Path(given))
-    if isinstance(given, Pairs):
-        given = (given.wi, given.wo)
-    if isinstance(given, tuple | list):
-        if len(given) != 2:
-            raise ValueError(f"geometry has {len(given)} entries, must be two: wi and wo")
-        given = dict(zip(VECTORS, given, strict=True))
+def _directions(geometry: Any, arrays: Arrays, dims: tuple[Hashable, ...]) -> Arrays:
+    """The arrays of directions by name; arrays: those beside the values, whose axes have these names."""
     where = "geometry is not given, and there is nothing beside the values that"
-    arrays, _, where = (beside, None, where) if given is None else _find(given, "geometry")
+    if geometry is not None:
+        if isinstance(geometry, str | Path) and Path(geometry).is_file() and Path(geometry).suffix.lower() not in FILES:
+            geometry = read_directions(Path(geometry))
+        if isinstance(geometry, Pairs):
+            geometry = (geometry.wi, geometry.wo)
+        if isinstance(geometry, tuple | list):
+            if len(geometry) != 2:
+                raise ValueError(f"geometry has {len(geometry)} entries, must be two: wi and wo")
+            geometry = dict(zip(VECTORS, geometry, strict=True))
+        where, arrays = "geometry", _arrays(geometry, "geometry")
     names = next((names for names in (VECTORS, ANGLES) if all(name in arrays for name in names)), None)
     if names is None:
+        wanted = f"{' and '.join(VECTORS)}, or {', '.join(ANGLES)} in degrees"
         raise ValueError(f"{where} has no directions, must hold {wanted}")
-    found, axes = {name: _ordered(arrays[name], dims) for name in names}, 2 if "wi" in names else 1
-    for name, one in found.items():
-        if len(one.shape) < axes or (axes == 2 and one.shape[-1] != 3):
-            must = "(N, 3) or (..., N, 3), the map's axes in front" if axes == 2 else "(N,) or (..., N)"
-            raise ValueError(f"{one.name} ({name}) has shape {one.shape}, must be {must}")
-    counts = {one.shape[-axes] for one in found.values()}
-    over = {one.shape[:-axes] for one in found.values()} - {()}
-    if len(counts) > 1 or len(over) > 1 or 0 in counts:
-        listed = ", ".join(f"{name} {one.shape}" for name, one in found.items())
-        raise ValueError(f"geometry: shapes {listed} do not fit together, N and the map's axes must be the same")
-    return found, counts.pop(), next(iter(over), ())
+    for name in names:
+        least = 2 if names is VECTORS else 1
+        if arrays[name].ndim < least or 0 in arrays[name].shape:
+            raise ValueError(f"{arrays[name].name} ({name}) has shape {arrays[name].shape}, must be (N, 3) or (N,)")
+    return {name: _ordered(arrays[name], dims) for name in names}
 
 
-def _unit_vectors(found: Mapping[str, Floats], given: NDArray[np.bool_], where: str) -> tuple[Floats, Floats]:
-    """`wi` and `wo`, (block shape, N, 3), refused where one of a `given` texel is none, along the normal elsewhere."""
-    if "wi" not in found:
-        polar = {}
+def _unit_vectors(directions: Mapping[str, Floats], used: NDArray[np.bool_], where: str) -> tuple[Floats, Floats]:
+    """`wi` and `wo`, (block shape, N, 3), refused where one of a `used` texel is none, along the normal elsewhere."""
+    if "wi" not in directions:
         for name in ("theta_i", "theta_o"):
-            out = (found[name] < 0.0) | (found[name] > 180.0)
-            if (wrong := out & given[..., None]).any():
-                first = np.broadcast_to(found[name], wrong.shape)[wrong][0]
+            wrong = ((directions[name] < 0.0) | (directions[name] > 180.0)) & used[..., None]
+            if wrong.any():
+                first = np.broadcast_to(directions[name], wrong.shape)[wrong][0]
                 raise ValueError(f"geometry: {name} is {first:g}, must be in [0, 180] degrees")
-            polar[name] = np.where(out, np.nan, found[name])
-        found = {"wi": direction(polar["theta_i"], found["phi_i"]), "wo": direction(polar["theta_o"], found["phi_o"])}
+        pairs = {"wi": ("theta_i", "phi_i"), "wo": ("theta_o", "phi_o")}
+        directions = {name: direction(*(directions[one] for one in angles)) for name, angles in pairs.items()}
     checked = []
     for name in VECTORS:
-        w = np.broadcast_to(found[name], (*given.shape, *found[name].shape[-2:]))
-        bad = ~(np.abs(np.linalg.norm(w, axis=-1) - 1.0) <= 1e-6)
-        if np.any(wrong := bad & given[..., None]):
-            raise ValueError(f"geometry: {name} is {w[wrong][0].tolist()}{where}, must be finite and of length 1")
-        checked.append(np.where(bad[..., None], NORMAL, w))
+        vectors = np.broadcast_to(directions[name], (*used.shape, *directions[name].shape[-2:]))
+        bad = ~(np.abs(np.linalg.norm(vectors, axis=-1) - 1.0) <= 1e-6)
+        if np.any(wrong := bad & used[..., None]):
+            raise ValueError(f"geometry: {name} is {vectors[wrong][0].tolist()}{where}, must be finite and of length 1")
+        checked.append(np.where(bad[..., None], NORMAL, vectors))
     return checked[0], checked[1]
 
 
-def _split_axes(values: xr.DataArray, samples: int) -> tuple[tuple[int, ...], int]:
-    """The shape of the map, and how many channels it has."""
-    shape, named = values.shape, values.dims
-    if len(shape) > 2 and shape[-2] == samples and (CHANNEL in named or SAMPLE not in named):
-        return shape[:-2], shape[-1]
-    if len(shape) > 1 and shape[-1] == samples and CHANNEL not in named:
-        return shape[:-1], 1
-    raise ValueError(
-        f"{values.name} has shape {shape}, the geometry {samples} pairs of directions: values must be "
-        f"(..., {samples}, C), or (..., {samples}) for one channel, with an axis or more of texels"
-    )
-
-
-def _require_fitting(sigma: xr.DataArray | None, mask: xr.DataArray | None, full: tuple[int, ...]) -> None:
-    """Refuse deviations and a mask whose shapes are not those of the values (..., N, C) and of the map."""
-    shape = full[:-2]
-    if sigma is not None:
-        own = sigma.shape if sigma.ndim == len(full) else (*sigma.shape, full[-1])
-        over = own[:-2] if sigma.ndim > 1 else shape
-        texels = len(over) == len(shape) and all(one in (1, size) for one, size in zip(over, shape, strict=True))
-        if own[-2:] != full[-2:] or not texels:
-            raise ValueError(
-                f"{sigma.name} has shape {sigma.shape}, sigma must be {full}, {full[:-1]}, the same with 1 for axes of "
-                f"texels, or {full[-2:-1]}"
-            )
-    if mask is not None and mask.shape != shape:
-        raise ValueError(f"{mask.name} has shape {mask.shape}, a mask must have that of the map, {shape}")
-    if mask is not None and mask.dtype.kind == "f":
-        raise ValueError(f"{mask.name} holds {mask.dtype}, a mask must hold truth values or whole numbers")
-
-
-def words(block: Block) -> str:
+def block_words(block: Block) -> str:
     """A block as errors name it: [0:32, 64:96]."""
     return f"[{', '.join(f'{one.start}:{one.stop}' for one in block)}]"
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

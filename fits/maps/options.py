@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, Literal, get_args
 
 from fits.names import Objective
@@ -41,26 +42,26 @@ class SpatialPrior:
 
     def __post_init__(self) -> None:
         require_choice("SpatialPrior.kind", self.kind, get_args(Kind))
-        given = self.scale if isinstance(self.scale, Mapping) else {"": self.scale}
-        if not given:
-            raise ValueError("SpatialPrior.scale is empty; it must name a parameter, or be a number")
-        where = {name: f"SpatialPrior.scale[{name!r}]" if name else "SpatialPrior.scale" for name in given}
-        checked = {str(name): _number(where[name], one, *SCALES) for name, one in given.items()}
-        object.__setattr__(self, "scale", checked if isinstance(self.scale, Mapping) else checked[""])
         require_count("SpatialPrior.rounds", self.rounds, 1)
+        if not isinstance(self.scale, Mapping):
+            _require_number("SpatialPrior.scale", self.scale, *SCALES)
+        elif not self.scale:
+            raise ValueError("SpatialPrior.scale is empty; it must name a parameter, or be a number")
+        else:
+            for name, scale in self.scale.items():
+                _require_number(f"SpatialPrior.scale[{name!r}]", scale, *SCALES)
 
     def scales(self, names: Sequence[str]) -> dict[str, float]:
-        """Of those of these parameters that are smoothed. ValueError: a scale is of none of them."""
+        """Scales of those of these parameters that are smoothed. ValueError: a scale is of none of them."""
         if not isinstance(self.scale, Mapping):
-            return dict.fromkeys(names, self.scale)
-        found: dict[str, float] = {}
-        for name, scale in self.scale.items():
-            own = [one for one in names if name in (one, re.sub(r"\[\d+\]$", "", one))]
-            if not own:
+            return dict.fromkeys(names, float(self.scale))
+        whole = {name: re.sub(r"\[\d+\]$", "", name) for name in names}  # without the channel
+        for name in self.scale:
+            if name not in {*names, *whole.values()}:
                 raise ValueError(f"SpatialPrior.scale names {name!r}; it must be one of {', '.join(names)}")
-            # a channel's own goes before that of all channels
-            found |= {one: scale for one in own if one == name or one not in self.scale}
-        return found
+        # a channel's own goes before that of all channels
+        scales = {name: self.scale.get(name, self.scale.get(whole[name])) for name in names}
+        return {name: float(scale) for name, scale in scales.items() if scale is not None}
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class MapOptions:
     chunk_size: int = 1024
     """Texels that are fitted and written together."""
     restarts: int = 3
-    """Further starts, and rounds of neighbours' values, that a texel which ended poorly is tried from."""
+    """Further starts, and rounds of neighbours' values, from which a texel that ended poorly is fitted again."""
     emulator: bool | None = None
     """Whether an exact transport is replaced by an emulator over the bounds, made once; None: where it holds, and the
     map has `emulator_min_texels`."""
@@ -116,7 +117,7 @@ class MapOptions:
     """The median chi-square is no chance this many of a texel's standard deviations from 1."""
 
     processes: int = 1
-    """1: threads of this process, one a core; of more each has a core of its own."""
+    """1: threads of this process, one a core; more: so many processes with one thread each."""
     force: bool = False
     """Throw away a store of other arguments, and begin anew."""
     progress: Progress | None = None
@@ -127,9 +128,9 @@ class MapOptions:
                             "emulator_min_texels": 0, "emulator_max_solves": 1}.items():  # fmt: skip
             require_count(name, getattr(self, name), least)
         for name in ("emulator_error", "settled", "pilot_factor", "numerical_error", "chi_square_sigmas"):
-            _number(name, getattr(self, name), 0.0, math.inf)
+            _require_number(name, getattr(self, name), 0.0, math.inf)
         for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
-            _number(name, getattr(self, name), 0.0, 1.0)
+            _require_number(name, getattr(self, name), 0.0, 1.0)
         require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
 
     @property
@@ -142,23 +143,18 @@ class MapOptions:
         without = {*self.model, "spatial_prior", "processes", "force", "progress"}
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in without}
 
-    def tell(self, stage: str, done: int, total: int, note: str = "") -> None:
+    def report(self, stage: str, done: int, total: int, note: str = "") -> None:
         """Report progress, where somebody listens."""
         if self.progress is not None:
             self.progress(stage, done, total, note)
 
 
-def _number(name: str, value: Any, low: float, high: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not low <= number <= high:
+def _require_number(name: str, value: Any, low: float, high: float) -> None:
+    if not (isinstance(value, Real) and low <= float(value) <= high):
         raise ValueError(f"{name} is {value!r}; it must be a number from {low:g} to {high:g}")
-    return number
 
 
-USUAL = MapOptions()
+DEFAULT = MapOptions()
 
 VERDICTS = {"converged_share", "flagged_share", "chi_square_sigmas", "settled"}
 """Options that change no number of a store: another value is not another fit."""

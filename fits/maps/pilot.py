@@ -5,24 +5,24 @@ have in common, where all other fits begin, and which chi-squares are to be expe
 chunks that are left as the first would have.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
 import layerjax as lj
 from fits.data.measurements import Measurements, channel_names
-from fits.maps.common import Common, fit_common, with_common
+from fits.maps.common import fit_common, with_common
 from fits.maps.emulator import Emulator, emulate, with_emulator
-from fits.maps.inputs import Block, MapData, Measured, map_data
+from fits.maps.inputs import Block, MapData, Measured
 from fits.maps.options import MapOptions
 from fits.maps.search import Results, Starts, fit_first, reduced_chi_square, search, sigmas, starts_at
-from fits.maps.store import PILOT, Store
+from fits.maps.store import Store
 from fits.maps.texels import Texels, make_texels, with_own_directions
 from fits.optimise.fit import fit
 from fits.optimise.multi_start import start_points
@@ -35,9 +35,8 @@ from fits.problem.stack_file import transport_from_dict, transport_to_dict
 
 Floats = NDArray[np.float64]
 
-GOLDEN, MOST_TRIED, FEW = 0.6180339887498949, 4096, 8
-"""Steps between the texels of a pilot, as a share of the map, how many are tried for it, and how many are enough where
-most are of no use."""
+GOLDEN, MOST_TRIED = 0.6180339887498949, 4096
+"""Steps between the texels that are tried for a pilot, as a share of the map, and how many are."""
 
 MOST_PARAMETERS = 32
 
@@ -50,19 +49,11 @@ class Pilot:
         prototype: the problem of a texel, with common parameters held, and a resolution.
         emulator: in the place of its transport; None: that itself.
         starts: of all other fits.
-        common: what was found of common parameters; None if there are none.
-        numerical_error: of the model, in standard deviations, at most; None where the transport has none.
-        words: on the resolution and the emulator.
-        reduced: median of the reduced chi-squares of the pilot texels.
     """
 
     prototype: Problem
     emulator: Emulator | None
     starts: Starts
-    common: Common | None
-    numerical_error: float | None
-    words: dict[str, str]
-    reduced: float
 
     def __getstate__(self) -> dict[str, Any]:  # a model does not outlive its process
         return {one.name: getattr(self, one.name) for one in fields(self)}
@@ -77,9 +68,9 @@ class Pilot:
         return texels_of(measured, least_floor(self.prototype))
 
 
-def map_problem(problem: Problem, own: bool, emulator: Emulator | None) -> Problem:
-    """A problem with the model of a map; own: texels have directions of their own."""
-    problem = with_own_directions(problem) if own else problem
+def map_problem(problem: Problem, own_directions: bool, emulator: Emulator | None) -> Problem:
+    """A problem with the model of a map; own_directions: of each texel."""
+    problem = with_own_directions(problem) if own_directions else problem
     return problem if emulator is None else problem.with_model(with_emulator(problem.model, emulator))
 
 
@@ -104,16 +95,10 @@ def pilot_texels(data: MapData, count: int) -> Texels:
     candidates = np.flatnonzero(data.read_mask(tuple(slice(0, size) for size in data.shape)))
     if not candidates.size:
         raise ValueError("mask: no texel takes part, it is 0 everywhere")
-    first = np.arange(min(4 * count, candidates.size))  # evenly, then others in case those are of no use
-    rest = np.linspace(0, candidates.size - 1, min(candidates.size, MOST_TRIED))
-    order = candidates[np.concatenate([((first + 0.5) * GOLDEN % 1.0) * candidates.size, rest]).astype(int)]
-    found: dict[int, Texels] = {}
+    order = candidates[((np.arange(MOST_TRIED) + 0.5) * GOLDEN % 1.0 * candidates.size).astype(int)]
+    chosen: dict[int, Texels] = {}
     failure: ValueError | None = None
-    for turn, place in enumerate(order.tolist()):
-        if len(found) == count or (turn >= 4 * count and len(found) >= FEW):
-            break
-        if place in found:
-            continue
+    for place in dict.fromkeys(order.tolist()):
         try:
             at = np.unravel_index(place, data.shape)
             row = texels_of(data.read(tuple(slice(int(one), int(one) + 1) for one in at)), 0.0)
@@ -121,106 +106,112 @@ def pilot_texels(data: MapData, count: int) -> Texels:
             failure = failure or error
             continue
         if row.measurements[0]:
-            found[place] = row
-    if not found:
+            chosen[place] = row
+        if len(chosen) == count:
+            break
+    if not chosen:
         raise failure or ValueError("values: no measurement of a texel that takes part is a finite number")
-    rows = [found[place] for place in sorted(found)]
+    rows = [chosen[place] for place in sorted(chosen)]
     return Texels(*(None if one[0] is None else np.concatenate(one) for one in zip(*rows, strict=True)))
 
 
-def prototype(
+def make_prototype(
     pilot: Texels, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions
 ) -> Problem:
-    """A problem with the measurements of a typical texel, in whose place those of each texel come."""
+    """A problem with the measurements of a typical texel, in whose place those of each texel come.
+
+    ValueError for one that a map cannot have.
+    """
     noise = Noise() if noise is None else noise
     if noise.discrepancy:
         raise ValueError("noise.discrepancy is given; fits of maps have independent noise only")
 
     def median(values: Floats) -> Floats:  # of every datum over the texels where it counts, (N, C), or of all data
-        found = np.ma.median(np.ma.masked_array(values, ~pilot.used), axis=0)
-        return np.asarray(np.ma.filled(found, np.median(values[pilot.used])), float)
+        medians = np.ma.median(np.ma.masked_array(values, ~pilot.used), axis=0)
+        return np.asarray(np.ma.filled(medians, np.median(values[pilot.used])), float)
 
     bright = np.nanmean(np.where(pilot.used, pilot.values, np.nan), axis=(1, 2))
     typical = int(np.argsort(bright)[len(bright) // 2])
     values = np.where(pilot.used[typical], pilot.values[typical], median(pilot.values))
-    known = noise.use_sigma and data.sigma is not None
-    sigma = np.sqrt(median(pilot.variance)) if known else None
+    sigma = np.sqrt(median(pilot.variance)) if noise.use_sigma and data.sigma is not None else None
     relative, floor = noise.relative, noise.floor
     if relative is None:
         relative = DEFAULT_RELATIVE if sigma is None and floor is None else 0.0
     if floor is None:  # one for the whole map
-        alone = not is_free(relative) and relative == 0
-        floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(pilot.values[pilot.used])))
+        none = not is_free(relative) and relative == 0
+        floor = 0.0 if none else DEFAULT_FLOOR * float(np.median(np.abs(pilot.values[pilot.used])))
     view = data.geometry
     wi, wo = (pilot.wi[typical], pilot.wo[typical]) if view is None else (view.wi, view.wo)
     measured = Measurements(wi, wo, values, sigma, np.ones(len(values), bool), channel_names(data.channels))
     noise = replace(noise, relative=relative, floor=floor, discrepancy=False)
-    return Problem(stack, measured, transport=transport, noise=noise, **options.model)
+    problem = Problem(stack, measured, transport=transport, noise=noise, **options.model)
 
-
-def require_fitting(problem: Problem, texels: Texels, options: MapOptions) -> None:
-    """ValueError for a problem that a map cannot have."""
-    names, common = problem.names, problem.common_names
+    names, common, prior = problem.names, problem.common_names, options.spatial_prior
     if len(names) > MOST_PARAMETERS:
         raise ValueError(f"stack: {len(names)} parameters are free; of a map at most {MOST_PARAMETERS} can be")
     if any(name.startswith("instrument.") for name in common):
         raise ValueError("instrument.tilt is common to all texels; hold it at a number")
     if len(common) == len(names):
         raise ValueError("stack: all free parameters are common; a map needs one that each texel has of its own")
-    if not (texels.measurements >= len(names)).any():
+    if not (pilot.measurements >= len(names)).any():
         raise ValueError(f"values: no texel has as many measurements as there are free parameters, {len(names)}")
-    if options.spatial_prior is not None:
+    if prior is not None:
         if problem.objective != "likelihood":
             raise ValueError(
                 f"spatial_prior is given, but objective {problem.objective!r} has no noise to weigh it with"
             )
-        options.spatial_prior.scales([name for name in names if name not in common])
+        prior.scales([name for name in names if name not in common])
+    return problem
 
 
 # ---- the fits of the pilot ----
 
 
-def fit_pilot(data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions) -> Pilot:
-    """Find resolution, emulator, common parameters and starts from the pilot texels.
+def fit_pilot(
+    problem: Problem, texels: Texels, shape: tuple[int, ...], options: MapOptions
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Find resolution, emulator, common parameters and starts from the pilot texels of a map of this shape.
+
+    Returns what a store keeps of that: arrays, and what its root says.
 
     Raises:
-        ValueError: a problem that a map cannot have, an emulator is required that cannot be made, or no texel has a
-            fit.
+        ValueError: an emulator is required that cannot be made, or no texel has a fit.
     """
-    texels = pilot_texels(data, options.pilot_texels)
-    problem, own = prototype(texels, data, stack, noise, transport, options), data.geometry is None
-    require_fitting(problem, texels, options)
+    own_directions, size = texels.wi is not None, options.chunk_size
     texels = texels.rows(texels.measurements >= len(problem.names)).with_floor(least_floor(problem))
 
     # the resolution that a fit of its own data ends with
     known = resolutions(problem)
     if leaves_rays_open(problem) or (known is not None and known.open):
-        found = fit(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
-        problem = replace(problem, transport=found.transport, instrument=found.instrument)
+        best = fit(problem, starts=options.starts, seed=options.seed, progress=options.progress).problem
+        problem = replace(problem, transport=best.transport, instrument=best.instrument)
 
-    common = None
+    common: dict[str, Any] = {}
     if problem.common_names:
-        options.tell("common", 0, len(problem.common_names))
-        held, common = fit_common(map_problem(problem, own, None), texels, options)
-        problem = replace(held)  # without the model of a map
+        options.report("common", 0, len(problem.common_names))
+        values, errors, converged = fit_common(map_problem(problem, own_directions, None), texels, options)
+        problem = with_common(problem, values)
+        for name, value in values.items():
+            common[name] = {"value": value, "error": errors[name], "unit": unit(name), "converged": converged}
 
     # the pilot, at finer resolutions until its noise hides their error
-    options.tell("pilot", 0, texels.number)
-    if own and options.emulator:
+    options.report("pilot", 0, texels.number)
+    if own_directions and options.emulator:
         raise ValueError("emulator: there is none where every texel has directions of its own")
-    pays = known is not None and np.prod(data.shape) >= options.emulator_min_texels
-    wants_emulator = not own and (pays if options.emulator is None else options.emulator)
-    words: dict[str, str] = {}
+    pays = known is not None and np.prod(shape) >= options.emulator_min_texels
+    wants_emulator = not own_directions and (pays if options.emulator is None else options.emulator)
+    numerical: dict[str, Any] = {}
     while True:
-        emulator = None
+        emulator, error = None, None
         if wants_emulator:
-            emulator, words["emulator"] = emulate(problem, options)
+            emulator, numerical["emulator"] = emulate(problem, options)
             if emulator is None and options.emulator:
-                raise ValueError(f"emulator: {words['emulator']}")
-        ready = map_problem(problem, own, emulator)
-        starts, results = _fit_texels(ready, texels, options)
-        if own or (known is None and not has_rays(problem)):
-            error = None
+                raise ValueError(f"emulator: {numerical['emulator']}")
+        ready = map_problem(problem, own_directions, emulator)
+        points = start_points(ready, options.starts, options.seed)
+        starts = starts_at(ready, fit_first(ready, points, texels, size).distinct(), own_directions, size)
+        results = search(ready, starts, texels, size, options)
+        if own_directions or (known is None and not has_rays(problem)):
             break
         finer = None if known is None else known.finer(problem.transport)  # type: ignore[arg-type]
         fine = None if finer is None else replace(problem, transport=finer)
@@ -228,32 +219,51 @@ def fit_pilot(data: MapData, stack: Any, noise: Noise | None, transport: Any, op
         if known is None or not known.open or fine is None or error <= options.numerical_error:
             if has_rays(problem):
                 error += _numerical_error(ready, problem.with_other_rays(), results, texels)
-            words["resolution"] = resolution_in_words(problem, known)
+            numerical["resolution"] = resolution_in_words(problem, known)
             break
         problem = fine
-    options.tell("pilot", texels.number, texels.number)
-    reduced = reduced_chi_square(results.fits, texels)
-    return Pilot(problem, emulator, starts, common, error, words, float(np.nanmedian(reduced)))
+    options.report("pilot", texels.number, texels.number)
 
-
-def _fit_texels(problem: Problem, texels: Texels, options: MapOptions) -> tuple[Starts, Results]:
-    """Fits of the pilot: a few from all starts, the others from where these ended; and starts of all other fits."""
-    points, own, size = start_points(problem, options.starts, options.seed), texels.wi is not None, options.chunk_size
-    first = starts_at(problem, fit_first(problem, points, texels, size).distinct(), points[1:], own, size)
-    results = search(problem, first, texels, size, options)
     reduced = reduced_chi_square(results.fits, texels)
     finite = reduced[np.isfinite(reduced)]
-    explained = options.pilot_factor * float(np.quantile(finite, options.pilot_quantile)) if finite.size else 0.0
-    return starts_at(problem, results.fits.distinct(), points[1:], own, size, explained), results
+    arrays = {"starts": results.fits.distinct(), **({} if emulator is None else emulator.arrays())}
+    has_words = isinstance(problem.transport, lj.Transport) or problem.transport == "auto"
+    kept = {
+        "reduced_chi_square": float(np.median(finite)) if finite.size else None,
+        "poor_above": options.pilot_factor * float(np.quantile(finite, options.pilot_quantile)) if finite.size else 0.0,
+        "floor": None if is_free(problem.noise.floor) else problem.noise.floor,
+        "transport": transport_to_dict(problem.transport) if has_words else None,  # type: ignore[arg-type]
+        "rings": None if problem.instrument is None else problem.instrument.rings,
+    }
+    about = {"transport": repr(problem.transport), "noise": repr(problem.noise), "pilot": kept, "common": common}
+    return arrays, about | {"numerical": numerical | {"error": error}}
+
+
+def assemble(
+    problem: Problem, own_directions: bool, arrays: Mapping[str, Any], about: Mapping[str, Any], options: MapOptions
+) -> Pilot:
+    """The pilot by what a store keeps of it, see `fit_pilot`; problem: as that was called with."""
+    kept = about["pilot"]
+    if kept["floor"] is not None:
+        problem = replace(problem, noise=replace(problem.noise, floor=kept["floor"]))
+    if kept["transport"] is not None:
+        problem = replace(problem, transport=transport_from_dict(kept["transport"]))
+    if problem.instrument is not None:
+        problem = replace(problem, instrument=replace(problem.instrument, rings=kept["rings"]))
+    if common := about["common"]:
+        problem = with_common(problem, {name: float(one["value"]) for name, one in common.items()})
+    emulator = Emulator.of(arrays) if "orders" in arrays else None
+    ready, size = map_problem(problem, own_directions, emulator), options.chunk_size
+    return Pilot(problem, emulator, starts_at(ready, arrays["starts"], own_directions, size, kept["poor_above"]))
 
 
 def _numerical_error(ready: Problem, fine: Problem, results: Results, texels: Texels) -> float:
     """Largest numerical error of the pilot, in standard deviations, by a finer problem."""
     good = np.isfinite(results.fits.cost)
-    found, rows = results.fits.rows(good), texels.rows(good)
-    exact = predict_all(fine, found.vector)
+    fits, rows = results.fits.rows(good), texels.rows(good)
+    exact = predict_all(fine, fits.vector)
     own = np.where(rows.used, np.sqrt(rows.variance), 0.0)
-    error = np.abs(found.predicted - exact) / np.hypot(sigmas(ready, found.vector, exact), own)
+    error = np.abs(fits.predicted - exact) / np.hypot(sigmas(ready, fits.vector, exact), own)
     return float(np.max(np.where(rows.used, error, 0.0), initial=0.0))
 
 
@@ -264,71 +274,6 @@ def predict_all(problem: Problem, vectors: Floats) -> Floats:
 
 def _predict_all(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
-
-
-# ---- in the store ----
-
-
-def described(pilot: Pilot) -> dict[str, Any]:
-    """What the root of a store says of it."""
-    problem, common = pilot.prototype, {}
-    if pilot.common is not None:
-        for name, value in pilot.common.values.items():
-            error, converged = pilot.common.errors[name], pilot.common.converged
-            common[name] = {"value": value, "error": error, "unit": unit(name), "converged": converged}
-    known = isinstance(problem.transport, lj.Transport) or problem.transport == "auto"
-    kept = {
-        "reduced_chi_square": pilot.reduced,
-        "poor_above": pilot.starts.explained,
-        "floor": None if is_free(problem.noise.floor) else problem.noise.floor,
-        "transport": transport_to_dict(problem.transport) if known else None,  # type: ignore[arg-type]
-        "rings": None if problem.instrument is None else problem.instrument.rings,
-    }
-    numerical = {**pilot.words, "error": pilot.numerical_error}
-    words = {"transport": repr(problem.transport), "noise": repr(problem.noise)}
-    return {**words, "pilot": kept, "numerical": numerical, "common": common}
-
-
-def save(pilot: Pilot, store: Store) -> None:
-    """Keep its arrays in a store."""
-    arrays: dict[str, Any] = {"vectors": pilot.starts.vectors, "random": pilot.starts.random}
-    if pilot.emulator is not None:
-        arrays |= {f"emulator/{name}": np.asarray(getattr(pilot.emulator, name)) for name in _arrays_of_emulator()}
-    store.save_group(PILOT, arrays, {})
-
-
-def load(
-    store: Store, data: MapData, stack: Any, noise: Noise | None, transport: Any, options: MapOptions
-) -> Pilot | None:
-    """What a store keeps of it, for the same arguments as those of `fit_pilot`; None where it is not there whole."""
-    found = store.load_group(PILOT)
-    if found is None:
-        return None
-    array, kept, own, common, emulator = found[0], store.attributes["pilot"], data.geometry is None, None, None
-    texels = pilot_texels(data, options.pilot_texels)
-    problem = prototype(texels, data, stack, noise, transport, options)
-    require_fitting(problem, texels, options)
-    if kept["floor"] is not None:
-        problem = replace(problem, noise=replace(problem.noise, floor=kept["floor"]))
-    if kept["transport"] is not None:
-        problem = replace(problem, transport=transport_from_dict(kept["transport"]))
-    if problem.instrument is not None:
-        problem = replace(problem, instrument=replace(problem.instrument, rings=kept["rings"]))
-    if said := store.attributes["common"]:
-        values, errors = ({name: float(one[part]) for name, one in said.items()} for part in ("value", "error"))
-        common = Common(values, errors, all(one["converged"] for one in said.values()))
-        problem = with_common(problem, values)
-    if "emulator/orders" in array:
-        parts = {name: jnp.asarray(array[f"emulator/{name}"]) for name in _arrays_of_emulator()}
-        emulator = Emulator(**parts, highest=int(np.max(array["emulator/orders"])))
-    ready, reduced = map_problem(problem, own, emulator), float(kept["reduced_chi_square"])
-    starts = starts_at(ready, array["vectors"], array["random"], own, options.chunk_size, kept["poor_above"])
-    words = {name: one for name, one in store.attributes["numerical"].items() if name != "error"}
-    return Pilot(problem, emulator, starts, common, store.numerical_error, words, reduced)
-
-
-def _arrays_of_emulator() -> list[str]:
-    return [entry.name for entry in fields(Emulator) if entry.name != "highest"]
 
 
 # ---- for those who do the work ----
@@ -342,32 +287,25 @@ class Job:
         path: of the store.
         pilot: what was found of a sample of the map.
         options: of the map; its chunk size is that of the program.
-        source: of the measurements, or what `map_data` opens them from; None where each task brings its own.
+        data: the measurements; None where each task brings its own.
     """
 
     path: str
     pilot: Pilot
     options: MapOptions
-    source: MapData | tuple[Any, Any, Any, Any] | None
+    data: MapData | None
 
-    def __getstate__(self) -> dict[str, Any]:  # open files do not outlive their process
+    def __getstate__(self) -> dict[str, Any]:  # an open store does not outlive its process
         return {one.name: getattr(self, one.name) for one in fields(self)}
-
-    @cached_property
-    def data(self) -> MapData:
-        """The measurements, opened once in each process."""
-        assert self.source is not None
-        return self.source if isinstance(self.source, MapData) else map_data(*self.source)
 
     @cached_property
     def store(self) -> Store:
         """The store, opened once in each process."""
         return Store(self.path)
 
-    def sent(self, data: MapData, block: Block) -> Measured | None:
-        """What a task brings of its block."""
-        return None if self.source is not None else data.read(block)
-
-    def measured(self, block: Block, sent: Measured | None) -> Measured:
-        """The measurements of a block, wherever they are."""
-        return self.data.read(block) if sent is None else sent
+    def measured(self, block: Block, measured: Measured | None) -> Measured:
+        """The measurements of a block; measured: as the task brings them."""
+        if measured is not None:
+            return measured
+        assert self.data is not None
+        return self.data.read(block)

@@ -1,7 +1,7 @@
-"""The best fit of each of many texels: from the likeliest of known starts, and from others where that ended poorly.
+"""The best fit of each of many texels: from the likeliest of known starts, and from others where that fit is poor.
 
-A texel is begun again, from other starts, from its neighbours' values and from points all over the bounds, only where
-its chi-square says that it ended poorly: a second minimum that fits as well is not looked for.
+A texel is fitted again, from other starts and from its neighbours' values, only where its chi-square says that it ended
+poorly: a second minimum that fits as well is not looked for.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from fits.maps.options import MapOptions
-from fits.maps.texels import (
-    Fits,
-    Integers,
-    Linearisation,
-    Texels,
-    Truths,
-    fit_texels,
-    linearise_at,
-    to_units,
-)
+from fits.maps.texels import Fits, Integers, Linearisation, Texels, Truths, fit_texels, linearise_at, to_units
 from fits.problem.model import Model
 from fits.problem.problem import Problem
 
@@ -35,7 +26,7 @@ FIRST = 8
 MOST_PREDICTED = 4
 """Starts that are compared for every texel, where each has directions of its own."""
 
-NEIGHBOUR, RANDOM = -1, -2
+NEIGHBOUR = -1
 """Where a texel's best fit began, if not at a start of the list."""
 
 
@@ -44,19 +35,17 @@ class Starts:
     """Where fits begin.
 
     vectors, units: K, physical and in the unit box, (K, P). known: the model there, (K, ...); None where every texel
-    has directions of its own. random: further points of the unit box, (R, P).
-    explained: a reduced chi-square that is not poor, whatever the noise says.
+    has directions of its own. explained: a reduced chi-square that is not poor, whatever the noise says.
     """
 
     vectors: Floats
     units: Floats
     known: Linearisation | None
-    random: Floats
     explained: float = 0.0
 
 
 class Results(NamedTuple):
-    """What is found of M texels: fits, where each began, and which are poor or were started again, (M,) each."""
+    """What is found of M texels: fits, where each began, and which are poor or were fitted again, (M,) each."""
 
     fits: Fits
     start: Integers
@@ -64,69 +53,64 @@ class Results(NamedTuple):
     restarted: Truths
 
 
-def starts_at(
-    problem: Problem, vectors: Floats, random: Floats, own: bool, size: int, explained: float = 0.0
-) -> Starts:
-    """The starts at these vectors (K, P); own: texels have directions of their own; size: of the program."""
-    vectors = vectors[:MOST_PREDICTED] if own else vectors
+def starts_at(problem: Problem, vectors: Floats, own_directions: bool, size: int, explained: float = 0.0) -> Starts:
+    """The starts at these vectors (K, P); own_directions: of each texel; size: of the program."""
+    vectors = vectors[:MOST_PREDICTED] if own_directions else vectors
     units = to_units(problem, vectors)
-    known = None if own else linearise_at(problem, units, size)
-    return Starts(vectors, units, known, random, explained)
+    return Starts(vectors, units, None if own_directions else linearise_at(problem, units, size), explained)
 
 
 def fit_first(problem: Problem, points: Floats, pilot: Texels, size: int) -> Fits:
     """The lowest fits of a few of the pilot texels, from all of the points (starts, P) of the unit box."""
     rows = pilot.rows(np.unique(np.linspace(0, pilot.number - 1, min(FIRST, pilot.number)).astype(int)))
     best, *others = (fit_texels(problem, np.tile(point, (rows.number, 1)), rows, size) for point in points)
-    for found in others:
-        better = np.flatnonzero(best.better(found, slice(None)))
-        best.put(better, found.rows(better))
+    for other in others:
+        best.improve(np.arange(rows.number), other)
     return best
 
 
 def search(
-    problem: Problem, starts: Starts, texels: Texels, size: int, options: MapOptions, beside: Integers | None = None
+    problem: Problem, starts: Starts, texels: Texels, size: int, options: MapOptions, neighbours: Integers | None = None
 ) -> Results:
     """Fit each texel.
 
     Args:
         size: of the program: texels at a time.
-        beside: the neighbours of each, (M, ...), by their places; -1 where there is none.
+        neighbours: of each texel, (M, ...), by their places; -1 where there is none.
     """
     order = likeliest(problem, starts, texels, size, options.restarts + 1)
     start, restarted = order[:, 0].copy(), np.zeros(texels.number, bool)
     which = None if starts.known is None else start.copy()
-    found = fit_texels(problem, starts.units[start], texels, size, known=starts.known, which=which, fresh=False)
+    best = fit_texels(problem, starts.units[start], texels, size, known=starts.known, which=which, fresh=False)
     limit = explained_chi_square(problem, starts, texels, options)
 
     def poor() -> Truths:
         """Which fits are worse than noise and pilot explain, or have not converged."""
-        return ~((reduced_chi_square(found, texels) <= limit) & found.converged)
+        return ~((reduced_chi_square(best, texels) <= limit) & best.converged)
 
-    def again(rows: Integers, units: Floats, begun: Integers) -> None:
-        if not len(rows):
-            return
-        restarted[rows] = True
-        other = fit_texels(problem, units, texels.rows(rows), size)
-        improved = found.better(other, rows)
-        found.put(rows[improved], other.rows(improved))
-        start[rows[improved]] = begun[improved]
+    def refit(rows: Integers, units: Floats, origins: Integers) -> None:
+        if len(rows):
+            restarted[rows] = True
+            improved = best.improve(rows, fit_texels(problem, units, texels.rows(rows), size))
+            start[rows[improved]] = origins[improved]
 
     for place in range(1, order.shape[1]):
         rows = np.flatnonzero(poor())
-        again(rows, starts.units[order[rows, place]], order[rows, place])
-    for _ in range(options.restarts if beside is not None else 0):
-        rows, vectors = _neighbours_of_poor(found, poor(), beside)
-        again(rows, to_units(problem, vectors), np.full(len(rows), NEIGHBOUR))
-    for point in starts.random:
-        rows = np.flatnonzero(poor())
-        again(rows, np.tile(point, (len(rows), 1)), np.full(len(rows), RANDOM))
-    return Results(found, start, poor() & found.converged, restarted)
+        refit(rows, starts.units[order[rows, place]], order[rows, place])
+    for _ in range(options.restarts):
+        if neighbours is None:
+            break
+        # poor texels that have a neighbour which is not, from where the best of those ended; the place -1 is none
+        good, cost = np.append(~poor(), False), np.append(best.cost, np.inf)
+        rows = np.flatnonzero(poor() & np.any(good[neighbours], axis=1))
+        choice = np.argmin(np.where(good[neighbours[rows]], cost[neighbours[rows]], np.inf), axis=1)
+        refit(rows, best.unit[neighbours[rows, choice]], np.full(len(rows), NEIGHBOUR))
+    return Results(best, start, poor() & best.converged, restarted)
 
 
-def reduced_chi_square(found: Fits, texels: Texels) -> Floats:
+def reduced_chi_square(fits: Fits, texels: Texels) -> Floats:
     """Chi-square over degrees of freedom, (M,)."""
-    return np.asarray(found.chi_square) / _freedom(texels, found.vector.shape[1])
+    return np.asarray(fits.chi_square) / _freedom(texels, fits.vector.shape[1])
 
 
 def _freedom(texels: Texels, parameters: int) -> Floats:
@@ -144,43 +128,27 @@ def explained_chi_square(problem: Problem, starts: Starts, texels: Texels, optio
     return limit
 
 
-def _neighbours_of_poor(found: Fits, poor: Truths, beside: Integers | None) -> tuple[Integers, Floats]:
-    """Poor texels that have a neighbour which is not, and where the best of those ended."""
-    assert beside is not None
-    good = np.append(~poor, False)  # the place -1 is none
-    cost = np.append(np.asarray(found.cost), np.inf)
-    rows = np.flatnonzero(poor & np.any(good[beside], axis=1))
-    choice = np.argmin(np.where(good[beside[rows]], cost[beside[rows]], np.inf), axis=1)
-    return rows, found.vector[beside[rows, choice]]
-
-
 def likeliest(problem: Problem, starts: Starts, texels: Texels, size: int, most: int) -> Integers:
-    """The starts that suit each texel best, (M, at most `most`), best first."""
-    if starts.known is None:  # the cost of each along the texel's own directions
+    """The starts that suit each texel best, (M, at most `most`), best first.
+
+    By minus twice the log-likelihood, with noise as the problem's own values have it, as matrix products; or by the
+    cost, where each texel has directions of its own.
+    """
+    if starts.known is None:
         units = (np.tile(unit, (texels.number, 1)) for unit in starts.units)
         costs = [fit_texels(problem, unit, texels, size, fresh=False, most_steps=1).cost for unit in units]
-        misfit = np.stack(costs, axis=1)
-    else:
-        misfit = _misfit(problem, starts, texels)
-    return np.argsort(misfit, axis=1, kind="stable")[:, :most]
-
-
-def _misfit(problem: Problem, starts: Starts, texels: Texels) -> Floats:
-    """Minus twice the log-likelihood of known starts with noise as the problem's own values have it, as matrix
-    products, (M, K)."""
-    assert starts.known is not None
+        return np.argsort(np.stack(costs, axis=1), axis=1, kind="stable")[:, :most]
     predicted = np.asarray(starts.known.values, float)
-    sigma = np.asarray(sigmas(problem, starts.vectors, predicted))
+    sigma = sigmas(problem, starts.vectors, predicted)
     with np.errstate(all="ignore"):
-        parts = (
+        terms = (
             (np.square(texels.values), sigma**-2.0),
             (texels.values, -2.0 * predicted / sigma**2),
             (texels.used, (predicted / sigma) ** 2 + 2.0 * np.log(sigma)),
         )
-        squares = sum(
-            measured.reshape(texels.number, -1).astype(float) @ of.reshape(len(of), -1).T for measured, of in parts
-        )
-    return np.nan_to_num(squares, nan=np.inf, posinf=np.inf)
+        misfit = sum(one.reshape(len(one), -1).astype(float) @ other.reshape(len(other), -1).T for one, other in terms)
+    misfit = np.nan_to_num(misfit, nan=np.inf, posinf=np.inf)
+    return np.argsort(misfit, axis=1, kind="stable")[:, :most]
 
 
 def sigmas(problem: Problem, vectors: Floats, predicted: Floats) -> Floats:
@@ -192,7 +160,7 @@ def _sigmas(model: Model, vectors: Array, predicted: Array) -> Array:
     return jax.vmap(model.sigma_at)(vectors, predicted)
 
 
-def neighbours(shape: tuple[int, ...]) -> Integers:
+def neighbours_of(shape: tuple[int, ...]) -> Integers:
     """The places of those beside each texel of a block of this shape, (M, 2 rank); -1 beyond its edge."""
     places = np.pad(np.arange(int(np.prod(shape))).reshape(shape), 1, constant_values=-1)
     inner = tuple(slice(1, -1) for _ in shape)

@@ -14,7 +14,6 @@ it along the axes of the map, and join fitted texels alone. After each round the
 
 import json
 import math
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,11 +21,11 @@ from numpy.typing import NDArray
 
 from fits._files import plain
 from fits.engines import Failure, run
-from fits.maps.inputs import Block, MapData, Measured, words
+from fits.maps.inputs import Block, MapData, Measured, block_words
 from fits.maps.options import Kind, MapOptions
 from fits.maps.pilot import Job
 from fits.maps.store import FLAGS, SMOOTHED, Store, blocks_of
-from fits.maps.texels import fit_texels, natural, standard_errors, to_units, widths
+from fits.maps.texels import fit_texels, standard_errors, to_units, widths
 
 Floats = NDArray[np.float64]
 Truths = NDArray[np.bool_]
@@ -34,38 +33,29 @@ Truths = NDArray[np.bool_]
 FLAT = 0.1
 """Of the scale: below, a difference counts by its square in a total variation, which has no derivative at 0."""
 
-GIVEN = {"values": "given its neighbours", "errors": "standard error with the neighbours held where they are"}
-"""What the arrays of each group say of themselves."""
 
+def neighbour_prior(kind: Kind, scales: Floats, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:
+    """The Gaussian by which the neighbours of each texel hold it: its centre in the unit box and its precision, 0 where
+    no edge ends, (map shape, P) each.
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """What differences between neighbours cost; scales: of each parameter, (P,), infinite where it is not smoothed."""
+    Its logarithm and that of the spatial prior have the same slope where the texel is, and it lies below elsewhere:
+    what lowers the cost with it lowers that with the spatial prior at least as much.
 
-    kind: Kind
-    scales: Floats
-
-    def prior_pull(self, units: Floats, fitted: Truths) -> tuple[Floats, Floats]:
-        """The Gaussian by which the neighbours of each texel draw it: its centre in the unit box and its precision, 0
-        where no edge ends, (map shape, P) each.
-
-        Its logarithm and that of the spatial prior have the same slope where the texel is, and it lies below elsewhere:
-        what lowers the cost with it lowers that with the spatial prior at least as much.
-
-        units: (map shape, P), in the unit box, finite where `fitted`, (map shape).
-        """
-        total, moment = np.zeros((2, *units.shape))
-        with np.errstate(invalid="ignore"):
-            for axis in range(fitted.ndim):
-                for here, there in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
-                    own, other = ((*[slice(None)] * axis, cut) for cut in (here, there))
-                    joined = fitted[own] & fitted[other]
-                    share = np.abs(units[other] - units[own]) / self.scales
-                    flat = np.ones_like(share) if self.kind == "gaussian" else np.maximum(share, FLAT)
-                    weight = np.where(joined[..., None], 1.0 / (np.square(self.scales) * flat), 0.0)
-                    total[own] += weight
-                    moment[own] += np.where(joined[..., None], weight * units[other], 0.0)
-        return moment / np.where(total > 0.0, total, 1.0), total
+    scales: (P,), infinite where a parameter is not smoothed. units: (map shape, P), in the unit box, finite where
+    `fitted`, (map shape).
+    """
+    total, moment = np.zeros((2, *units.shape))
+    with np.errstate(invalid="ignore"):
+        for axis in range(fitted.ndim):
+            for first, second in ((slice(None, -1), slice(1, None)), (slice(1, None), slice(None, -1))):
+                own, other = ((*[slice(None)] * axis, cut) for cut in (first, second))
+                joined = fitted[own] & fitted[other]
+                share = np.abs(units[other] - units[own]) / scales
+                flat = np.ones_like(share) if kind == "gaussian" else np.maximum(share, FLAT)
+                weight = np.where(joined[..., None], 1.0 / (np.square(scales) * flat), 0.0)
+                total[own] += weight
+                moment[own] += np.where(joined[..., None], weight * units[other], 0.0)
+    return moment / np.where(total > 0.0, total, 1.0), total
 
 
 class Half(NamedTuple):
@@ -88,9 +78,9 @@ def work(job: Job, task: Half) -> tuple[Floats, Floats]:
     problem = job.pilot.problem
     rows = job.pilot.texels(job.measured(task.block, task.measured)).rows(task.places)
     rows = rows._replace(centre=task.centre, inverse_sd=task.inverse_sd)
-    found = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
-    errors, finite = standard_errors(problem, found, rows)[0], found.finite[:, None]
-    return np.where(finite, found.vector, np.nan), np.where(finite, errors, np.nan)
+    best = fit_texels(problem, task.units, rows, job.options.chunk_size, fresh=False)
+    errors, finite = standard_errors(problem, best, rows)[0], best.finite[:, None]
+    return np.where(finite, best.vector, np.nan), np.where(finite, errors, np.nan)
 
 
 def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapOptions) -> None:
@@ -107,73 +97,64 @@ def smooth_map(store: Store, job: Job, data: MapData, client: Any, options: MapO
     assert prior is not None
     scales = prior.scales(names)
     said = {"kind": prior.kind, "scale": scales, "rounds": prior.rounds, "settled": options.settled}
-    said = json.loads(json.dumps(plain(said)))  # as a store gives it back
-    edges = Edges(prior.kind, np.array([scales.get(name, math.inf) for name in names]))
-    low, high = natural(problem, problem.low), natural(problem, problem.high)
+    widest = np.array([scales.get(name, math.inf) for name in names])
+    paths = [f"{group}/{name}" for group in ("values", "errors") for name in names]
 
     # where an earlier call stopped, or the plain fit
-    fitted = (np.asarray(store.arrays["flags"][...]) & FLAGS["fitted"]) != 0
-    kept, moves = store.load_group(SMOOTHED), []
-    arrays: dict[str, Any] = {path: store.arrays[path][...] for group in GIVEN for path in _paths(group, names)}
-    if kept is not None and kept[1]["prior"] == said:
+    fitted = (store.flags & FLAGS["fitted"]) != 0
+    kept, moves = store.load_group(SMOOTHED), list[float]()
+    if kept is not None and kept[1]["smoothing"]["prior"] == json.loads(json.dumps(plain(said))):
         if kept[1]["finished"]:
             return
-        arrays, moves = kept[0], list(kept[1]["largest_moves"])
-    vectors, errors = (np.stack([arrays[path] for path in _paths(group, names)], axis=-1) for group in GIVEN)
+        moves = list(kept[1]["smoothing"]["largest_moves"])
+    arrays = kept[0] if kept is not None and moves else {path: store.read(path) for path in paths}
+    vectors, errors = np.moveaxis(
+        np.stack([arrays[path] for path in paths]).reshape(2, len(names), *fitted.shape), 1, -1
+    )
 
     def units_now() -> Floats:  # whatever of texels that are not fitted
-        return to_units(problem, np.where(fitted[..., None], vectors, 1.0))
-
-    def tell() -> None:
-        note = f"the farthest moved by {moves[-1]:.2g} errors" if moves else ""
-        options.tell("smoothing", len(moves), prior.rounds, note)
+        return to_units(problem, np.where(fitted[..., None], vectors, problem.low))
 
     while len(moves) < prior.rounds and not (moves and moves[-1] <= options.settled):
-        tell()
+        note = f"the farthest moved by {moves[-1]:.2g} errors" if moves else ""
+        options.report("smoothing", len(moves), prior.rounds, note)
         before, errors_before = units_now(), errors.copy()
         for colour in (0, 1):
             units = units_now()
-            centre, precision = edges.prior_pull(units, fitted)
-            centre, inverse_sd = low + centre * (high - low), np.sqrt(precision) / (high - low)
+            centre, precision = neighbour_prior(prior.kind, widest, units, fitted)
             coloured = fitted & (np.indices(fitted.shape).sum(axis=0) % 2 == colour)
             tasks = []
             for block in blocks_of(fitted.shape, store.chunk):
                 if (mine := coloured[block]).any():
-                    at, to, inverse = (one[block][mine] for one in (units, centre, inverse_sd))
-                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse, job.sent(data, block)))
+                    at, to, inverse_sd = (one[block][mine] for one in (units, centre, np.sqrt(precision)))
+                    measured = data.read(block) if job.data is None else None
+                    tasks.append(Half(block, np.flatnonzero(mine), at, to, inverse_sd, measured))
             for index, result in run(work, job, tasks, client=client):
                 block, places, *_ = tasks[index]
                 if isinstance(result, Failure):
                     raise ValueError(
-                        f"{store.path}: smoothing of chunk {words(block)}: {result.error}; the map is fitted, and "
-                        "another run resumes after the last whole round"
+                        f"{store.path}: smoothing of chunk {block_words(block)}: {result.error}; the map is fitted, "
+                        "and another run resumes after the last whole round"
                     )
-                for whole, found in zip((vectors, errors), result, strict=True):
-                    part = whole[block].reshape(-1, len(names))  # a copy
-                    part[places] = np.where(np.isfinite(result[0]), found, part[places])
-                    whole[block] = part.reshape(whole[block].shape)
+                for whole, part in zip((vectors, errors), result, strict=True):
+                    chunk = whole[block].reshape(-1, len(names))  # a copy
+                    chunk[places] = np.where(np.isfinite(result[0]), part, chunk[places])
+                    whole[block] = chunk.reshape(whole[block].shape)
         # how far a texel moved at most, in standard errors: those of now, or of before where there are none
         error = np.where(np.isfinite(errors), errors, np.where(np.isfinite(errors_before), errors_before, np.inf))
         share = np.abs(units_now() - before) * widths(problem, vectors) / np.where(error > 0.0, error, np.inf)
         moves.append(float(np.max(share[fitted], initial=0.0)))
-        _keep(store, vectors, errors, said, moves)
-    tell()
 
-
-def _paths(group: str, names: tuple[str, ...]) -> list[str]:
-    return [f"{group}/{name}" for name in names]
-
-
-def _keep(store: Store, vectors: Floats, errors: Floats, prior: dict[str, Any], moves: list[float]) -> None:
-    """Write the state after a round; the last one is the smoothed map."""
-    settled = moves[-1] <= prior["settled"]
-    said = {"kind": "smoothed map", "prior": prior, "rounds": len(moves), "settled": settled, "largest_moves": moves}
-    said |= {"finished": settled or len(moves) == prior["rounds"], "eps": f"{FLAT:g} of the scale"}
-    arrays, attributes = {}, {}
-    for group, whole in (("values", vectors), ("errors", errors)):
-        for place, (name, path) in enumerate(zip(store.names, _paths(group, store.names), strict=True)):
-            arrays[path] = whole[..., place]
-            attributes[path] = {"units": store.units[name], "long_name": f"{name}, {GIVEN[group]}"}
-    axes = store.arrays["flags"].metadata.dimension_names
-    chunk: Any = store.chunk
-    store.save_group(SMOOTHED, arrays, said, attributes, chunks=chunk, dimension_names=axes, fill_value=np.nan)
+        # the state after a round; the last one is the smoothed map
+        settled = moves[-1] <= options.settled
+        about = {"prior": said, "rounds": len(moves), "settled": settled, "largest_moves": moves, "eps": FLAT}
+        state = np.moveaxis(np.stack([vectors, errors]), -1, 1).reshape(len(paths), *fitted.shape)
+        store.save_group(
+            SMOOTHED,
+            dict(zip(paths, state, strict=True)),
+            {"smoothing": about, "finished": settled or len(moves) == prior.rounds},
+            chunks=store.chunk,
+            dimension_names=store.arrays["flags"].metadata.dimension_names,
+            fill_value=np.nan,
+        )
+    options.report("smoothing", len(moves), prior.rounds)

@@ -8,12 +8,9 @@ lock); readers change nothing.
 """
 
 import asyncio
-import glob
 import itertools
 import os
 import shutil
-import tempfile
-import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -25,14 +22,15 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
 from zarr.core.sync import sync
 
-from fits._files import named, permissions, plain, require_there
+from fits._files import named, plain, require_there
 from fits._lazy import shown_by
+from fits.engines.failures import one_line
 from fits.maps.inputs import UNREADABLE, Block
 from fits.store import another, differences
 
 Floats = NDArray[np.float64]
 
-ROOT, KEY, KIND, FORMAT = "zarr.json", "layerjax", "fitted map", 4
+KEY, KIND, FORMAT = "layerjax", "fitted map", 5
 PILOT, SMOOTHED = "pilot", "smoothed"
 PARTIAL = ".partial"
 """How names end, here and in zarr, of what has not been written to its end."""
@@ -51,9 +49,18 @@ FLAGS = {
 """Meaning and bit of what `flags` says of a texel; 0: it is not there yet."""
 
 NO_START = -32768
-"""In ``start``: the texel is not fitted. Others: -1 a neighbour's values, -2 random ones, else the start's number."""
+"""In ``start``: the texel is not fitted. Others: -1 a neighbour's values, else the number of the start."""
 
 CHECKSUM = (Crc32cCodec(),)
+
+DESCRIPTIONS: dict[str, dict[str, Any]] = {
+    "reduced_chi_square": {"long_name": "chi-square per degree of freedom"},
+    "start": {"long_name": f"start of the best fit; -1: a neighbour's values, {NO_START}: none"},
+    "at_bound": {"long_name": "bit p: parameter p, in the order of the root's names, is at a bound"},
+    "measurements": {"long_name": "how many measurements entered"},
+    "flags": {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)},
+}
+"""Attributes of arrays by the CF conventions."""
 
 
 def arrays_of(names: Sequence[str]) -> dict[str, tuple[np.dtype, Any]]:
@@ -71,10 +78,9 @@ def arrays_of(names: Sequence[str]) -> dict[str, tuple[np.dtype, Any]]:
 
 def blocks_of(shape: Sequence[int], chunk: Sequence[int]) -> Iterator[Block]:
     """The parts of an array that its chunks hold, last axis fastest."""
-    for place in itertools.product(*(range(-(-size // side)) for size, side in zip(shape, chunk, strict=True))):
-        yield tuple(
-            slice(at * side, min((at + 1) * side, size)) for at, size, side in zip(place, shape, chunk, strict=True)
-        )
+    edges = [range(0, size, side) for size, side in zip(shape, chunk, strict=True)]
+    for place in itertools.product(*edges):
+        yield tuple(slice(at, min(at + side, size)) for at, side, size in zip(place, chunk, shape, strict=True))
 
 
 # ---- reading ----
@@ -83,7 +89,7 @@ def blocks_of(shape: Sequence[int], chunk: Sequence[int]) -> Iterator[Block]:
 class FittedMap:
     """Parameters of every texel of a map, with errors and flags; arrays are read when they are accessed.
 
-    Of a store that still grows the parts that are not there have flags of 0; asking again reads again.
+    Of a store that still grows the parts that are not there have flags of 0; a later access reads again.
     `map["values/base.albedo"]` is the array of zarr, to be read in parts.
 
     Attributes:
@@ -108,7 +114,7 @@ class FittedMap:
                 if array.shape != self.shape:
                     raise ValueError(f"{name} has shape {array.shape}, must be {self.shape}")
         except Exception as error:  # whatever a description that is none leads to
-            raise ValueError(f"{path}: damaged, {type(error).__name__} {' '.join(str(error).split())}") from None
+            raise ValueError(f"{path}: damaged, {type(error).__name__} {one_line(error)}") from None
 
     @cached_property
     def arrays(self) -> dict[str, Any]:
@@ -138,15 +144,8 @@ class FittedMap:
     @property
     def smoothing(self) -> dict[str, Any] | None:
         """How the map was smoothed: its prior, rounds, largest moves, whether it settled; None if it was not."""
-        try:
-            about: Any = self.root[SMOOTHED].attrs[KEY]
-        except KeyError:
-            return None
-        return (
-            {name: one for name, one in about.items() if name not in ("arrays", "finished")}
-            if about["finished"]
-            else None
-        )
+        about: Any = self.root[SMOOTHED].attrs[KEY] if SMOOTHED in self.root else {}
+        return about["smoothing"] if about.get("finished") else None
 
     @property
     def reduced_chi_square(self) -> Floats:
@@ -155,12 +154,12 @@ class FittedMap:
 
     @property
     def flags(self) -> NDArray[np.uint16]:
-        """What became of every texel, in bits (see `has`); 0: it is not there yet."""
+        """The state of every texel, in bits (see `has`); 0: it is not there yet."""
         return self.read("flags")
 
     @property
     def start(self) -> NDArray[np.int16]:
-        """Which start the best fit came from; -1: a neighbour's values, -2: random ones, -32768: it is not fitted."""
+        """Which start the best fit came from; -1: a neighbour's values, -32768: it is not fitted."""
         return self.read("start")
 
     @property
@@ -183,7 +182,7 @@ class FittedMap:
     @property
     def done(self) -> float:
         """The share of texels that are there."""
-        return float(np.count_nonzero(self.flags)) / float(np.prod(self.shape))
+        return float(np.mean(self.flags != 0))
 
     def has(self, meaning: str) -> NDArray[np.bool_]:
         """Which texels have a flag.
@@ -200,11 +199,10 @@ class FittedMap:
         """A number of the `MapOptions` that the map was fitted with."""
         from fits.maps.options import MapOptions
 
-        return self.attributes.get("options", {}).get(name, getattr(MapOptions, name))
+        return self.attributes["options"].get(name, getattr(MapOptions, name))
 
     def __getitem__(self, path: str) -> "zarr.Array[Any]":
-        own = path.removeprefix(f"{SMOOTHED}/")
-        if own not in self.arrays or (own != path and self.smoothing is None):
+        if path.removeprefix(f"{SMOOTHED}/") not in self.arrays or path not in self.root:
             raise KeyError(f"{path!r} is not one of {', '.join(self.arrays)}")
         return self.root[path]  # type: ignore[return-value]
 
@@ -214,14 +212,14 @@ class FittedMap:
         try:
             return np.asarray(array[...])
         except Exception as error:  # codecs raise what they like
-            raise ValueError(f"{self.path}/{path}: damaged, {' '.join(str(error).split())}") from None
+            raise ValueError(f"{self.path}/{path}: damaged, {one_line(error)}") from None
 
     def __repr__(self) -> str:
         size = " x ".join(map(str, self.shape))
         return f"<FittedMap of {size} texels, {100.0 * self.done:.4g} % done: {', '.join(self.names)}; {self.path}>"
 
     def _repr_html_(self) -> str:
-        return str(shown_by("fits.maps.report.verdicts:fragment", self))
+        return str(shown_by("fits.maps.report.summary:fragment", self))
 
 
 class _Arrays(Mapping[str, Floats]):
@@ -233,17 +231,14 @@ class _Arrays(Mapping[str, Floats]):
     def __getitem__(self, name: str) -> Floats:
         if name not in self._map.names:
             raise KeyError(f"{name!r} is not one of {', '.join(self._map.names)}")
-        found: Floats = self._map.read(f"{self._group}/{name}")
-        return found
+        array: Floats = self._map.read(f"{self._group}/{name}")
+        return array
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._map.names)
 
     def __len__(self) -> int:
         return len(self._map.names)
-
-    def __repr__(self) -> str:
-        return f"<{self._group} of {', '.join(self)}, each {' x '.join(map(str, self._map.shape))}>"
 
 
 def open_map(path: str | Path) -> FittedMap:
@@ -260,70 +255,16 @@ def _attributes(path: Path) -> dict[str, Any]:
     """What the root of a store says under our key; ValueError for what is no such store."""
     require_there(path, "no such file or directory")
     try:
-        found: Any = zarr.open_group(path, mode="r").attrs[KEY]
-        if found["kind"] == KIND:
-            return found
-        reason = f"it holds a {found['kind']}"
+        about: Any = zarr.open_group(path, mode="r").attrs[KEY]
+        if about["kind"] == KIND:
+            return about
+        reason = f"it holds a {about['kind']}"
     except Exception as error:  # whatever else stands there
-        reason = " ".join(f"{type(error).__name__} {error}".split())
+        reason = f"{type(error).__name__} {one_line(error)}"
     raise ValueError(f"{path}: is no store of a {KIND}, as `layerjax fit-map` writes it ({reason})")
 
 
 # ---- writing ----
-
-
-def create(
-    path: Path,
-    *,
-    names: Sequence[str],
-    units: Mapping[str, str],
-    shape: Sequence[int],
-    chunk: Sequence[int],
-    attributes: Mapping[str, Any],
-) -> "Store":
-    """Make an empty store, whole or not at all.
-
-    Args:
-        names, units: of the parameters, at most 32 (the bits of ``at_bound``); "1" for plain ratios.
-        chunk: texels along each axis of what is written at once.
-        attributes: what else the root says under the key "layerjax", such as how the map was fitted.
-
-    Raises:
-        ValueError: there is something at `path`.
-    """
-    if os.path.lexists(path):
-        raise ValueError(f"{path}: exists already")
-    about = {"kind": KIND, "format": FORMAT, "names": list(names), "units": {name: units[name] for name in names}}
-    about |= {"shape": list(shape), "chunk": list(chunk)}
-    described: dict[str, dict[str, Any]] = {  # by the CF conventions
-        "reduced_chi_square": {"long_name": "chi-square per degree of freedom"},
-        "start": {"long_name": f"start of the best fit; -1: a neighbour's values, -2: random ones, {NO_START}: none"},
-        "at_bound": {"long_name": "bit p: parameter p, in the order of the root's names, is at a bound"},
-        "measurements": {"long_name": "how many measurements entered"},
-        "flags": {"flag_masks": list(FLAGS.values()), "flag_meanings": " ".join(FLAGS)},
-    }
-    axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
-    with named(path):
-        new = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=PARTIAL, dir=path.resolve().parent))
-        try:
-            root = zarr.create_group(new, attributes={KEY: plain({**attributes, **about})})
-            for name, (dtype, fill) in arrays_of(names).items():
-                root.create_array(
-                    name,
-                    shape=tuple(shape),
-                    chunks=tuple(chunk),
-                    dtype=dtype,
-                    fill_value=fill,
-                    compressors=CHECKSUM,
-                    dimension_names=axes,
-                    attributes=described.get(name) or {"units": units[name.partition("/")[2]]},
-                )
-            os.chmod(new, permissions(0o777))  # mkdtemp makes what only its owner can read
-            os.rename(new, path)
-        except BaseException:
-            shutil.rmtree(new, ignore_errors=True)
-            raise
-    return Store(path)
 
 
 class Store(FittedMap):
@@ -338,56 +279,45 @@ class Store(FittedMap):
         results: by path, such as ``"values/base.albedo"``, the block's numbers of every array.
         """
 
-        async def write(names: Iterable[str]) -> None:  # together, which takes half the time
-            parts = {name: np.asarray(results[name], array.dtype) for name, array in self.arrays.items()}
-            await asyncio.gather(*(self.arrays[name].async_array.setitem(block, parts[name]) for name in names))
+        async def write(names: Iterable[str]) -> None:  # at once, which takes half the time
+            parts = {name: np.asarray(results[name], self.arrays[name].dtype) for name in names}
+            await asyncio.gather(*(self.arrays[name].async_array.setitem(block, part) for name, part in parts.items()))
 
         with named(self.path):
             os.stat(self.path)  # one that was removed is not made again
             sync(write(self.arrays.keys() - {"flags"}))
             sync(write(["flags"]))
 
-    def whole(self, block: Block = ()) -> NDArray[np.uint16] | None:
-        """The flags of a part of the map; None if it is not whole: a flag is 0, an array is damaged or lacks values."""
+    def is_whole(self, block: Block = ()) -> bool:
+        """Whether a part of the map is there: no flag is 0, no array is damaged or lacks values."""
         try:
-            found = {name: np.asarray(array[block]) for name, array in self.arrays.items()}
+            parts = {name: np.asarray(array[block]) for name, array in self.arrays.items()}
         except Exception:  # codecs raise what they like
-            return None
-        fitted = (found["flags"] & FLAGS["fitted"]) != 0
-        lacking = [name for name in self.names if not np.isfinite(found[f"values/{name}"][fitted]).all()]
-        return None if lacking or not found["flags"].all() else found["flags"]
+            return False
+        fitted = (parts["flags"] & FLAGS["fitted"]) != 0
+        return bool(parts["flags"].all()) and all(np.isfinite(parts[f"values/{n}"][fitted]).all() for n in self.names)
 
     def unfinished(self) -> list[Block]:
         """The chunks that are not there whole, in their order."""
-        if self.whole() is not None:  # at once, much faster than one by one
+        if self.is_whole():  # at once, much faster than one by one
             return []
-        return [block for block in blocks_of(self.shape, self.chunk) if self.whole(block) is None]
+        return [block for block in blocks_of(self.shape, self.chunk) if not self.is_whole(block)]
 
     def clean(self) -> None:
         """Remove what writers that were killed left of files; none may be writing."""
         for path in list(self.path.rglob(f"*{PARTIAL}")):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
-    def save_group(
-        self,
-        name: str,
-        arrays: Mapping[str, np.ndarray],
-        about: Mapping[str, Any],
-        attributes: Mapping[str, Mapping[str, Any]] | None = None,
-        **options: Any,
-    ) -> None:
-        """Write a group of arrays, whole or not at all, in place of what is there. OSError: named.
-
-        attributes: of the arrays. options: of all, as zarr takes them.
-        """
+    def save_group(self, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], **options: Any) -> None:
+        """Write a group of arrays with what it says of itself, whole or not at all, in place of what is there; options:
+        of the arrays, as zarr takes them. OSError: named."""
         place, new = self.path / name, self.path / f"{name}{PARTIAL}"
         with named(self.path):
             shutil.rmtree(new, ignore_errors=True)
             try:
                 group = self.root.create_group(new.name)
                 for path, array in arrays.items():
-                    own, numbers = dict((attributes or {}).get(path, {})), np.ascontiguousarray(array)
-                    group.create_array(path, data=numbers, compressors=CHECKSUM, attributes=own, **options)
+                    group.create_array(path, data=np.ascontiguousarray(array), compressors=CHECKSUM, **options)
                 group.attrs.update({KEY: {"arrays": list(arrays), **plain(about)}})
             except BaseException:
                 shutil.rmtree(new, ignore_errors=True)
@@ -405,22 +335,52 @@ class Store(FittedMap):
             return None
 
 
-# ---- whose map it is ----
+def create(path: Path, attributes: Mapping[str, Any]) -> Store:
+    """Make an empty store, whole or not at all, in place of what is there.
+
+    attributes: what the root says under the key "layerjax": the names of the parameters, at most 32 (the bits of
+    ``at_bound``), their units, the shape and the chunk (texels along each axis) of the map, and how it was fitted.
+    """
+    names, units, shape = attributes["names"], attributes["units"], tuple(attributes["shape"])
+    axes = {1: ["texel"], 2: ["row", "column"]}.get(len(shape), [f"axis_{axis}" for axis in range(len(shape))])
+    new, old = _scratch(path)
+    with named(path):
+        try:
+            root = zarr.create_group(new, attributes={KEY: plain({**attributes, "kind": KIND, "format": FORMAT})})
+            for name, (dtype, fill) in arrays_of(names).items():
+                root.create_array(
+                    name,
+                    shape=shape,
+                    chunks=tuple(attributes["chunk"]),
+                    dtype=dtype,
+                    fill_value=fill,
+                    compressors=CHECKSUM,
+                    dimension_names=axes,
+                    attributes=DESCRIPTIONS.get(name) or {"units": units[name.partition("/")[2]]},
+                )
+        except BaseException:
+            shutil.rmtree(new, ignore_errors=True)
+            raise
+        if os.path.lexists(path):
+            os.rename(path, old)
+        os.rename(new, path)
+        shutil.rmtree(old, ignore_errors=True)
+    return Store(path)
 
 
 def resume(path: Path, identity: Mapping[str, str], measurements: Sequence[str], force: bool) -> Store | None:
     """The store that is there, if it is of the same fit, without what killed writers left; None: there is none, or one
-    to `throw_away`.
+    to be replaced.
 
     Args:
         identity: fingerprints of what makes this fit, by name.
         measurements: those of the data, part by part.
-        force: throw away a map of another fit, or a damaged one.
+        force: replace a map of another fit, or a damaged one.
 
     Raises:
         ValueError: something else is there, or a map of another fit (it names what differs), or a damaged one.
     """
-    for unfinished in path.resolve().parent.glob(f".{glob.escape(path.name)}.*{PARTIAL}"):
+    for unfinished in _scratch(path):
         shutil.rmtree(unfinished, ignore_errors=True)
     if not os.path.lexists(path):
         return None
@@ -443,9 +403,6 @@ def resume(path: Path, identity: Mapping[str, str], measurements: Sequence[str],
     return store
 
 
-def throw_away(path: Path) -> None:
-    """Remove the map that is there, if there is one; what is left of it where that is stopped `resume` takes away."""
-    if os.path.lexists(path):
-        old = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PARTIAL}")
-        os.rename(path, old)
-        shutil.rmtree(old)
+def _scratch(path: Path) -> tuple[Path, Path]:
+    """Where a store is made, and where one goes that is thrown away: of the one process that holds the lock."""
+    return path.with_name(f".{path.name}.new{PARTIAL}"), path.with_name(f".{path.name}.old{PARTIAL}")

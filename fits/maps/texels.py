@@ -53,8 +53,8 @@ class Texels(NamedTuple):
 
     values, variance, lowest: (M, N, C), BSDF in 1/sr, the measurement's own variance, enormous for what is omitted,
     and what sigma cannot fall below. used: (M, N, C) bool. wi, wo: (M, N, 3), None where all texels have the directions
-    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the coordinate of
-    `Box.centre`; None where there are none.
+    of the problem. centre, inverse_sd: (M, P), of Gaussian priors beside those of the problem, in the unit box; None
+    where there are none.
     """
 
     values: Any
@@ -114,9 +114,11 @@ def model_of(model: Model, row: Texels) -> Model:
         model = eqx.tree_at(lambda m: (m.wi, m.wo), model, (row.wi, row.wo))
     if row.centre is None:
         return model
-    # the product of two Gaussians, up to a constant
-    box, own, other = model.box, jnp.square(model.box.inverse_sd), jnp.square(row.inverse_sd)
-    mean = (own * box.centre + other * row.centre) / jnp.where(own + other > 0.0, own + other, 1.0)
+    # the product of two Gaussians, up to a constant, in the coordinate of `Box.centre`
+    box, vector = model.box, model.box.from_unit(row.centre)
+    centre = jnp.where(box.logarithmic, jnp.log(jnp.where(box.logarithmic, vector, 1.0)), vector)
+    own, other = jnp.square(box.inverse_sd), jnp.square(row.inverse_sd / box.slope(jnp.ones_like(vector)))
+    mean = (own * box.centre + other * centre) / jnp.where(own + other > 0.0, own + other, 1.0)
     box = replace(box, centre=mean, inverse_sd=jnp.sqrt(own + other))
     return eqx.tree_at(lambda m: m.box, model, box)
 
@@ -170,14 +172,12 @@ class Fits(NamedTuple):
             raise ValueError("values: no texel of the pilot has a finite fit; are they in 1/sr?")
         return np.unique(vectors, axis=0)
 
-    def better(self, other: "Fits", rows: Any) -> Truths:
-        """Where another one, of these rows, is lower by more than is left to gain, (len(rows),) bool."""
-        return np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
-
-    def put(self, rows: Any, other: "Fits") -> None:
-        """Take over another one at these rows."""
+    def improve(self, rows: Integers, other: "Fits") -> Truths:
+        """Take over other fits of these rows where they are lower by more than is left to gain; which, (len(rows),)."""
+        lower = np.asarray(other.cost < self.cost[rows] - 10.0 * COST_TOLERANCE)
         for mine, theirs in zip(self, other, strict=True):
-            mine[rows] = theirs
+            mine[rows[lower]] = theirs[lower]
+        return lower
 
 
 def fit_texels(
@@ -217,51 +217,45 @@ def linearise_at(problem: Problem, units: Floats, size: int) -> Linearisation:
     return Linearisation(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def natural(problem: Problem, vectors: Floats) -> Floats:
-    """Vectors (..., P) in the coordinate where the box is even: logarithms for some priors."""
-    logarithmic = np.asarray(problem.model.box.logarithmic)
-    return np.where(logarithmic, np.log(np.where(logarithmic, vectors, 1.0)), vectors)
-
-
 def to_units(problem: Problem, vectors: Floats) -> Floats:
     """Vectors (..., P) in the unit box."""
-    low, high = natural(problem, problem.low), natural(problem, problem.high)
-    return np.clip((natural(problem, vectors) - low) / (high - low), 0.0, 1.0)
+    return np.clip(np.asarray(problem.model.box.to_unit(jnp.asarray(vectors)), float), 0.0, 1.0)
 
 
 def widths(problem: Problem, vectors: Floats) -> Floats:
-    """Of the box in physical units at vectors (..., P)."""
-    even = natural(problem, problem.high) - natural(problem, problem.low)
-    return even * np.where(np.asarray(problem.model.box.logarithmic), vectors, 1.0)
+    """The width of the box in physical units at vectors (..., P)."""
+    return np.asarray(problem.model.box.slope(jnp.asarray(vectors)), float)
 
 
-def standard_errors(problem: Problem, found: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
+def held_by_bounds(unit: Floats, gradient: Floats, least: Any = LEAST_GRADIENT) -> Truths:
+    """Which parameters lie on a bound of the unit box and would go beyond it; least: gradient that counts."""
+    return ((unit <= ON_BOUND) & (gradient > least)) | ((unit >= 1.0 - ON_BOUND) & (gradient < -least))
+
+
+def standard_errors(problem: Problem, fits: Fits, texels: Texels) -> tuple[Floats, Truths, Truths]:
     """As `fits.optimise.uncertainty`, of M fits: standard errors (M, P), NaN where a bound holds the parameter and
     infinite where nothing does; which are at a bound, (M, P); in which texels the data leave a parameter unidentified,
     (M,)."""
-    count = found.unit.shape[1]
-    scatter = np.ones((len(found.cost), 1))  # what a difference in cost is measured in
+    count = fits.unit.shape[1]
+    scatter = np.ones((len(fits.cost), 1))  # what a difference in cost is measured in
     if problem.objective != "likelihood":
         freedom = np.maximum(texels.measurements - count, 1)
-        scatter = np.maximum(2.0 * found.cost / freedom, np.finfo(float).tiny)[:, None]
-    root, known = found.root / np.sqrt(scatter)[..., None], found.finite & np.isfinite(found.root).all((1, 2))
+        scatter = np.maximum(2.0 * fits.cost / freedom, np.finfo(float).tiny)[:, None]
+    root, known = fits.root / np.sqrt(scatter)[..., None], fits.finite & np.isfinite(fits.root).all((1, 2))
     root = np.where(known[:, None, None], root, 0.0)
     insensitive = np.linalg.norm(root, axis=1) * UNKNOWN_BEYOND < 1.0
-    up, down = found.gradient < -LEAST_GRADIENT * scatter, found.gradient > LEAST_GRADIENT * scatter
-    at_bound = ((found.unit <= ON_BOUND) & down) | ((found.unit >= 1.0 - ON_BOUND) & up)
-    at_bound &= ~insensitive & known[:, None]
+    at_bound = held_by_bounds(fits.unit, fits.gradient, LEAST_GRADIENT * scatter) & ~insensitive & known[:, None]
     unidentified = (np.linalg.svd(root, compute_uv=False)[:, -1] < 1.0 / UNIDENTIFIED_BEYOND) | ~known
     prior = np.asarray(problem.model.box.prior_slopes())
     prior = prior[prior.any(axis=1)]
     prior = np.broadcast_to(prior, (len(root), *prior.shape))
     if texels.inverse_sd is not None:
-        even = natural(problem, problem.high) - natural(problem, problem.low)
-        prior = np.concatenate([prior, (texels.inverse_sd * even)[:, :, None] * np.eye(count)], axis=1)
+        prior = np.concatenate([prior, texels.inverse_sd[:, :, None] * np.eye(count)], axis=1)
     rows = np.where(at_bound[:, None], 0.0, np.concatenate([root, prior], axis=1))
     _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
-    least = np.maximum(np.finfo(found.root.dtype).eps * count * sizes[:, :1], 1.0 / LARGEST_ERROR)
+    least = np.maximum(np.finfo(fits.root.dtype).eps * count * sizes[:, :1], 1.0 / LARGEST_ERROR)
     spread = np.linalg.norm(directions / np.maximum(sizes, least)[..., None], axis=1)
-    errors = spread * widths(problem, found.vector)
+    errors = spread * widths(problem, fits.vector)
     errors = np.where((spread > UNKNOWN_BEYOND) | ~known[:, None], np.inf, errors)
     return np.where(at_bound, np.nan, errors), at_bound, unidentified
 
@@ -413,7 +407,7 @@ def _linearise(model: Model, vector: Array) -> Linearisation:
 
 
 def _options(model: Model, fresh: Array, most_steps: Array) -> dict[str, Any]:
-    """Of the solver."""
+    """The options of the solver."""
     options: dict[str, Any] = {"damping": jnp.where(fresh, FIRST_DAMPING, NEARBY), "most_steps": most_steps}
     if model.objective == "likelihood":
         options |= {"tolerance": COST_TOLERANCE} | ({"logarithmic": model.logarithmic} if model.varying else {})

@@ -7,12 +7,14 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 import layerjax as lj
 from benchmarks.studies.accelerator import study
 from benchmarks.studies.accelerator.tasks import Task
 
 
+@pytest.mark.slow
 def test_a_tiny_run_writes_whole_files_and_keeps_other_rows(tmp_path: Path) -> None:
     lines: list[str] = []
     value = Task("interface over metal, 2007", 16)

@@ -79,6 +79,7 @@ def test_the_material_that_is_fitted_agrees_with_its_numpy_model() -> None:
     np.testing.assert_allclose(fitting.model(fitting.TRUTH, wi, wo), values[:, 0], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_a_tiny_throughput_run_writes_whole_files(tmp_path: Path) -> None:
     text, paths = throughput.study(
         with_peers=False,
@@ -113,6 +114,7 @@ def test_a_tiny_run_of_maps_writes_whole_files(tmp_path: Path, monkeypatch: pyte
     assert textured.measure(few[0], "float32", 20_000, hurried, with_peers=False).texels == textured.PROBED
 
 
+@pytest.mark.slow
 def test_a_tiny_recovery_run_writes_whole_files(tmp_path: Path) -> None:
     text, paths = recovery.study(directory=tmp_path, size=recovery.Size(repeats=2, many=4))
     content = json.loads(paths[0].read_text())

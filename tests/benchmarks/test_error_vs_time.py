@@ -85,6 +85,27 @@ def test_differences_that_timings_cannot_tell_are_no_figures() -> None:
     assert error_tables.time_of_a_value([*found, found[0]], called=False) == "25.0"
 
 
+def test_one_stack_writes_whole_files(tmp_path: Path) -> None:
+    """Haze, which compiles fast."""
+    haze = lj.Stack([lj.Medium(0.2, 0.5, lj.HenyeyGreenstein(0.3))])
+    solver, walk = lj.AddingDoubling(nodes=4, modes=4), lj.RandomWalk(paths=256)
+    models = [Model("single scattering", MODELS[0].steps), Model("solver", {"4": solver})]
+    text, paths = error_vs_time.study(
+        directory=tmp_path,
+        cases=[Case("thin_haze", "transmitting_slabs", "here", "A remark.", haze)],
+        models=models,
+        references=References(truth=solver, check=walk, solver=solver, walk=walk),
+        size=Size(batch=32, walked_opaque=5, walked_transmitting=8, rounds=1),
+    )
+    assert sorted(paths) == sorted(tmp_path.iterdir())
+    content = json.loads((tmp_path / "error-vs-time.json").read_text())
+    assert (tmp_path / "error-vs-time.md").read_text() == text
+    rows = {row["model"]: row for row in content["rows"]}
+    assert rows["solver"]["l2"] < 1e-12  # it is its own truth here
+    assert 0.005 < rows["single scattering"]["l2"] < 0.2
+
+
+@pytest.mark.slow
 def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     """One channel, few nodes and paths: the harness, not the models, is tested."""
     directory = tmp_path / "new"

@@ -98,6 +98,7 @@ def test_a_tiny_run_writes_whole_files(tmp_path: Path) -> None:
     assert "left out" in text
 
 
+@pytest.mark.slow
 def test_scipy_begins_where_fits_of_the_map_do_and_ends_as_low() -> None:
     """A texel's cost at the truth is above both."""
     with given(FLAKES, 8) as one:

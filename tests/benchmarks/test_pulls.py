@@ -8,6 +8,7 @@ import layerjax as lj
 from benchmarks.studies.pulls import cases, run
 
 
+@pytest.mark.slow
 def test_a_mixture_is_recovered():
     case = next(cases.of_mixtures(6))
     rows = run.run_case("mixtures", case)
@@ -18,6 +19,7 @@ def test_a_mixture_is_recovered():
     assert "coat on 30% of a metal" in run._table(rows, of_tables=False)
 
 
+@pytest.mark.slow
 def test_an_instrument_is_part_of_one_problem_and_not_of_the_other():
     found, without = (case for case, _ in zip(cases.by_instruments(2), range(2), strict=False))
     assert found.truth["instrument.tilt"] == cases.LEANS

@@ -27,6 +27,7 @@ def test_verdicts(shift: float, effective: float, verdict: str) -> None:
     assert samplers._row(PLAIN, PLAIN)[-1] == "-"
 
 
+@pytest.mark.slow
 def test_a_tiny_run_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("blackjax")
     options = {"posteriors": {"line": line_fit}, "ess": 300.0}

@@ -66,14 +66,8 @@ def stored(
 ) -> FittedMap:
     """A store of these arrays, of which the first `chunks` chunks are written; more: attributes."""
     shape = found["flags"].shape
-    store = create(
-        path,
-        names=NAMES,
-        units=UNITS,
-        shape=shape,
-        chunk=tuple(map(min, chunk, shape)),
-        attributes=ATTRIBUTES | more,
-    )
+    chunk = tuple(map(min, chunk, shape))
+    store = create(path, ATTRIBUTES | {"names": NAMES, "units": UNITS, "shape": shape, "chunk": chunk} | more)
     for block in list(blocks_of(shape, store.chunk))[:chunks]:
         store.write(block, {name: values[block] for name, values in found.items()})
     return open_map(path)

@@ -1,17 +1,23 @@
 """A small map of a coat over a diffuse base that is fitted in no time, in memory and as the files of a user."""
 
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import fits
 import layerjax as lj
 from fits.data.geometry import Geometry
 from fits.maps.options import MapOptions
 from fits.maps.store import FittedMap
+from tests.helpers.files import contents
 
 TRANSPORT, NOISE = lj.SingleScattering(), fits.Noise(relative=0.02)
 NAMES = ("layers[0].thickness", "base.albedo")
@@ -96,9 +102,24 @@ def command(folder: Path, out: Path, *more: str) -> list[str]:
 
 def assert_same(found: FittedMap, expected: FittedMap) -> None:
     """To the bit: every file of the stores."""
-    one, other = _files(found.path), _files(expected.path)
+    one, other = (
+        {path.removeprefix(str(map.path)): content for path, content in contents(map.path).items()}
+        for map in (found, expected)
+    )
     assert {name for name in {*one, *other} if one.get(name) != other.get(name)} == set()
 
 
-def _files(store: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(store)): path.read_bytes() for path in sorted(store.rglob("*")) if path.is_file()}
+@contextmanager
+def full_disk(monkeypatch: pytest.MonkeyPatch, after: int | None) -> Iterator[None]:
+    """A disk that is full after so many files that zarr writes; None: it never is."""
+    replace, written = Path.replace, []
+
+    def full(source: Path, target: Path) -> Path:
+        written.append(target)
+        if after is not None and len(written) > after:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(source))
+        return replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full)
+        yield

@@ -1,11 +1,17 @@
-"""Work for engines to do, importable by the processes that do it."""
+"""Work for engines, importable by the processes that execute it, and programs that are started and killed."""
 
 import errno
 import os
 import signal
+import subprocess
+import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from tests.helpers.places import ROOT
 
 
 def square(shared: Any, task: int) -> int:
@@ -54,10 +60,6 @@ def endless(shared: str, task: int) -> None:
     time.sleep(100.0)
 
 
-def unpicklable(shared: Any, task: Any) -> Any:
-    return lambda: task
-
-
 def surroundings(shared: Any, task: Any) -> dict[str, Any]:
     """What JAX is set to where the task runs, after it has computed."""
     import jax
@@ -70,7 +72,40 @@ def surroundings(shared: Any, task: Any) -> dict[str, Any]:
         "cache": jax.config.values["jax_compilation_cache_dir"],
         "least": jax.config.values["jax_persistent_cache_min_compile_time_secs"],
         "flags": os.environ.get("XLA_FLAGS", ""),
-        "cores": sorted(os.sched_getaffinity(0)),
+        "threads": os.environ.get("NPROC"),
         "interrupts": signal.getsignal(signal.SIGINT) == signal.SIG_IGN,
         "shared": shared,
     }
+
+
+@contextmanager
+def started(words: list[str], *paths: Path) -> Iterator[subprocess.Popen[str]]:
+    """A program of Python in a process group of its own, with these paths to import from; killed in the end."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))}
+    environment |= {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring is inherited
+    try:
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        process = subprocess.Popen([sys.executable, *words], env=environment, start_new_session=True, **pipes)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def running(process: int) -> bool:
+    """Whether a process is there, and no zombie."""
+    with suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 120.0) -> None:
+    """Wait for a condition, or fail."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came to that"
+        time.sleep(0.002)

@@ -41,7 +41,7 @@ STRUCTURES = {
 
 
 QUICK = {
-    (np.float32, "reverse"): tuple(STRUCTURES),
+    (np.float32, "reverse"): tuple(name for name in STRUCTURES if name != "three layers"),
     (np.float64, "reverse"): ("tilted fibers", "conductor"),
     (np.float32, "forward"): ("surface flakes", "haze on rough diffuse"),
 }
@@ -112,12 +112,12 @@ def test_no_draw_gains_energy(name):
 
 def test_tangent_and_unnormalised_directions_give_no_nan():
     """Traced directions cannot be refused."""
-    stack = lj.Stack(three({k: v[0] for k, v in draw(1)[0].items()}))
+    layers = three({k: v[0] for k, v in draw(1)[0].items()})  # each in a stack of its own, over another base
     odd = jnp.array([[1.0, 0, 0], [0, 0, 0], [2, 2, 2], [1, 0, 1e-30], [0, 0, 1e-8], [0, 0, -3], [1e-20, 0, 1e-20]])
     bases = (None, lj.Conductor(0.2, 3.0, 0.1), lj.OrenNayar(0.5, 0.5))
-    for base, dtype in zip(bases, (jnp.float32, jnp.float64, jnp.float32), strict=True):
+    for base, layer, dtype in zip(bases, layers, (jnp.float32, jnp.float64, jnp.float32), strict=True):
         wi, wo = odd[:, None].astype(dtype), odd[None].astype(dtype)
-        whole = lj.Stack(stack.layers, base)
+        whole = lj.Stack([layer], base)
 
         def values(stack, a, b):
             return lj.evaluate(stack, a, b, SINGLE), lj.pdf(stack, a, b, SINGLE)
@@ -131,7 +131,9 @@ def test_tangent_and_unnormalised_directions_give_no_nan():
         assert all(np.isfinite(array).all() for array in jax.tree.leaves(all_of(whole, wi, wo)))
 
 
-@pytest.mark.parametrize("name", STRUCTURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "three layers")) for name in STRUCTURES]
+)
 def test_albedo_and_what_passes_straight_through_stay_below_one(name):
     make, some = STRUCTURES[name], slice(0, POINTS, 100)
     parameters, wi, _ = jax.tree.map(lambda x: x[some], draw(14))

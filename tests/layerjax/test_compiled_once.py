@@ -85,7 +85,7 @@ def carried(name, transport, call):
     return True
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("name", "transport", "call"),
     [

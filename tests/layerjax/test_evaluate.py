@@ -57,6 +57,7 @@ def test_an_empty_stack_is_nothing_at_all():
     assert all((share == 0).all() for share in lj.albedo(empty, wi, SINGLE))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_large_batches_run_in_chunks_with_the_same_result(dtype):
     chunk = CHUNK_BYTES // np.dtype(dtype).itemsize

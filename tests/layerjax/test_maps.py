@@ -58,7 +58,7 @@ CASES = {
 }
 
 
-LONG = ("AddingDoubling, light passes", "AddingDoubling, ordinates")
+LONG = ("SpongeCake", "Statistical", "AddingDoubling, light passes", "AddingDoubling, ordinates")
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in CASES])
@@ -90,7 +90,7 @@ def test_random_walks_of_a_map():
         assert (jnp.abs(values[k] - value) < 5.0 * jnp.sqrt(2.0) * error).all()
 
 
-@pytest.mark.parametrize("transport", [lj.SingleScattering(), lj.SpongeCake()])
+@pytest.mark.parametrize("transport", [lj.SingleScattering(), pytest.param(lj.SpongeCake(), marks=pytest.mark.slow)])
 def test_everything_takes_maps(transport):
     whole = haze(slice(None))
     wo, density, weight = lj.sample(whole, WI, jax.random.key(0), transport)
@@ -173,8 +173,7 @@ def test_an_axis_that_is_the_normal_stays_so():
     """Media that are symmetric about it are solved in modes, in a map as well."""
 
     def stack_of(k):
-        flakes = lj.SGGX("fiber", ALPHA[k], (0.0, 0.0, 2.0))
-        return lj.Stack([lj.Interface(1.5, 0.3), lj.Medium(1.0, 0.8, flakes)], lj.Lambertian(0.5))
+        return lj.Stack([lj.Medium(1.0, 0.8, lj.SGGX("fiber", ALPHA[k], (0.0, 0.0, 2.0)))], lj.Lambertian(0.5))
 
     values = lj.evaluate(stack_of(slice(None)), WI, WO, SOLVER)
     np.testing.assert_allclose(values[2], lj.evaluate(stack_of(2), WI[2], WO[2], SOLVER), rtol=1e-9)

@@ -12,17 +12,24 @@ BARE = lj.Stack([], lj.Conductor([0.2, 0.4, 1.0], 3.0, 0.3))
 COATED = lj.Stack([lj.Interface(1.5, 0.2)], lj.Conductor(0.2, 3.0, 0.3))
 DUST, FELT = (lj.Stack([lj.Medium(0.7, 0.8, lj.SGGX("surface", alpha))]) for alpha in (0.3, 0.6))
 PAINT = lj.Stack([lj.Interface(1.5, 0.3)], lj.Lambertian([0.2, 0.3, 0.4]))
-SOLVER, CHEAP = lj.AddingDoubling(nodes=6, modes=8), lj.WeidlichWilkie()
+SOLVER, CHEAP = lj.AddingDoubling(nodes=4, modes=3), lj.WeidlichWilkie()
 WI = lj.direction(jnp.array([0.2, 0.9, 0.4]), 0.3)
 WO = lj.direction(jnp.array([0.5, 0.3, 2.3]), 3.0)
+OTHER_COATED = lj.Stack([lj.Interface(1.3, 0.4)], lj.Conductor(0.6, 2.0, 0.2))
+OTHER_PAINT = lj.Stack([lj.Interface(1.3, 0.2)], lj.Lambertian([0.6, 0.5, 0.1]))
+HAZE, FOG = (
+    lj.Stack([lj.Medium(depth, albedo, lj.HenyeyGreenstein(0.3))], lj.Lambertian([0.2, 0.3, 0.4]))
+    for depth, albedo in ((0.7, 0.8), (0.2, 0.95))
+)
 PARTS = [
     (lj.SingleScattering(), DUST, BARE),
     (lj.SpongeCake(), DUST, FELT),
-    (lj.Statistical(), COATED, PAINT),
-    (lj.ENDF(), COATED, BARE),
+    (lj.Statistical(), PAINT, OTHER_PAINT),
+    (lj.ENDF(), COATED, OTHER_COATED),
     (lj.WeidlichWilkie(), COATED, BARE),
-    (SOLVER, COATED, PAINT),
+    (SOLVER, HAZE, FOG),
 ]
+"""Two of one structure share their programs; parts of two structures are of the transports that compile least."""
 by_transport = pytest.mark.parametrize(
     ("transport", "one", "other"), PARTS, ids=[type(transport).__name__ for transport, _, _ in PARTS]
 )
@@ -52,15 +59,15 @@ def test_light_that_passes_straight_is_the_mean() -> None:
 
 
 def test_walks_are_drawn_for_each_part_by_itself() -> None:
-    mixed = lj.Mixture({"coated": COATED, "paint": PAINT}, [0.4, 0.6])
-    walk, wi, wo = lj.RandomWalk(paths=2048), WI[:2], WO[:2]
+    mixed = lj.Mixture({"haze": HAZE, "fog": FOG}, [0.4, 0.6])
+    walk, wi, wo, solver = lj.RandomWalk(paths=2048), WI[:2], WO[:2], lj.AddingDoubling(nodes=8, modes=6)
     values, errors = lj.evaluate_with_error(mixed, wi, wo, walk, key=jax.random.key(1))
-    truth, numerical = lj.evaluate_with_error(mixed, wi, wo, lj.AddingDoubling(nodes=12, modes=16))
+    truth, numerical = lj.evaluate_with_error(mixed, wi, wo, solver)
     assert np.all(np.abs(values - truth) < 4.0 * errors + numerical)
-    own = [lj.evaluate_with_error(part, wi, wo, walk, key=jax.random.key(2))[1] for part in (COATED, PAINT)]
+    own = [lj.evaluate_with_error(part, wi, wo, walk, key=jax.random.key(2))[1] for part in (HAZE, FOG)]
     # standard errors are themselves known to a few percent by so many paths
     np.testing.assert_allclose(errors, np.hypot(0.4 * own[0], 0.6 * own[1]), rtol=0.1)
-    keyed = lj.evaluate_with_error(mixed, wi, wo, lj.AddingDoubling(nodes=12, modes=16), key=jax.random.key(1))
+    keyed = lj.evaluate_with_error(mixed, wi, wo, solver, key=jax.random.key(1))
     np.testing.assert_array_equal(keyed[1], numerical)  # of one that draws nothing a key changes nothing
     with pytest.raises(ValueError, match="key: RandomWalk draws random numbers"):
         lj.evaluate(mixed, wi, wo, walk)

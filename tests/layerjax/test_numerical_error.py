@@ -22,6 +22,7 @@ def in_errors(stack, transport, truth):
     return np.abs(values - np.asarray(lj.evaluate(stack, WI, WO, truth))) / errors
 
 
+@pytest.mark.slow
 def test_resolutions_that_agree_are_not_taken_for_exact():
     """Three resolutions agree to 1e-6, all 3e-5 and more away: what their facets have in common counts."""
     varnish = lj.Stack([lj.Interface(1.4439, 0.4771)], lj.Lambertian(0.3159))

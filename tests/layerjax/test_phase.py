@@ -84,7 +84,7 @@ RAYLEIGH = lj.Rayleigh()
 PHASES = {"Rayleigh": RAYLEIGH, "Schlick": Schlick(0.5), "Schlick, backward": Schlick(-0.4)}
 WI = lj.direction(0.7, 0.3)
 WO = lj.direction(np.array([0.2, 1.0, 1.4, 2.0, 2.8, 2.4]), np.array([0.0, 2.0, 3.4, 1.0, 3.0, 5.0]))
-DRAWS, SIGNIFICANCE = 100_000, 1e-4
+DRAWS, SIGNIFICANCE = 20_000, 1e-4
 SOLVER = lj.AddingDoubling(nodes=24, modes=16)
 
 each = pytest.mark.parametrize("phase", PHASES.values(), ids=PHASES)
@@ -217,9 +217,9 @@ STACKS = {
 def test_the_solver_agrees_with_the_walk(name):
     stack = STACKS[name]
     wo = WO[:3] if stack.base is not None else WO
-    values, errors = lj.evaluate_with_error(stack, WI, wo, lj.RandomWalk(paths=1 << 16), key=jax.random.key(3))
+    values, errors = lj.evaluate_with_error(stack, WI, wo, lj.RandomWalk(paths=1 << 14), key=jax.random.key(3))
     solved, coarse = lj.evaluate_with_error(stack, WI, wo, SOLVER)
-    assert (errors < 0.02 * values).all()
+    assert (errors < 0.04 * values).all()
     np.testing.assert_array_less(np.abs(values - solved), 4.0 * errors + coarse)
 
 

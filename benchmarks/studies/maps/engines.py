@@ -86,7 +86,7 @@ def by_workers(one: Given, size: Size, report: Report) -> list[Figure]:
                 rates["dask"].append(steady(run_tasks(timed, job, tasks * PROCESSES * size.repeats, client=client)))
         told = ", ".join(f"{name} {values[-1]:.0f}" for name, values in rates.items() if values)
         report(f"workers, round {index + 1}: fits/s of {told}")
-    note = f"{figure(float(np.median(rates['one'])))} fits/s of one spawned process on a core of its own"
+    note = f"{figure(float(np.median(rates['one'])))} fits/s of one spawned process with one thread"
     figures = [_ratio("2 processes against 1", rates["two"], rates["one"], PAIR, note)]
     if missing is None:
         note = f"{figure(float(np.median(rates['dask'])))} fits/s of a `LocalCluster` with a thread a worker"

@@ -50,7 +50,7 @@ def run(rows: Sequence[Row], size: Size, report: Report) -> tuple[list[Engine], 
     ]
     handed: float | None = None
     if why_no_cluster() is None:
-        with cluster() as client, patch.object(distributed, "ENOUGH", 0.0):  # one at a time
+        with cluster() as client, patch.object(distributed, "GROUP_SECONDS", 0.0):  # one at a time
             engines.append(
                 _engine(f"dask, {PROCESSES} workers", run_tasks(empty, None, range(size.tasks), client=client))
             )

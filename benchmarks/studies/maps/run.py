@@ -35,7 +35,7 @@ measurement, the largest of {checked} texels.
 ## Workers
 
 Rates while all workers are at work: they wait for each other after the first chunk, and the last chunk of the first to
-be done ends it; medians of {rounds} rounds in turns. One worker is a spawned process on a core of its own with chunks
+be done ends it; medians of {rounds} rounds in turns. One worker is a spawned process with one thread and chunks
 of the same map (`processes=1` would be threads). Memory is the most that the system has seen of a worker that compiles
 all programs. {missing}
 

@@ -21,7 +21,7 @@ from layerjax.channels import Channels, each
 Orders = tuple[Channels, ...]
 
 LEAST_ESCAPE = 1e-6
-"""Of light between two elements, the share that stands for all smaller ones to leave at a turn."""
+"""Least share of the light between two elements that leaves at a turn."""
 
 LEAST_ENERGY = 1e-12
 """Energy below which a mean of variances is not formed: squares of it are divided by in derivatives."""
@@ -112,7 +112,7 @@ def add_element(above: Above, element: Element) -> tuple[Lobe, Above]:
         s_t0=s_t0,
         s_ri=s_ri,
         s_ti=s_ti,
-        jacobian=each(lambda j, own: at_most(j * own, MOST_JACOBIAN), above.jacobian, element.jacobian),
+        jacobian=each(lambda j, factor: at_most(j * factor, MOST_JACOBIAN), above.jacobian, element.jacobian),
     )
 
 
@@ -131,7 +131,7 @@ def retain(above: Above, share: Channels) -> Above:
 
 
 def whole(energy: Orders) -> Channels:
-    """Of all orders together."""
+    """The statistics of all orders together."""
     return channels.total(energy)
 
 

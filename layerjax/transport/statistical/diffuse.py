@@ -185,7 +185,7 @@ def _arriving(coats: Sequence[Coat], relative: Sequence[Array], cosine: Array) -
         series = 1.0 / (1.0 - back * (1.0 - clear))
         energy = energy * coated_transmission(cosine, coat.alpha, n, coat.tau) * series
         cosine, _ = bounded_refracted_cosine(cosine, n, STEEPEST)
-        # a smooth interface reflects both sides of a ray alike
+        # a smooth interface reflects a ray from either side equally
         back = (1.0 - clear + clear * clear * back * series) * _powers(coat.tau, 2.0 / cosine)
     return energy
 

@@ -49,7 +49,7 @@ AZIMUTHS = 24
 """Azimuths of the albedo of a base that is not Lambertian."""
 
 LEAST_ALBEDO = 1e-6
-"""Stands for the albedo 0 of a base where its shape is asked for."""
+"""Replaces the albedo 0 of a base where its shape is needed."""
 
 LARGEST_RETURN = 1.0 - 1e-4
 """Bound of R, and of rho R, over a base that is not Lambertian: one that reflects too much would amplify on and on."""
@@ -99,16 +99,18 @@ def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseB
     counted = _share(base, bottom.cosine)
 
     def arriving(parts: Parts) -> Array:
-        """Of the diffuse light along every node what arrives at the base, (C or 1, nodes)."""
+        """Share of the diffuse light along every node that arrives at the base, (C or 1, nodes)."""
         flux = parts.total
-        return jnp.zeros_like(counted) if flux is None else jnp.einsum("cij,ci->cj", *_alike(flux[:, 0], counted))
+        return (
+            jnp.zeros_like(counted) if flux is None else jnp.einsum("cij,ci->cj", *_broadcast_pair(flux[:, 0], counted))
+        )
 
     scattered, back = arriving(whole.transmit_down), arriving(whole.reflect_bottom)
     if whole.direct_down is None:
         there, table = scattered, _refracted_table(bare, grid, scattered, plan)
     else:
-        straight = whole.direct_down[:, 0] * counted
-        there, table = scattered + straight, _straight_table(bare, base, grid, scattered)
+        ballistic = whole.direct_down[:, 0] * counted
+        there, table = scattered + ballistic, _ballistic_table(bare, base, grid, scattered)
     # means over diffuse light at the nodes of the solver: they know the critical angles
     inward, outward = (2.0 * region.weight / region.ior**2 for region in (bottom, top))
     returned = jnp.sum(inward * counted * back, axis=-1)
@@ -140,9 +142,9 @@ def _refracted_table(bare: Stack, grid: Grid, there: Array, plan: Plan) -> Array
     return at_table_points(grid, behind) * at_points
 
 
-def _straight_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
+def _ballistic_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) -> Array:
     """T at the points of a table, where there are media alone: of what is scattered the share of what meets anything
-    is interpolated, and what passes straight is known."""
+    is interpolated, and what passes without a collision is known."""
     top, media = grid.regions[0], media_of(bare)
 
     def along(region: Region) -> Vector:
@@ -151,12 +153,12 @@ def _straight_table(bare: Stack, base: Surface, grid: Grid, scattered: Array) ->
     points = table_region(grid, top)
     at_nodes, at_points = (jnp.stack(colliding_share(media, along(region))) for region in (top, points))
     depths = [jnp.stack(depth) for depth in optical_depths(media, along(points))]
-    straight = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
-    scattered, at_nodes = _alike(scattered, at_nodes)
-    return at_table_points(grid, scattered / at_nodes) * at_points + straight
+    ballistic = jnp.exp(-sum(depths[1:], depths[0])) * _share(base, points.cosine)
+    scattered, at_nodes = _broadcast_pair(scattered, at_nodes)
+    return at_table_points(grid, scattered / at_nodes) * at_points + ballistic
 
 
-def _alike(a: Array, b: Array) -> tuple[Array, Array]:
+def _broadcast_pair(a: Array, b: Array) -> tuple[Array, Array]:
     """Both with as many channels, their first axis."""
     channels = max(a.shape[0], b.shape[0])
     return jnp.broadcast_to(a, (channels, *a.shape[1:])), jnp.broadcast_to(b, (channels, *b.shape[1:]))

@@ -104,7 +104,7 @@ def diffuse_part(diffuse: DiffusePart, wi: Vector, wo: Vector) -> Channels:
 
 
 def _probabilities(lobes: Shaped, diffuse: DiffusePart | None, wi: Vector) -> list[Array]:
-    """Of the lobes, in their order; what is missing from 1 is that of the diffuse part."""
+    """Probabilities of the lobes, in their order; the rest to 1 is that of the diffuse part."""
     energies = [jnp.where(share > 1e-6, share, 1e-6) for share in lobes.shares()]
     if not energies:
         return []

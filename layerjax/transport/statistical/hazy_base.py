@@ -1,8 +1,8 @@
 """Light that has reached a Lambertian base under media that lie on top, and what is below them: the closed form.
 
 The same closed form as `layerjax.transport.statistical.diffuse_base`, f = T(i) T(o) rho / (pi n^2 (1 - rho R)). Light
-that goes straight through the media arrives as it does without them (`streamed_base`, `coated_base`). Of what meets
-something on its way, scattered there once or often or turned back by it, few streams say how much arrives: between
+that passes the media without a collision arrives as it does without them (`streamed_base`, `coated_base`). Of what
+meets something on its way, scattered there once or often or reflected by it, few streams say how much arrives: between
 these it is a polynomial of the cosine times the share that meets anything, which is all that is steep at grazing.
 """
 
@@ -21,9 +21,9 @@ from layerjax.transport.statistical.streamed_base import ClosedForm, StreamedBas
 
 
 class HazyBase(ClosedForm):
-    """depth: of the media on top, of what goes not straight on. scattered: what of the light that meets something there
+    """depth: optical depth of the media on top, but for forward peaks. scattered: what of the light that collides there
     arrives, a unit of depth, by polynomials and channels; None if they only absorb. inner: what becomes of light that
-    passes straight; None: the base itself.
+    passes; None: the base itself.
     """
 
     depth: Channels
@@ -32,8 +32,8 @@ class HazyBase(ClosedForm):
 
     def arriving(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
-        straight: Channels = tuple(jnp.exp(-depth / cosine) for depth in self.depth)
-        there = straight if self.inner is None else times(straight, self.inner.arriving(cosine))
+        ballistic: Channels = tuple(jnp.exp(-depth / cosine) for depth in self.depth)
+        there = ballistic if self.inner is None else times(ballistic, self.inner.arriving(cosine))
         if self.scattered is None:
             return there
         found = streams.polynomials(cosine)
@@ -68,7 +68,7 @@ def make_hazy(stack: Stack) -> HazyBase:
     )
     scattered = None
     if not all(map(absorbs, top)):
-        met = below.onward - under_interfaces.onward * stream_layers.straight(depth)
+        met = below.onward - under_interfaces.onward * stream_layers.ballistic(depth)
         nodes = jnp.asarray(streams.NODES, dtype)
         share = exprel(depth[:, None] / nodes) / nodes
         scattered = per_channel(streams.by_polynomials(met / share))

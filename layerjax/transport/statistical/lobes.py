@@ -114,7 +114,7 @@ def parts(stack: Stack, upward: bool, smooth: tuple[bool, ...] | None = None) ->
 
 
 def statistics(stack: Stack, cosine: Array, options: Options, upward: bool = False) -> Statistics:
-    """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are left out."""
+    """Lobes of a simplified stack, lit along cosines > 0, from below if `upward`. Diffuse bases are omitted."""
     met = parts(stack, upward, options.smooth)
     above = nothing(cosine)
     reflected: list[Reflection] = []
@@ -230,19 +230,19 @@ def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, t
     depth = tuple(thickness / cosine for thickness in per_channel(jnp.asarray(medium.thickness)))
     zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
     dark = (zero,)
-    straight = tuple(jnp.exp(-t) for t in depth)
+    ballistic = tuple(jnp.exp(-t) for t in depth)
     g = medium.phase.forward_lobe
     if g is None or is_known(medium.albedo, 0.0):
-        return Element(dark, (straight,), dark, (straight,), zero, zero, zero, one), None
+        return Element(dark, (ballistic,), dark, (ballistic,), zero, zero, zero, one), None
     scattered = channels.times(per_channel(jnp.asarray(medium.albedo)), depth)
     width = phase_variance(jnp.asarray(g))
     if options.scattering == "single":
         passed = each(lambda s, t: jnp.exp(jnp.log1p(s) - t), scattered, depth)  # (1 + t) exp(-t)
         added = tuple(s / (1.0 + s) * width for s in scattered)
         return Element(dark, (passed,), dark, (passed,), zero, added, added, one), None
-    once = channels.times(straight, scattered)
-    more = each(lambda s, t, e, o: at_least(jnp.exp(s - t) - e - o, 0.0), scattered, depth, straight, once)
-    orders = (straight, once, more)
+    once = channels.times(ballistic, scattered)
+    more = each(lambda s, t, e, o: at_least(jnp.exp(s - t) - e - o, 0.0), scattered, depth, ballistic, once)
+    orders = (ballistic, once, more)
     return Element(dark, orders, dark, orders, zero, zero, zero, one), (scattered, width)
 
 

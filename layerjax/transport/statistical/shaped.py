@@ -1,6 +1,6 @@
 """Lobes of a stack as they are evaluated: of every one its energy, its scale and its roughness.
 
-Nothing is prepared: all of it is found at the cosines that are asked for, from energies that are looked up.
+Nothing is prepared: all of it is computed at the requested cosines, from energies that are looked up.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from layerjax.transport.statistical.lobes import (
 from layerjax.transport.statistical.variance import bounded_refracted_cosine
 
 LEAST_ENERGY = 1e-6
-"""Of an unscaled lobe, what it is divided by at least."""
+"""Least energy of an unscaled lobe that is divided by."""
 
 GRAZING = 1e-6
 """Cosine that stands for 0."""
@@ -57,14 +57,14 @@ class _Lobe(NamedTuple):
 
 
 class Shaped(NamedTuple):
-    """Lobes for light along some cosines: those on its own side, and those on the other (none over a base)."""
+    """Lobes for light along some cosines: the reflected ones, and the transmitted ones (none over a base)."""
 
     reflected: tuple[ShapedLobe, ...]
     transmitted: tuple[ShapedLobe, ...]
     facet: Facet | None
 
     def energies(self, dark: Array) -> tuple[Channels, Channels]:
-        """Of all lobes on the side of the light and on the other, added to zeros."""
+        """Energies of all lobes on the side of the light and on the other, added to zeros."""
         lobes = self.reflected, self.transmitted
         near, far = (channels.total([(dark,), *(lobe.energy for lobe in side)]) for side in lobes)
         return near, far
@@ -86,7 +86,7 @@ class Shaped(NamedTuple):
 
 
 def shaped(stack: Stack, options: Options, cosine: Array, upward: bool) -> Shaped:
-    """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are left out."""
+    """Lobes of a simplified stack, lit from above, or from below (`upward`). Diffuse bases are omitted."""
     cosine = at_least(cosine, GRAZING)
     found = statistics(stack, cosine, options, upward)
     reflected, facet = _returning(found, cosine)
@@ -99,7 +99,7 @@ def shaped(stack: Stack, options: Options, cosine: Array, upward: bool) -> Shape
 
 
 def _scaled(lobe: _Lobe, alpha: Channels, unscaled: Channels) -> ShapedLobe:
-    scale = each(lambda energy, of: energy / at_least(of, LEAST_ENERGY), lobe.energy, unscaled)
+    scale = each(lambda energy, whole: energy / at_least(whole, LEAST_ENERGY), lobe.energy, unscaled)
     return ShapedLobe(lobe.energy, scale, alpha or None)
 
 
@@ -147,7 +147,7 @@ def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tu
     """The transmitted lobes by orders, in the medium of the reference index, none over a base.
 
     Also the largest sine there that is not totally reflected on the way out. What nothing meets (no interface, no
-    collision) passes straight and is no lobe.
+    collision) passes and is no lobe.
     """
     if found.transmitted is None:
         return [], jnp.ones_like(cosine)

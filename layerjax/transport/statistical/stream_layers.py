@@ -2,7 +2,7 @@
 
 As in `layerjax.transport.adding_doubling`, of one Fourier mode. A slab that scatters is Z = tanh(h sqrt(Q P)) sqrt(Q
 P)^-1 Q and W, the same with P and Q changed over, h half its thickness: net flux over its sum where the two sides are
-lit alike, and the other way round where they are lit with opposite signs. Both are doubled from a thin slab, Z <- 2 (1
+lit equally, and the inverse where they are lit with opposite signs. Both are doubled from a thin slab, Z <- 2 (1
 + Z W)^-1 Z: sums of what is positive, nothing cancels, in single precision either.
 """
 
@@ -24,7 +24,7 @@ STEPS = 18
 """Doublings of a slab: from one thinner than 0.02 to half of the thickest medium of the box, 1e4."""
 
 MOMENTS = 2 * STREAMS
-"""Of a phase function that are kept; the rest of it counts as light that goes straight on (delta-M)."""
+"""Moments of a phase function that are used; the rest of it counts as ballistic light (delta-M)."""
 
 
 class Below(NamedTuple):
@@ -56,7 +56,7 @@ def under_medium(below: Below, medium: Medium) -> Below:
     """A medium on top."""
     dtype = below.onward.dtype
     if is_known(medium.albedo, 0.0):
-        passed = straight(collisions(medium, dtype))
+        passed = ballistic(collisions(medium, dtype))
         reflected = None if below.reflected is None else passed[:, :, None] * below.reflected * passed[:, None, :]
         return below._replace(onward=below.onward * passed, reflected=reflected)
     reflected, passed = _slab_of(medium, dtype)
@@ -81,7 +81,7 @@ def under_layers(below: Below, layers: Sequence[Interface | Medium]) -> tuple[Be
 
 
 def collisions(medium: Medium, dtype: Any) -> Array:
-    """Optical depth of what does not go straight on, by channels."""
+    """Optical depth but for the ballistic part of forward peaks, by channels."""
     thickness = _channels(medium.thickness, dtype)
     if is_known(medium.albedo, 0.0):
         return thickness
@@ -89,7 +89,7 @@ def collisions(medium: Medium, dtype: Any) -> Array:
     return thickness * (1.0 - albedo * g**MOMENTS)
 
 
-def straight(depth: Array) -> Array:
+def ballistic(depth: Array) -> Array:
     """Share of each stream that meets nothing in an optical depth, by channels."""
     return jnp.exp(-depth[:, None] / jnp.asarray(NODES, depth.dtype))
 
@@ -153,7 +153,7 @@ def over_medium(above: Roof, medium: Medium) -> Roof:
     """A medium more under it."""
     dtype = above.bottom.dtype
     if is_known(medium.albedo, 0.0):
-        passed = straight(collisions(medium, dtype))
+        passed = ballistic(collisions(medium, dtype))
         return Roof(passed[:, :, None] * above.bottom * passed[:, None, :], passed[:, :, None] * above.inside)
     reflected, passed = _slab_of(medium, dtype)
     turns = inverse(jnp.asarray(np.eye(STREAMS), dtype) - matmul(above.bottom, reflected))
@@ -189,16 +189,16 @@ def slab(thickness: Array, albedo: Array, g: Array) -> tuple[Array, Array]:
     taken = thin * absorbed[:, None] * removed * jnp.asarray(DIFFUSE, thickness.dtype)
     begin = _anchored(thin[..., None] * rate(0), taken), thin[..., None] * rate(1), taken
     (net, sums, _), _ = jax.lax.scan(doubled, begin, None, length=STEPS)
-    alike, opposed = inverse(one + net), inverse(one + sums)
-    return alike - opposed, alike + opposed - one
+    even, odd = inverse(one + net), inverse(one + sums)
+    return even - odd, even + odd - one
 
 
 def _anchored(net: Array, taken: Array) -> Array:
     """Z, with what it takes of diffuse light known by itself: rounding would absorb light in the thickest media."""
     diffuse = jnp.asarray(DIFFUSE, net.dtype)
-    lack = taken - times(net, diffuse)
-    mean = dot(lack, diffuse)[..., None, None]
-    sides = lack[..., :, None] * diffuse
+    remainder = taken - times(net, diffuse)
+    mean = dot(remainder, diffuse)[..., None, None]
+    sides = remainder[..., :, None] * diffuse
     return net + sides + jnp.swapaxes(sides, -1, -2) - mean * diffuse[:, None] * diffuse
 
 
@@ -206,7 +206,7 @@ _HARMONICS = [
     (2 * order + 1) * np.outer(*[np.sqrt(WEIGHTS / NODES) * np.polynomial.Legendre.basis(order)(NODES)] * 2)
     for order in range(MOMENTS)
 ]
-"""Of a phase function's moments what they scatter from stream to stream."""
+"""What the moments of a phase function scatter from stream to stream."""
 
 
 @jax.custom_jvp

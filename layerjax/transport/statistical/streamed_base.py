@@ -5,7 +5,7 @@ has T and R from an exact solve; here they are those of few streams (`layerjax.t
 
 Behind a narrow interface light is a beam, and polynomials of the cosine ring where an interface begins to reflect
 totally. So the light that enters is followed along two cosines that have its moments, to the second interface and
-between the two, as far as it stays a beam; what is scattered on the way, or turned back wide, is in the streams.
+between the two, as far as it stays a beam; what is scattered on the way, or reflected widely, is in the streams.
 
 Two interfaces (indices 1.2 to 2 at random, alpha .01 to .6) beside the solve, T over its mean: rms 1e-3 to 6e-3,
 largest 2e-2; with an optical depth of 1 between them 5e-3 to 1.5e-2, largest 7e-2. BSDFs of light from the base,
@@ -76,7 +76,7 @@ class ClosedForm(eqx.Module):
 class StreamedBase(ClosedForm):
     """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
 
-    alpha, ior: of the interface. depth: of the media behind it, of what goes not straight on; None if there are none.
+    alpha, ior: of the interface. depth: of the media behind it, optically, but for forward peaks; None if none.
     onward: share of the light behind these that arrives at the base. again: of light that goes up there, passes them,
     and comes back from the interface. scattered: what of light just behind the interface arrives, and of light that
     goes up there, if it is scattered in the media; None if it is not.
@@ -135,9 +135,9 @@ def make_streamed(stack: Stack) -> StreamedBase:
     again, scattered = met.again, None
     if not all(map(absorbs, media)):
         assert depth is not None
-        straight = stream_layers.straight(jnp.stack(depth))
-        once = met.onward * straight
-        again = straight * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
+        ballistic = stream_layers.ballistic(jnp.stack(depth))
+        once = met.onward * ballistic
+        again = ballistic * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
         down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
         scattered = per_channel(down), per_channel(up)
     out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind)
@@ -157,12 +157,12 @@ def make_streamed(stack: Stack) -> StreamedBase:
 
 
 def _depth(media: list[Medium], dtype: np.dtype) -> Channels | None:
-    """Of what goes not straight through media."""
+    """The same of light that collides in media."""
     return total([per_channel(stream_layers.collisions(medium, dtype)) for medium in media]) if media else None
 
 
 def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: Array, spread: Array) -> Channels:
-    """Share of light behind the first interface, along cosines (2, ...), that goes straight on and arrives.
+    """Share of light behind the first interface, along cosines (2, ...), that arrives without a collision.
 
     reflectance: of that interface, from outside and, of a beam, from inside.
     """

@@ -27,7 +27,7 @@ from layerjax.tables import load
 from layerjax.transport.statistical.diffuse import roughness_variable
 
 STREAMS = 4
-"""Of the light up, and of that down."""
+"""Moments of the light up, and of that down."""
 
 INTERFACES = (16, 16)
 """Coefficients of the table of interfaces along roughness and index."""
@@ -62,7 +62,7 @@ DIFFUSE = AT_NODES[:, 0]
 
 
 _MOMENTS_OF = np.linalg.inv(_coefficients())
-"""From means of the polynomials to those of the powers of the cosine."""
+"""Matrix from means of the polynomials to those of the powers of the cosine."""
 
 LEAST_SPREAD, SKEWED, LEAST_COSINE = 1e-4, 3e-3, 0.02
 """Of a lobe: its least variance, that at which its skewness fades, and the least of the two cosines."""
@@ -169,14 +169,14 @@ def unpacked(entries: Array, dense: Array) -> tuple[Array, Array, Array]:
 
 
 def by_polynomials(onward: Array) -> Array:
-    """From streams to polynomials."""
+    """Matrix from streams to polynomials."""
     return times(jnp.asarray(AT_NODES.T, onward.dtype), onward)
 
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of small matrices, term by term.
 
-    XLA calls a library for every product that it is told of, and in single precision for every sum along an axis, which
+    XLA calls a library for every product that it is given, and in single precision for every sum along an axis, which
     takes several times as long; and it would work out the factors anew for each of the sums that they are in.
     """
     a, b = jax.lax.optimization_barrier(a), jax.lax.optimization_barrier(b)

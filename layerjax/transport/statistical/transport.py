@@ -92,13 +92,13 @@ class Statistical(DeterministicTransport):
             al. 2016), or ``"single"``, Walter 2007: light that a facet sends into another is lost.
         scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
             collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
-            that lobe cannot be told from the light that nothing met, and both are left out.
+            that lobe cannot be distinguished from unscattered light, and both are omitted.
         diffuse: light that has met a diffuse base: ``"tables"``, a closed form with transmittances from tables and few
             streams, at every texel (over a `Lambertian`, ``microfacets="multiple"``; what else there is as if
             ``"exact"``); ``"exact"``, those of an adding-doubling solve for every stack; or ``"lobe"``, one GGX lobe
             from tables (2022), for interfaces and absorbing media over a `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
-        own_side: whether light from inside meets the reflectance of its own side, or by reciprocity that from outside.
+        own_side: whether light from inside meets the reflectance of the inside, or by reciprocity that from outside.
 
     Raises:
         ValueError: an option that is none.

@@ -11,7 +11,7 @@ from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.directions import squared_cosine_of_refraction
 
 EXPONENT = 1.1
-"""Of the map between roughness and variance (Eq. 6)."""
+"""Exponent of the map between roughness and variance (Eq. 6)."""
 
 WIDEST = 0.9999
 """Roughness that stands for all above, where the variance grows without bound."""

@@ -85,6 +85,7 @@ def test_what_is_opaque_reflects_diffuse_light() -> None:
         np.testing.assert_allclose(problem.predict([albedo])[0, 0], expected, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_light_from_behind_meets_the_other_face() -> None:
     """A slab that is dark on one side: only the sphere there sees it."""
     grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)
@@ -101,6 +102,7 @@ def test_light_from_behind_meets_the_other_face() -> None:
     assert gains[0] > 1.02 * gains[1]
 
 
+@pytest.mark.slow
 def test_coefficients_are_recovered_through_spheres() -> None:
     spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
     slab = lj.Stack([lj.TurbidMedium(1.0, Free(2.0, 0.1, 50.0), Free(0.5, 1e-3, 5.0), lj.HenyeyGreenstein(0.5))])

@@ -15,7 +15,6 @@ from fits.maps.options import MapOptions
 from fits.maps.texels import make_texels
 from fits.problem.parameters import PowerLaw, is_free
 from fits.problem.stack_file import read_problem, write_problem
-from tests.helpers import quick_maps
 
 TRANSPORT = lj.SingleScattering()
 NOISE = fits.Noise(relative=0.02, floor=1e-4, discrepancy=False)
@@ -31,11 +30,6 @@ def coat(thickness, albedo, g):
 def free(low=-0.2, high=0.8, prior=None):
     g = fits.Free(0.2, low, high, prior=prior, same_for_all_texels=True)
     return coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), g)
-
-
-@pytest.fixture(scope="module")
-def geometry():
-    return quick_maps.geometry()
 
 
 @pytest.fixture(scope="module")
@@ -71,15 +65,14 @@ def test_the_joint_fit_of_a_pilot_is_that_of_joint(geometry, values, prior, boun
         data = Measurements(geometry.wi, geometry.wo, row, None, np.ones(len(row), bool), ("value",))
         problems[f"t{k}"] = fits.Problem(free(*bounds, prior=prior), data, transport=TRANSPORT, noise=NOISE)
     joint = fits.fit(fits.Joint(problems, shared=["layers[0].phase.g"]), starts=4)
-    texels = make_texels(values, least=NOISE.floor)
-    held, common = fit_common(problems["t0"], texels, MapOptions(starts=4, chunk_size=4))
-    (name,) = common.values
+    common = fit_common(problems["t0"], make_texels(values, least=NOISE.floor), MapOptions(starts=4, chunk_size=4))
+    ((name, value),) = common.values.items()
     assert common.converged
-    assert held.names == NAMES
+    assert with_common(problems["t0"], common.values).names == NAMES
     error = joint.standard_errors["layers[0].phase.g"]
     scale = error if np.isfinite(error) else 1e-3
     # a step of a hundredth of an error is the last one
-    assert abs(common.values[name] - joint.values["layers[0].phase.g"]) < 0.02 * scale
+    assert abs(value - joint.values["layers[0].phase.g"]) < 0.02 * scale
     np.testing.assert_allclose(common.errors[name], error, rtol=0.02)
 
 
@@ -92,27 +85,21 @@ def test_errors_of_what_a_pilot_does_not_know_are_infinite():
 
 
 def test_a_map_holds_what_its_texels_have_in_common(tmp_path, fitted):
-    found = fitted(tmp_path / "common.zarr", free())
-    assert found.names == NAMES
-    said = found.attributes["common"]["layers[0].phase.g"]
-    assert abs(said["value"] - G) < 4.0 * said["error"]
-    assert (said["unit"], said["converged"]) == ("1", True)
+    map = fitted(tmp_path / "common.zarr", free())
+    assert map.names == NAMES
+    common = map.attributes["common"]["layers[0].phase.g"]
+    assert abs(common["value"] - G) < 4.0 * common["error"]
+    assert (common["unit"], common["converged"]) == ("1", True)
     for column, name in enumerate(NAMES):
-        pulls = (found.values[name] - TRUTH[:, column]) / found.errors[name]
+        pulls = (map.values[name] - TRUTH[:, column]) / map.errors[name]
         assert np.all(np.abs(pulls) < 4.5)
-
-
-def test_a_common_level_of_noise_is_found(tmp_path, fitted):
+    # and a level of noise, of which 64 measurements know 9 %, and 8 of 64 degrees of freedom are fitted away
     stack = coat(fits.Free(0.5, 0.05, 3.0), fits.Free(0.4, 0.0, 1.0), G)
     noise = dataclasses.replace(NOISE, relative=fits.Free(0.05, 0.001, 0.3, same_for_all_texels=True))
-    found = fitted(tmp_path / "noise.zarr", stack, noise)
-    said = found.attributes["common"]["noise.relative"]
-    # of 64 measurements a level is known to 9 %, and 8 of 64 degrees of freedom are fitted away
-    assert abs(said["value"] - 0.02) < 4.0 * said["error"] + 0.002
-    assert fitted(tmp_path / "noise.zarr", stack, noise).attributes == found.attributes
-
-
-def test_a_map_of_common_parameters_alone_is_refused(tmp_path, fitted):
+    map = fitted(tmp_path / "noise.zarr", stack, noise)
+    common = map.attributes["common"]["noise.relative"]
+    assert abs(common["value"] - 0.02) < 4.0 * common["error"] + 0.002
+    assert fitted(tmp_path / "noise.zarr", stack, noise).attributes == map.attributes
     with pytest.raises(ValueError, match="all free parameters are common"):
         fitted(tmp_path / "none.zarr", coat(0.5, 0.4, fits.Free(0.2, -0.2, 0.8, same_for_all_texels=True)))
     assert not (tmp_path / "none.zarr").exists()

@@ -6,23 +6,21 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from fits.cli.parser import main
-from fits.maps.store import FittedMap, open_map
+from fits.maps.store import open_map
 from tests.helpers.files import mounted
-from tests.helpers.places import ROOT
 from tests.helpers.quick_maps import assert_same, command, write_files
+from tests.helpers.tasks import running, started, wait_until
 
-CLI, PATIENCE = "fits.cli", 120.0
+CLI, PATIENCE = ["-m", "fits.cli"], 120.0
 SLOW_DISK = """import os, time
 replace = os.replace
 def slowly(*paths):
@@ -33,7 +31,7 @@ os.replace = slowly
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory):
     """A folder with a map of 16 chunks."""
     folder = tmp_path_factory.mktemp("map")
     write_files(folder, (16, 16))
@@ -42,84 +40,51 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(place: Path) -> FittedMap:
+def whole(place):
     """The store of an undisturbed run."""
     assert main(command(place, place / "whole.zarr", "--processes", "1")) == 0
     return open_map(place / "whole.zarr")
 
 
-@contextmanager
-def begun(words: list[str], place: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program of Python in a process group of its own, with the slow disk of this place, killed in the end."""
-    paths = os.pathsep.join((str(place), str(ROOT)))
-    environment = os.environ | {"PYTHONPATH": paths, "DASK_LOGGING__DISTRIBUTED": "critical"}
-    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
-    try:
-        process = subprocess.Popen(
-            [sys.executable, "-m", *words], env=environment, text=True, stderr=subprocess.PIPE, stdout=subprocess.PIPE,
-            start_new_session=True,
-        )  # fmt: skip
-    finally:
-        signal.signal(signal.SIGINT, ours)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def there(store: Path) -> int:
+def chunks_of(store):
     """How many chunks a store has."""
     return sum(1 for path in store.glob("flags/c/*/*") if path.suffix != ".partial")
 
 
-def children(process: int, what: str) -> list[int]:
-    """Processes below this one whose command line holds a word."""
-    found, unseen = [], [process]
-    while unseen:
+def workers_of(process):
+    """Worker processes below this one."""
+    workers, pending = [], [process]
+    while pending:
         with suppress(OSError):
-            for thread in Path(f"/proc/{unseen.pop(0)}/task").iterdir():
+            for thread in Path(f"/proc/{pending.pop(0)}/task").iterdir():
                 for child in map(int, (thread / "children").read_text().split()):
-                    unseen.append(child)
-                    if what in Path(f"/proc/{child}/cmdline").read_text():
-                        found.append(child)
-    return found
+                    pending.append(child)
+                    if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text():
+                        workers.append(child)
+    return workers
 
 
-def running(process: int) -> bool:
-    with suppress(OSError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
-
-
-def wait_until(when: Callable[[], bool], seconds: float = PATIENCE) -> None:
-    end = time.monotonic() + seconds
-    while not when():
-        assert time.monotonic() < end, "it never came to that"
-        time.sleep(0.001)
-
-
-def kill_at_random(place: Path, words: list[str], store: Path, kills: int, chunks: int, seed: int) -> Counter[str]:
-    """The same command again and again until it has been killed so many times, every fifth time as a whole and else one
-    of its workers, after a few chunks each, at any moment; what was killed how often."""
-    choice, killed = random.Random(seed), Counter[str]()
+def kill_at_random(place, words, store, kills, chunks, seed):
+    """The same command repeated until it has been killed so many times, every fifth time as a whole and else one of its
+    workers, after a few chunks each, at any moment; what was killed how often."""
+    choice, killed = random.Random(seed), Counter()
     while killed.total() < kills:
-        workers: list[int] = []
-        with begun([CLI, *words], place) as process:
+        workers = []
+        with started([*CLI, *words], place) as process:
             while process.poll() is None and killed.total() < kills:
-                until = there(store) + int(1.6 * chunks / kills * choice.random())
+                until = chunks_of(store) + int(1.6 * chunks / kills * choice.random())
                 late = time.monotonic() + 10.0 * choice.random()  # as it starts, too
-                while process.poll() is None and there(store) < until and time.monotonic() < late:
+                while process.poll() is None and chunks_of(store) < until and time.monotonic() < late:
                     time.sleep(0.002)
                 time.sleep(0.05 * choice.random())
-                workers = children(process.pid, "spawn_main")
+                workers = workers_of(process.pid)
                 whole = killed.total() % 5 == 4
                 if process.poll() is None and (whole or workers):
                     with suppress(ProcessLookupError):
                         os.kill(process.pid if whole else choice.choice(workers), signal.SIGKILL)
                         killed["run" if whole else "worker"] += 1
             process.wait(PATIENCE)
-            error = "" if process.stderr is None else process.stderr.read()
+            error = process.stderr.read()
         wait_until(lambda workers=workers: not any(map(running, workers)), 10.0)  # none is left behind
         if process.returncode == 0:
             break
@@ -132,7 +97,7 @@ def kill_at_random(place: Path, words: list[str], store: Path, kills: int, chunk
 @pytest.mark.parametrize(
     ("shape", "kills"), [((16, 16), 5), pytest.param((80, 40), 50, marks=pytest.mark.slow)], ids=["few", "fifty"]
 )
-def test_killed_at_random_moments(tmp_path: Path, shape: tuple[int, int], kills: int) -> None:
+def test_killed_at_random_moments(tmp_path, shape, kills):
     write_files(tmp_path, shape)
     (tmp_path / "sitecustomize.py").write_text(SLOW_DISK)
     assert main(command(tmp_path, tmp_path / "whole.zarr", "--processes", "1")) == 0
@@ -143,18 +108,16 @@ def test_killed_at_random_moments(tmp_path: Path, shape: tuple[int, int], kills:
     assert killed["run"] == kills // 5
     assert killed["worker"] == kills - kills // 5
     assert main(words) == 0
-    assert there(out) == chunks
+    assert chunks_of(out) == chunks
     assert_same(open_map(out), open_map(tmp_path / "whole.zarr"))
     assert os.listdir(tmp_path / "many") == ["coat.zarr"]
 
 
-def test_one_run_at_a_time_and_the_next_goes_on_where_it_was_killed(
-    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_run_at_a_time_and_the_next_resumes_where_it_was_killed(place, tmp_path, whole, capsys):
     out = tmp_path / "coat.zarr"
     words = command(place, out, "--processes", "1")
-    with begun([CLI, *words], place) as process:
-        wait_until(lambda: there(out) >= 3)
+    with started([*CLI, *words], place) as process:
+        wait_until(lambda: chunks_of(out) >= 3)
         process.send_signal(signal.SIGSTOP)
         for more in ([], ["--force"], ["--noise", "0.03", "--force"]):
             assert main([*words, *more]) == 2
@@ -171,13 +134,13 @@ def test_one_run_at_a_time_and_the_next_goes_on_where_it_was_killed(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("processes", ["1", "2"])
-def test_interrupted_by_the_user(place: Path, tmp_path: Path, whole: FittedMap, processes: str) -> None:
+def test_interrupted_by_the_user(place, tmp_path, whole, processes):
     """Ctrl-C goes to all processes of a terminal."""
     out = tmp_path / "coat.zarr"
     words = command(place, out, "--processes", processes)
-    with begun([CLI, *words], place) as process:
-        wait_until(lambda: there(out) >= 2)
-        workers = children(process.pid, "spawn_main")
+    with started([*CLI, *words], place) as process:
+        wait_until(lambda: chunks_of(out) >= 2)
+        workers = workers_of(process.pid)
         os.killpg(process.pid, signal.SIGINT)
         _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
@@ -190,10 +153,8 @@ def test_interrupted_by_the_user(place: Path, tmp_path: Path, whole: FittedMap, 
 
 
 @pytest.mark.parametrize("processes", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_a_disk_that_fills_up(
-    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str], processes: str
-) -> None:
-    """As the store is made, as what all chunks share is kept, and among chunks."""
+def test_a_disk_that_fills_up(place, tmp_path, whole, capsys, processes):
+    """As the store is made, as the pilot is kept, and among chunks."""
     (tmp_path / "disk").mkdir()
     out = tmp_path / "disk" / "coat.zarr"
     words = command(place, out, "--processes", processes)
@@ -206,7 +167,7 @@ def test_a_disk_that_fills_up(
             assert error == f"layerjax: error: {out}: no space left on device"
             # where one of several files does not fit, zarr tells before its threads have given up the others
             wait_until(lambda: not list((tmp_path / "disk").rglob("*.partial")))
-            done.append(there(out))
+            done.append(chunks_of(out))
         assert done[0] == done[1] == 0 < done[2] < done[3] < 16
         subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path / "disk")], check=True)
         assert main(words) == 0
@@ -214,21 +175,19 @@ def test_a_disk_that_fills_up(
 
 
 @pytest.mark.slow
-def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(
-    place: Path, tmp_path: Path, whole: FittedMap, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(place, tmp_path, whole, capsys):
     pytest.importorskip("distributed")
     out, file = tmp_path / "coat.zarr", tmp_path / "scheduler.json"
     where, killed = ["--no-dashboard", "--scheduler-file", str(file)], []
-    schedule = ["distributed.cli.dask_scheduler", "--port", "0", *where]
-    work = ["distributed.cli.dask_worker", "--nworkers", "2", "--nthreads", "1", *where]
-    with begun(schedule, place) as scheduler, begun(work, place) as nanny:
+    schedule = ["-m", "distributed.cli.dask_scheduler", "--port", "0", *where]
+    work = ["-m", "distributed.cli.dask_worker", "--nworkers", "2", "--nthreads", "1", *where]
+    with started(schedule, place) as scheduler, started(work, place) as nanny:
 
         def kill() -> None:
-            wait_until(lambda: there(out) >= 1)
-            killed.append(children(nanny.pid, "spawn_main")[0])
+            wait_until(lambda: chunks_of(out) >= 1)
+            killed.append(workers_of(nanny.pid)[0])
             os.kill(killed[0], signal.SIGKILL)
-            wait_until(lambda: there(out) >= 4)
+            wait_until(lambda: chunks_of(out) >= 4)
             scheduler.kill()
 
         wait_until(lambda: file.exists() and file.stat().st_size > 0)
@@ -239,8 +198,8 @@ def test_a_worker_and_then_the_scheduler_of_a_cluster_are_killed(
         thread.join()
         os.killpg(nanny.pid, signal.SIGKILL)
     error = capsys.readouterr().err.splitlines()[-1]
-    assert error == f"layerjax: error: {address}: the scheduler has gone away"
+    assert error == f"layerjax: error: {address}: the scheduler has stopped"
     assert killed
-    assert 4 <= there(out) < 16
+    assert 4 <= chunks_of(out) < 16
     assert main(command(place, out, "--processes", "1")) == 0
     assert_same(open_map(out), whole)

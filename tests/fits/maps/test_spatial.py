@@ -1,46 +1,52 @@
 """Neighbouring texels held together: against joint minimisations by scipy, and what becomes of work that is stopped."""
 
-import errno
-import os
-from pathlib import Path
+import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 
 import fits
 import layerjax as lj
 from fits.maps import spatial
 from fits.maps.inputs import MapData
 from fits.maps.options import MapOptions
-from fits.maps.spatial import Edges
+from fits.maps.spatial import neighbour_prior
 from tests.helpers import quick_maps
-from tests.helpers.quick_maps import NAMES, TRANSPORT, assert_same, coat
+from tests.helpers.quick_maps import NAMES, TRANSPORT, assert_same, coat, full_disk
 
 SHAPE, CHUNK = (4, 4), 12  # the second chunk begins at an odd column
 THICKNESS, ALBEDO = NAMES
 LOW, HIGH = np.array([np.log(0.05), 0.0]), np.array([np.log(3.0), 1.0])
 MEAN, SD = 0.5, 0.2
-"""Of the prior of the albedo."""
+"""The prior of the albedo."""
 
 HUBER = 0.1
-"""Of a scale: below, a total variation is quadratic."""
+"""Share of a scale below which a total variation is quadratic."""
 
 FREE = coat(fits.Free(0.5, 0.05, 3.0, prior=fits.LogUniform()), fits.Free(0.4, 0.0, 1.0, prior=fits.Normal(MEAN, SD)))
-SCALES = np.array([0.03, 0.02])
-WIDER = 3.0 * SCALES
-"""Of a total variation, whose neighbours hold on to each other ten times as much: few rounds are enough."""
+SCALES = {"gaussian": np.array([0.03, 0.02]), "total_variation": np.array([0.09, 0.06])}
+"""Those of a total variation, whose neighbours hold on to each other ten times as much, are wider: fewer rounds."""
 
-GAUSSIAN = fits.SpatialPrior("gaussian", dict(zip(NAMES, SCALES, strict=True)), rounds=40)
-VARIATION = fits.SpatialPrior("total_variation", dict(zip(NAMES, WIDER, strict=True)), rounds=100)
+PRIORS = {kind: fits.SpatialPrior(kind, dict(zip(NAMES, scales, strict=True)), 100) for kind, scales in SCALES.items()}
+GAUSSIAN = PRIORS["gaussian"]
+MASK = np.ones(SHAPE, bool)
+MASK[1, 2] = False
+PLACES = np.cumsum(MASK.ravel()).reshape(SHAPE) - 1
+PAIRS = [
+    (PLACES[row, column], PLACES[other])
+    for row, column in np.argwhere(MASK)
+    for other in ((row + 1, column), (row, column + 1))
+    if max(other) < 4 and MASK[other]
+]
+"""Places, among the texels that are fitted, of those that lie beside each other."""
 
 
 @pytest.fixture(scope="module")
-def predict():
+def predict(geometry):
     """Values (16,) of a texel from its numbers (2,) in the unit box."""
-    geometry = quick_maps.geometry()
 
     def one(unit):
         natural = LOW + unit * (HIGH - LOW)
@@ -51,15 +57,8 @@ def predict():
 
 
 @pytest.fixture(scope="module")
-def mask():
-    mask = np.ones(SHAPE, bool)
-    mask[1, 2] = False
-    return mask
-
-
-@pytest.fixture(scope="module")
 def measured(predict):
-    """Of a map whose albedo has an edge in the middle, with their standard deviations."""
+    """Values of a map whose albedo has an edge in the middle, and their standard deviations."""
     rows, columns = np.indices(SHAPE)
     truth = np.stack([np.log(0.3 + 0.1 * rows), np.where(columns < 2, 0.3, 0.6)], axis=-1)
     exact = np.stack([predict(one) for one in ((truth - LOW) / (HIGH - LOW)).reshape(-1, 2)]).reshape(*SHAPE, -1, 1)
@@ -68,210 +67,145 @@ def measured(predict):
 
 
 @pytest.fixture(scope="module")
-def fitted(measured, mask):
+def fitted(measured):
     """Fits the map, with these options."""
 
     def fit(out, **options):
         values, sigma = measured
-        given = {"chunk_size": CHUNK, "pilot_texels": 4, "noise": fits.Noise(relative=0.0, floor=0.0)} | options
-        return quick_maps.fitted(out, values, FREE, sigma=sigma, mask=mask, **given)
+        options = {"chunk_size": CHUNK, "pilot_texels": 4, "noise": fits.Noise(relative=0.0, floor=0.0)} | options
+        return quick_maps.fitted(out, values, FREE, sigma=sigma, mask=MASK, **options)
 
     return fit
 
 
 @pytest.fixture(scope="module")
-def own(predict, measured, mask):
-    """Residuals of all measured and priors at units (15, 2) of the texels that are fitted, written down anew."""
-    values, sigma = (jnp.asarray(one[mask][..., 0]) for one in measured)
+def plain(tmp_path_factory, fitted):
+    return fitted(tmp_path_factory.mktemp("map") / "plain.zarr")
 
-    def residuals(units):
-        data = (jax.vmap(predict)(units) - values) / sigma
-        return jnp.concatenate([data.reshape(-1), (units[:, 1] - MEAN) / SD])
 
-    return residuals
+@pytest.fixture
+def out(tmp_path, plain):
+    """A copy of its store."""
+    return shutil.copytree(plain.path, tmp_path / "coat.zarr")
 
 
 @pytest.fixture(scope="module")
-def pairs(mask):
-    """Places, among the texels that are fitted, of those that lie beside each other: first and second."""
-    place = np.full(SHAPE, -1)
-    place[mask] = np.arange(mask.sum())
-    found = []
-    for row, column in np.argwhere(mask):
-        for other in ((row + 1, column), (row, column + 1)):
-            if max(other) < 4 and mask[other]:
-                found.append((place[row, column], place[other]))
-    return np.array(found).T
+def smoothed(tmp_path_factory, plain, fitted):
+    """The maps with a spatial prior of each kind."""
+    folder = tmp_path_factory.mktemp("map")
+    return {kind: fitted(shutil.copytree(plain.path, folder / kind), spatial_prior=PRIORS[kind]) for kind in PRIORS}
 
 
-def units_of(values, mask):
+@pytest.fixture(scope="module")
+def gaussian(smoothed):
+    return smoothed["gaussian"]
+
+
+def units_of(values):
     """Numbers of the texels that are fitted, (15, 2), in the unit box."""
-    natural = np.stack([np.log(values[THICKNESS][mask]), values[ALBEDO][mask]], axis=-1)
+    natural = np.stack([np.log(values[THICKNESS][MASK]), values[ALBEDO][MASK]], axis=-1)
     return (natural - LOW) / (HIGH - LOW)
 
 
-def unit_errors(map, mask):
-    slope = (HIGH - LOW) * np.stack([map.smoothed[THICKNESS][mask], np.ones(mask.sum())], axis=-1)
-    return np.stack([map.smoothed_errors[name][mask] for name in NAMES], axis=-1) / slope
+@pytest.mark.parametrize("kind", PRIORS)
+def test_it_ends_where_a_joint_minimisation_does(smoothed, predict, measured, kind):
+    map, (first, second) = smoothed[kind], np.array(PAIRS).T
+    values, sigma = (jnp.asarray(one[MASK][..., 0]) for one in measured)
 
-
-@pytest.fixture(scope="module")
-def gaussian(tmp_path_factory, fitted):
-    return fitted(tmp_path_factory.mktemp("map") / "gaussian.zarr", spatial_prior=GAUSSIAN)
-
-
-@pytest.fixture(scope="module")
-def variation(tmp_path_factory, fitted):
-    return fitted(tmp_path_factory.mktemp("map") / "variation.zarr", spatial_prior=VARIATION)
-
-
-def left_to_go(map):
-    """How far the end of a geometric series of moves is at most, in standard errors, by its last two."""
-    *_, before, last = map.smoothing["largest_moves"]
-    return last / (1.0 - last / before)
-
-
-def test_gaussian_smoothness_ends_where_a_joint_minimisation_does(gaussian, own, pairs, mask):
-    assert gaussian.smoothing["settled"]
-    first, second = pairs
-
-    def residuals(flat):
+    def residuals(flat):  # of the data and the prior, written down anew
         units = flat.reshape(-1, 2)
-        return jnp.concatenate([own(units), ((units[second] - units[first]) / SCALES).reshape(-1)])
+        data = (jax.vmap(predict)(units) - values) / sigma
+        return jnp.concatenate([data.reshape(-1), (units[:, 1] - MEAN) / SD])
 
-    residuals, slopes = jax.jit(residuals), jax.jit(jax.jacfwd(residuals))
-    plain = units_of(gaussian.values, mask)
-    best = least_squares(
-        lambda x: np.asarray(residuals(x)), plain.ravel(), lambda x: np.asarray(slopes(x)), bounds=(0.0, 1.0),
-        xtol=1e-14, ftol=1e-14, gtol=1e-12,
-    )  # fmt: skip
-    joint, found = best.x.reshape(-1, 2), units_of(gaussian.smoothed, mask)
-    information = best.jac.T @ best.jac
-    errors = np.array([np.sqrt(np.diag(np.linalg.inv(information[k : k + 2, k : k + 2]))) for k in range(0, 30, 2)])
-    assert np.max(np.abs(joint - plain) / errors) > 3.0  # what is compared is no small change
-    assert np.max(np.abs(joint - found) / errors) < left_to_go(gaussian) + 2e-3  # a fit ends within 1e-4 errors
-    assert left_to_go(gaussian) < 0.1
-    # of Gauss-Newton at the optimum, to which the map has come this close
-    np.testing.assert_allclose(unit_errors(gaussian, mask), errors, rtol=0.01)
-
-
-def test_total_variation_ends_where_a_joint_minimisation_does(variation, own, pairs, mask):
-    assert variation.smoothing["settled"]
-    first, second = pairs
+    def share(flat):
+        units = flat.reshape(-1, 2)
+        return jnp.abs(units[second] - units[first]) / SCALES[kind]
 
     def cost(flat):
-        units = flat.reshape(-1, 2)
-        share = jnp.abs(units[second] - units[first]) / WIDER
-        size = jnp.where(share < HUBER, 0.5 * share**2 / HUBER + 0.5 * HUBER, share)
-        return 0.5 * jnp.sum(own(units) ** 2) + jnp.sum(size)
+        size = share(flat)
+        if kind == "gaussian":
+            size = 0.5 * size**2
+        else:
+            size = jnp.where(size < HUBER, 0.5 * size**2 / HUBER + 0.5 * HUBER, size)
+        return 0.5 * jnp.sum(residuals(flat) ** 2) + jnp.sum(size)
 
     both = jax.jit(jax.value_and_grad(cost))
-    plain, found = units_of(variation.values, mask), units_of(variation.smoothed, mask)
-    best = minimize(
-        lambda x: [np.asarray(one, float) for one in both(x)], plain.ravel(), jac=True, method="BFGS",
-        options={"gtol": 1e-4, "maxiter": 2000},
-    )  # fmt: skip
+    plain, ends = units_of(map.values), units_of(map.smoothed)
+    options = {"gtol": 1e-4, "maxiter": 2000}
+    best = minimize(lambda x: [np.asarray(one, float) for one in both(x)], plain.ravel(), jac=True, options=options)
     assert np.max(np.abs(best.jac)) < 1e-2  # slopes over a box: of next to nothing within an error
-    joint, errors = best.x.reshape(-1, 2), unit_errors(variation, mask)
-    assert np.max(np.abs(joint - plain) / errors) > 3.0
-    assert left_to_go(variation) < 0.1
-    assert np.max(np.abs(joint - found) / errors) < left_to_go(variation) + 2e-2
-    assert cost(found.ravel()) < cost(plain.ravel())
+    slope = (HIGH - LOW) * np.stack([map.smoothed[THICKNESS][MASK], np.ones(15)], axis=-1)
+    errors = np.stack([map.smoothed_errors[name][MASK] for name in NAMES], axis=-1) / slope
+    joint = best.x.reshape(-1, 2)
+    assert np.max(np.abs(joint - plain) / errors) > 3.0  # what is compared is no small change
+    *_, before, last = map.smoothing["largest_moves"]
+    remaining = last / (1.0 - last / before)  # at most, of a geometric series of moves, in standard errors
+    assert map.smoothing["settled"]
+    assert remaining < 0.1
+    assert np.max(np.abs(joint - ends) / errors) < remaining + (2e-3 if kind == "gaussian" else 2e-2)
+    assert cost(ends.ravel()) < cost(plain.ravel())
+    if kind == "gaussian":  # errors are those of Gauss-Newton at the optimum, with the neighbours held
+        jacobian = jax.jacfwd(lambda flat: jnp.concatenate([residuals(flat), share(flat).ravel()]))(best.x)
+        information = np.asarray(jacobian.T @ jacobian)
+        exact = [np.sqrt(np.diag(np.linalg.inv(information[k : k + 2, k : k + 2]))) for k in range(0, 30, 2)]
+        np.testing.assert_allclose(errors, exact, rtol=0.01)
 
 
-def test_total_variation_keeps_edges_better_than_a_gaussian(gaussian, variation):
-    jumps, scatter = [], []
-    for map in (gaussian, variation):
-        left, right = map.smoothed[ALBEDO][:, :2], map.smoothed[ALBEDO][:, 2:]
-        jumps.append(np.nanmean(right[:, 0]) - np.nanmean(left[:, 1]))
-        scatter.append(np.nanstd(left) + np.nanstd(right))
-    assert abs(jumps[1] - 0.3) < 0.5 * abs(jumps[0] - 0.3)
-    assert scatter[1] < scatter[0]
-
-
-def test_the_plain_fit_stays_and_texels_left_out_stay_out(tmp_path, gaussian, fitted, mask):
-    plain = fitted(tmp_path / "plain.zarr")
+def test_the_plain_fit_stays_and_masked_texels_stay_out(plain, gaussian):
     assert plain.smoothed is plain.smoothed_errors is plain.smoothing is None
     assert plain.attributes == gaussian.attributes
     for name in plain.arrays:
         np.testing.assert_array_equal(gaussian[name][:], plain[name][:], err_msg=name)
     for name in NAMES:
         for numbers in (gaussian.smoothed[name], gaussian.smoothed_errors[name]):
-            np.testing.assert_array_equal(np.isfinite(numbers), mask)
+            np.testing.assert_array_equal(np.isfinite(numbers), MASK)
         np.testing.assert_array_equal(gaussian[f"smoothed/values/{name}"][:], gaussian.smoothed[name])
-    assert "neighbours" in gaussian[f"smoothed/errors/{ALBEDO}"].attrs["long_name"]
 
 
-def test_what_is_not_named_is_not_smoothed(tmp_path, fitted):
-    map = fitted(tmp_path / "one.zarr", spatial_prior=fits.SpatialPrior("gaussian", {ALBEDO: 0.001}, rounds=4))
+def test_parameters_that_are_not_named_are_not_smoothed(out, fitted):
+    map = fitted(out, spatial_prior=fits.SpatialPrior("gaussian", {ALBEDO: 0.001}, rounds=4))
     assert map.smoothing["prior"] == {"kind": "gaussian", "scale": {ALBEDO: 0.001}, "rounds": 4, "settled": 0.01}
     assert not map.smoothing["settled"]
     rough = {name: np.nanstd(map.smoothed[name]) / np.nanstd(map.values[name]) for name in NAMES}
     assert rough[ALBEDO] < 0.5 < rough[THICKNESS]
 
 
-def test_a_run_that_was_stopped_between_rounds_is_resumed_to_the_bit(tmp_path, fitted, gaussian):
-    out, told = tmp_path / "stopped.zarr", []
-
+@pytest.mark.parametrize("how", ["stopped", "full disk"])
+def test_a_run_that_was_stopped_is_resumed_to_the_bit(out, monkeypatch, fitted, gaussian, how):
     def stop(stage, done, total=None, info=""):
-        if stage == "smoothing" and done == 2:
+        if stage == "smoothing" and done == 2 and how == "stopped":
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with full_disk(monkeypatch, 80 if how == "full disk" else None), pytest.raises((KeyboardInterrupt, OSError)):
         fitted(out, spatial_prior=GAUSSIAN, progress=stop)
     assert fits.open_map(out).done == 1.0
     assert fits.open_map(out).smoothed is None
     (out / "smoothed.partial" / "values").mkdir(parents=True)  # killed in the midst of the next
-    assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda *said: told.append(said[:2])), gaussian)
-    assert next(done for stage, done in told if stage == "smoothing") == 2  # not begun anew
+    rounds = []
+    again = fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, done, *_: rounds.append((stage, done)))
+    assert_same(again, gaussian)
+    assert next(done for stage, done in rounds if stage == "smoothing") >= 1  # not begun anew
 
 
-def test_a_full_disk_costs_a_round(tmp_path, monkeypatch, fitted, gaussian):
-    out, replace, calls = tmp_path / "full.zarr", Path.replace, []
-    fitted(out)
+def test_data_that_cannot_be_read_again_are_named(out, monkeypatch, fitted):
+    def gone(*_):
+        raise ValueError("values: damaged")
 
-    def full(source, target):
-        calls.append(target)
-        if len(calls) == 30:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target)
-
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(OSError, match="No space left"):
-        fitted(out, spatial_prior=GAUSSIAN)
-    monkeypatch.undo()
-    assert fits.open_map(out).smoothed is None
-    assert_same(fitted(out, spatial_prior=GAUSSIAN), gaussian)
-
-
-def test_data_that_cannot_be_read_again_are_named(tmp_path, monkeypatch, fitted):
-    out, read = tmp_path / "gone.zarr", MapData.read
-
-    def gone(data, block=()):
-        if monkeypatched:
-            raise ValueError("values: damaged")
-        return read(data, block)
-
-    monkeypatched = []
-    monkeypatch.setattr(MapData, "read", gone)
-    fitted(out)
     work = spatial.work
-    monkeypatch.setattr(spatial, "work", lambda *given: monkeypatched.append(1) or work(*given))
+    monkeypatch.setattr(spatial, "work", lambda *task: monkeypatch.setattr(MapData, "read", gone) or work(*task))
     with pytest.raises(ValueError, match=r"smoothing of chunk \[0:4, 0:3\]: values: damaged; the map is fitted"):
         fitted(out, spatial_prior=GAUSSIAN)
 
 
-def test_other_smoothness_smooths_anew_and_fits_nothing_again(tmp_path, fitted, gaussian):
-    out, told = tmp_path / "again.zarr", []
-    fitted(out, spatial_prior=VARIATION)
+def test_another_prior_smooths_anew_and_fits_nothing_again(tmp_path, smoothed, fitted, gaussian):
+    out, stages = shutil.copytree(smoothed["total_variation"].path, tmp_path / "again.zarr"), []
     before = {path: path.stat().st_mtime_ns for path in out.glob("values/**/c/*/*")}
-    found = fitted(out, spatial_prior=GAUSSIAN, progress=lambda *said: told.append(said[0]))
-    assert_same(found, gaussian)
-    assert "pilot" not in told
+    assert_same(fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage)), gaussian)
+    assert "pilot" not in stages
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    told.clear()
-    fitted(out, spatial_prior=GAUSSIAN, progress=lambda *said: told.append(said[0]))
-    assert "smoothing" not in told  # it is there
+    stages.clear()
+    fitted(out, spatial_prior=GAUSSIAN, progress=lambda stage, *_: stages.append(stage))
+    assert "smoothing" not in stages  # it is there
     assert fitted(out).smoothed is not None  # and stays
 
 
@@ -288,11 +222,11 @@ def test_other_smoothness_smooths_anew_and_fits_nothing_again(tmp_path, fitted, 
         ({"rounds": 1.5}, "SpatialPrior.rounds: 1.5 is not a whole number of at least 1"),
     ],
 )
-def test_spatial_priors_that_cannot_be_are_refused(tmp_path, measured, options, words):
-    given = {"kind": "gaussian", "scale": 0.1} | options
-    more = {name: given.pop(name) for name in ("objective", "stack") if name in given}
+def test_invalid_spatial_priors_are_refused(tmp_path, measured, options, words):
+    prior = {"kind": "gaussian", "scale": 0.1} | options
+    more = {name: prior.pop(name) for name in ("objective", "stack") if name in prior}
     with pytest.raises(ValueError, match=words):
-        quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**given))
+        quick_maps.fitted(tmp_path / "no.zarr", measured[0], **more, spatial_prior=fits.SpatialPrior(**prior))
     assert not (tmp_path / "no.zarr").exists()
     with pytest.raises(ValueError, match="spatial_prior"):
         MapOptions(spatial_prior=0.1)  # type: ignore[arg-type]
@@ -305,14 +239,13 @@ def test_spatial_priors_that_cannot_be_are_refused(tmp_path, measured, options, 
 def test_edges_are_those_of_a_loop_over_all_pairs(kind):
     rng = np.random.default_rng(0)
     shape, scales = (3, 4, 2), np.array([0.2, np.inf, 0.05])
-    units, there = rng.random((*shape, 3)), rng.random(shape) < 0.8
-    units[~there] = np.nan
-    centre, precision = Edges(kind, scales).prior_pull(units, there)
+    units, fitted = rng.random((*shape, 3)), rng.random(shape) < 0.8
+    units[~fitted] = np.nan
+    centre, precision = neighbour_prior(kind, scales, units, fitted)
     for place in np.ndindex(shape):
-        beside = [
-            other for other in np.ndindex(shape) if np.abs(np.subtract(place, other)).sum() == 1 and there[other]
-        ]  # fmt: skip
-        for k in (0, 1, 2) if there[place] else ():
+        beside = [other for other in np.argwhere(fitted).tolist() if np.abs(np.subtract(place, other)).sum() == 1]
+        beside = list(map(tuple, beside))
+        for k in (0, 1, 2) if fitted[place] else ():
             width = [max(abs(units[place][k] - units[other][k]), HUBER * scales[k]) for other in beside]
             weights = 1.0 / np.array([scales[k] ** 2 if kind == "gaussian" else scales[k] * one for one in width])
             assert precision[place][k] == pytest.approx(weights.sum())

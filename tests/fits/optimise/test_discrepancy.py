@@ -66,14 +66,14 @@ def test_repeats_are_fitted_by_what_their_own_readings_tell() -> None:
 
 
 def test_simulated_readings_share_errors(wrong: Fit) -> None:
-    steps, walkers = 64, 32
+    steps, walkers = 64, 16
     chain = np.tile(wrong.vector, (steps, walkers, 1))
     posterior = Posterior(wrong, chain, chain[..., 0], np.ones(chain.shape[-1]), 1.0, converged=True)
     simulated = posterior.inference_data.posterior_predictive["value"].to_numpy().reshape(-1, *wrong.predicted.shape)
     found = simulated / wrong.predicted
     at = wrong.problem.build(wrong.vector).correlation
     shared = at.amplitude * np.exp(at.grazing_exponent * np.asarray(log_scales(places(GEOMETRY.wi, GEOMETRY.wo))))
-    # of 2048 draws, and a regression on nodes between them
+    # of 1024 draws, and a regression on nodes between them
     np.testing.assert_allclose(np.log(found).std(axis=0)[:, 0], np.hypot(shared, 0.02), rtol=0.1)
 
 

@@ -83,7 +83,7 @@ def test_repeats_scatter_as_their_errors_say() -> None:
     """Pulls of 100 repeats have mean 0 and deviation 1, within 4 standard errors of those: 0.4 and 0.28."""
     problem = Problem(LOBE_STACK, noisy_lobe(0), lobe)
     values = np.stack([noisy_lobe(seed).values for seed in range(100)])
-    repeats = fit_many(problem, values, starts=8)
+    repeats = fit_many(problem, values, starts=4)
     truth = np.array([LOBE[name.strip("[']")] for name in problem.names])
     pulls = (repeats.vectors - truth) / repeats.standard_errors
     assert repeats.converged.all()

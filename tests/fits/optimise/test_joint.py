@@ -148,6 +148,7 @@ def test_the_posterior_is_that_of_all(joint):
     assert part.inference_data.posterior_predictive["value"].shape[-2:] == (COUNTS["second"], 1)
 
 
+@pytest.mark.slow
 def test_measurements_that_share_nothing_are_each_alone():
     """One with levels of noise that are fitted, one with errors that readings share."""
     values = design(60) @ [0.9, 0.4]

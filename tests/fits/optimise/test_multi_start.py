@@ -54,6 +54,7 @@ def cost_at(problem: Problem, values):
     return float(problem.call(cost_and_gradient, problem.model.box.to_unit(jnp.asarray(vector)))[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pair", "name", "degrees", "count"),
     [
@@ -165,6 +166,7 @@ def test_starts_are_those_of_the_same_fit_only(tmp_path):
     assert [kept(**other) for other in others] == [0] * len(others)
 
 
+@pytest.mark.slow
 def test_a_fit_does_not_end_on_a_plateau():
     """Of backward scattering `Statistical` knows nothing: the only start comes to rest where g is below 0."""
     noise = Noise(relative=0.02, floor=1e-6, discrepancy=False)

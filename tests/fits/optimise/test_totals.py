@@ -55,6 +55,7 @@ def test_all_that_is_left_of_a_lossless_slab_leaves():
     np.testing.assert_allclose(both.sum(axis=0), 1.0, atol=1e-3)  # of 8 nodes
 
 
+@pytest.mark.slow
 def test_totals_and_values_together_tell_more_than_either():
     stack = lj.Stack([lj.Medium(DEPTH, Free(0.5, 0.0, 1.0), lj.HenyeyGreenstein(0.2))])
     true = lj.Stack([lj.Medium(0.8, 0.6, lj.HenyeyGreenstein(0.2))])
@@ -75,6 +76,7 @@ def test_totals_and_values_together_tell_more_than_either():
     np.testing.assert_allclose((first + second) / np.outer(size, size), both / np.outer(size, size), atol=0.05)
 
 
+@pytest.mark.slow
 def test_a_total_costs_as_much_as_some_twenty_readings():
     """By operations: the solver knows the flux; what is left is the same solve, read off tables."""
     solver = lj.AddingDoubling(nodes=12, modes=16)

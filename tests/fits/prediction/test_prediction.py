@@ -105,7 +105,7 @@ def test_wrong_models_need_a_discrepancy() -> None:
     assert np.mean(better) > 1.0
 
 
-@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("shared", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     fitted, held_out = split(measurements(3, 0.1))
     noise = Noise(relative=SIGMA, floor=1e-4, discrepancy=shared)
@@ -122,6 +122,7 @@ def test_quantiles_are_those_of_the_draws(shared: bool) -> None:
     assert at.scores == scores(at, held_out)
 
 
+@pytest.mark.slow
 def test_what_is_predicted_first_is_the_bsdf_and_not_the_stack_alone() -> None:
     """The truth is known: a stack that is wrong by 10 %, smoothly in angle. Its intervals hold that, 95 of 100."""
     inside: dict[str, list[float]] = {"bsdf": [], "latent": []}

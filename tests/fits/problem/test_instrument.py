@@ -240,6 +240,7 @@ FREE = metal(Free(0.1, 1e-3, 1.0, LogUniform()), Free(3.0, 1.0, 8.0))
 NOISE = fits.Noise(relative=0.01, floor=1e-4, discrepancy=False)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_the_rays_that_the_lobe_asks_for_and_counts_what_is_left() -> None:
     """At 1.4 widths of the lobe four rays made k 2.78 +- 0.12 of 3.5."""
     data, seen = through(0.02, 1.4)
@@ -276,6 +277,7 @@ def test_a_broad_lobe_keeps_four_rays() -> None:
     assert limited_with(found) == {}
 
 
+@pytest.mark.slow
 def test_what_a_lobe_decides_is_named_also_where_its_width_is_at_a_bound() -> None:
     """The albedo of a matt part beside it is not: readings far from the lobe know it."""
     data, seen = through(0.004, 8.0)

@@ -73,6 +73,7 @@ def test_shares_are_recovered(file: Path) -> None:
     assert np.sum(np.abs(pulls[:, NAMES.index("weights.dust")]) < 3.0) >= 98
 
 
+@pytest.mark.slow
 def test_all_orders_choose_one_resolution_for_all_parts() -> None:
     def mixed(alpha, weight) -> lj.Mixture:
         coat = lj.Stack([lj.Interface(1.5, alpha)], lj.Lambertian(0.3))

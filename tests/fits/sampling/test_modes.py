@@ -88,7 +88,7 @@ def test_draws_by_weight_are_of_all_modes(fitted: Fit, summed: Sums) -> None:
     assert np.mean(larger) == pytest.approx(share, abs=4.0 * math.sqrt(share * (1.0 - share) / 500.0))
 
 
-@pytest.mark.parametrize("sampler", ["emcee", "nuts"])
+@pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
 def test_chains_visit_all_modes_as_often_as_they_are_likely(
     fitted: Fit, summed: Sums, sampler: Sampler, tmp_path: Path
 ) -> None:

@@ -92,6 +92,7 @@ def test_without_its_extra_it_says_how_to_get_it(result: Fit, monkeypatch: pytes
         sample(result, sampler="nuts")
 
 
+@pytest.mark.slow
 def test_the_command_samples_with_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -65,7 +65,8 @@ def test_trajectories_jump_along_it_and_go_on_from_their_file(tmp_path):
     np.testing.assert_array_equal(longer.chain, posterior.chain)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
 def test_haze_and_albedo_times_scale(seed):
     """By integration over thickness and albedo, with the scale integrated as the Gaussian that it nearly is."""
     posterior = sampled(HAZE, seed)

@@ -66,7 +66,7 @@ def test_one_parameter(sampler: Sampler) -> None:
     assert deviation == pytest.approx(spread, rel=error)
 
 
-@pytest.mark.parametrize("sampler", get_args(Sampler))
+@pytest.mark.parametrize("sampler", ["emcee", pytest.param("nuts", marks=pytest.mark.slow)])
 def test_a_direction_that_is_open_fills_its_box(sampler: Sampler) -> None:
     fitted = fit({**LINE, "c": Free(0.5, 0.0, 1.0)}, line_data(), transport=line, starts=2)
     posterior = sample(fitted, sampler=sampler, seed=3)

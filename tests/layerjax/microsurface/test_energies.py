@@ -173,28 +173,38 @@ def test_values_and_derivatives_are_finite_over_the_box(dtype):
         assert np.all(np.isfinite(slopes))
 
 
-def test_derivatives_equal_differences():
-    cosine, alpha, ior = (
-        jnp.array([0.6, 0.999999, 0.4, 0.8]),
-        jnp.array([0.3, 0.2, 0.15, 0.5]),
-        jnp.array([1.5, 1.5, 0.7, 0.9]),
-    )
-    for function, arguments in (
-        (both_kinds, (cosine, alpha, ior)),
-        (lambda c, a, n, k: conductor_energy(c, a, n, k, "multiple"), (cosine, alpha, ior, 2.0 + 0.0 * ior)),
-        (retained, (cosine, alpha, 0.6 * ior)),
-    ):
-        compiled = with_slopes(function)
-        _, slopes = compiled(*arguments)
-        for i, slope in enumerate(slopes):
-            step = 3e-7
-            above, below = (
-                compiled(*(x + sign * step if i == j else x for j, x in enumerate(arguments)))[0] for sign in (1, -1)
-            )
-            np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=2e-3, atol=2e-4)
+COSINE, ALPHA, IOR = (
+    np.array([0.6, 0.999999, 0.4, 0.8]),
+    np.array([0.3, 0.2, 0.15, 0.5]),
+    np.array([1.5, 1.5, 0.7, 0.9]),
+)
 
 
-def test_reverse_derivatives_equal_forward_ones():
+@pytest.mark.parametrize(
+    ("function", "arguments"),
+    [
+        (both_kinds, (COSINE, ALPHA, IOR)),
+        pytest.param(
+            *(lambda c, a, n, k: conductor_energy(c, a, n, k, "multiple"), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
+            marks=pytest.mark.slow,
+        ),
+        (retained, (COSINE, ALPHA, 0.6 * IOR)),
+    ],
+    ids=["interfaces", "metals", "retained"],
+)
+def test_derivatives_equal_differences(function, arguments):
+    compiled = with_slopes(function)
+    _, slopes = compiled(*arguments)
+    for i, slope in enumerate(slopes):
+        step = 3e-7
+        above, below = (
+            compiled(*(x + sign * step if i == j else x for j, x in enumerate(arguments)))[0] for sign in (1, -1)
+        )
+        np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=2e-3, atol=2e-4)
+
+
+@pytest.mark.parametrize("function", [pytest.param(lambda *x: single(*x)[0], marks=pytest.mark.slow), retained])
+def test_reverse_derivatives_equal_forward_ones(function):
     x = jnp.array([0.6, 0.3, 0.8])
-    for function in (lambda x: single(*x)[0], lambda x: retained(*x)):
-        np.testing.assert_allclose(jax.jit(jax.grad(function))(x), jax.jit(jax.jacfwd(function))(x), rtol=1e-8)
+    reverse, forward = (jax.jit(mode(lambda x: function(*x)))(x) for mode in (jax.grad, jax.jacfwd))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)

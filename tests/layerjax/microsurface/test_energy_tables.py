@@ -79,16 +79,17 @@ def test_derivatives_are_continuous_across_cells() -> None:
     flat = rng.normal(size=(9, 8)).ravel()
     edges = jnp.arange(1, 6) / 6.0
 
+    @jax.jit
     def along(x):
         return read(flat, 0, (9, 8), (x, jnp.full_like(x, 0.37)))[0]
 
-    slope = jax.vmap(jax.grad(along))
-    for function in (along, slope, jax.vmap(jax.grad(lambda x: slope(x[None])[0]))):
+    slope = jax.jit(jax.vmap(jax.grad(along)))
+    for function in (along, slope, jax.jit(jax.vmap(jax.grad(lambda x: slope(x[None])[0])))):
         before, after = function(edges - 1e-9), function(edges + 1e-9)
         np.testing.assert_allclose(before, after, atol=1e-5 * np.abs(flat).max())
     x, step = jnp.linspace(0.05, 0.95, 40), 1e-5
     np.testing.assert_allclose(slope(x), (along(x + step) - along(x - step)) / (2 * step), atol=1e-6)
-    np.testing.assert_allclose(jax.vmap(jax.jacfwd(along))(x), slope(x), rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.jacfwd(along)))(x), slope(x), rtol=1e-12)
 
 
 def test_cubics_are_found_again() -> None:
@@ -100,7 +101,7 @@ def test_cubics_are_found_again() -> None:
     np.testing.assert_allclose(found, (1.0 + places[0] ** 3) * (2.0 - places[1] ** 2), rtol=1e-10)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_ends_of_the_box(dtype) -> None:
     """Finite, in [0, 1], and with finite derivatives of both modes, everywhere."""
     axes = np.meshgrid([1e-6, 1e-3, 0.3, 1.0], [1e-4, 0.1, 1.0], [0.25, 1.0 - 1e-6, 1.0, 1.0 + 1e-6, 4.0])

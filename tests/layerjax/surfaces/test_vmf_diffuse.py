@@ -166,8 +166,7 @@ def value(parameters, wi, wo, form="paper"):
     ("dtype", "mode"),
     [
         (np.float32, "reverse"),
-        (np.float64, "reverse"),
-        pytest.param(np.float32, "forward", marks=pytest.mark.slow),
+        *(pytest.param(*how, marks=pytest.mark.slow) for how in ((np.float64, "reverse"), (np.float32, "forward"))),
     ],
 )
 def test_values_and_gradients_are_finite(dtype, mode):
@@ -258,6 +257,7 @@ def test_the_former_name_of_a_form_stands_for_its_present_one():
     assert lj.VMFDiffuse.from_diffuse_albedo(0.5, 0.3, "transport").form == "all_orders"
 
 
+@pytest.mark.slow
 def test_diffuse_albedo_comes_back_when_it_is_solved_for():
     def solved(k, r):
         return lj.VMFDiffuse.from_diffuse_albedo(jnp.stack([jnp.asarray(k), 0.8, 0.95]), r, exact=True)
@@ -305,6 +305,7 @@ def test_references_agree_on_it_as_a_base():
     np.testing.assert_array_less(np.abs(values - walked), 4 * errors + 0.005 * walked)
 
 
+@pytest.mark.slow
 def test_statistics_use_its_own_albedo():
     # what a black base lacks is the light that has met the base; the mean albedo in place of its own errs by 3 %
     wi, solver = along([1.0, 0.7, 0.4, 0.15]), lj.AddingDoubling(nodes=16, modes=1)

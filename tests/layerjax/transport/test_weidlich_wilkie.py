@@ -243,8 +243,15 @@ def draw(seed):
     return ranges, wi, wo
 
 
-@pytest.mark.parametrize("name", BOX)
-@pytest.mark.parametrize(("dtype", "mode"), [(np.float32, "reverse"), (np.float64, "forward")])
+@pytest.mark.parametrize(
+    ("name", "dtype", "mode"),
+    [
+        ("coated metal", np.float32, "reverse"),
+        ("coat on rough diffuse", np.float64, "forward"),
+        pytest.param("coated metal", np.float64, "forward", marks=pytest.mark.slow),
+        pytest.param("coat on rough diffuse", np.float32, "reverse", marks=pytest.mark.slow),
+    ],
+)
 def test_values_gradients_and_weights_are_finite(name, dtype, mode):
     make = BOX[name]
     parameters, wi, wo = jax.tree.map(lambda x: x.astype(dtype), draw(11))

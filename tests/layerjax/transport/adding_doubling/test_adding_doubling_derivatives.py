@@ -46,18 +46,20 @@ def extreme_stack(kind, generator):
     return Stack([flakes((1.0, 0.0, 0.0)), haze(), flakes((0.3, 0.2, 0.9))])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.grad, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
 def test_derivatives_of_many_stacks_side_by_side(mode):
     """Of a batch as a whole, for what the operators of a layer depend on: its index and its phase function."""
 
     def value(x):
-        stack = Stack([Interface(1.2 + x, 0.3), Medium(0.5, 0.9, HenyeyGreenstein(x))], lj.Conductor(1.0, 3.0, 0.2))
+        stack = Stack([Interface(1.2 + x, 0.3), Medium(0.5, 0.9, HenyeyGreenstein(x))], lj.Lambertian(0.5))
         return lj.evaluate(stack, wi, wo, lj.AddingDoubling(nodes=4, modes=2))[0, 0]
 
     wi, wo = jnp.asarray([[0.0, 0.6, 0.8]]), jnp.asarray([[0.6, 0.0, 0.8]])
     x = jnp.asarray([0.3, 0.4])
     together = jax.jit(mode(lambda x: jnp.sum(jax.vmap(value)(x))))(x)
-    np.testing.assert_allclose(together, [jax.jit(mode(value))(one) for one in x], rtol=1e-9)
+    values, step = jax.jit(jax.vmap(value)), 1e-5
+    np.testing.assert_allclose(together, (values(x + step) - values(x - step)) / (2.0 * step), rtol=1e-6)
 
 
 def test_elements_are_differentiated_by_directions_too():

@@ -10,6 +10,7 @@ import layerjax as lj
 WI, WO = lj.direction(0.84, 0.0), lj.direction(1.14, 2.9)
 
 
+@pytest.mark.slow
 def test_a_slab_of_low_index_settles() -> None:
     """Where it is known that the index below is that above, they share panels of nodes; traced, each has its own. With
     12 nodes the two differ by 3e-3, with 24 by 2e-5; a blur of rays over the edges of panels makes that 1e-2."""

@@ -58,6 +58,7 @@ def test_what_ends_like_a_root_has_its_mean(edge: float) -> None:
     assert found == pytest.approx(exact, rel=2e-4)
 
 
+@pytest.mark.slow
 def test_tables_are_smooth_in_an_inner_interface() -> None:
     """Over metal, which does not make light diffuse: second differences 5e-5 apart, 1e-3 where rays jump over edges."""
     incidence, outgoing = np.radians([10.0, 60.0]), np.radians(np.linspace(-70.0, 70.0, 9))
@@ -78,6 +79,7 @@ def test_tables_are_smooth_in_an_inner_interface() -> None:
         assert np.abs(np.diff(found, 2, axis=0) / found[0]).max() < 5e-6
 
 
+@pytest.mark.slow
 def test_what_is_far_from_a_mirrors_lobe_is_that_of_the_walk() -> None:
     """Under a rough interface, at 48 nodes: values of 2^17 paths, to 0.5 % at most; edges as wide as at 8 nodes had
     one 22 % beside."""

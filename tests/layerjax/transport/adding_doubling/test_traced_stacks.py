@@ -84,6 +84,7 @@ def test_values_and_slopes_under_grad(kind, seed):
     assert np.all(off < 0.01), off
 
 
+@pytest.mark.slow
 def test_slopes_by_a_narrow_coat():
     """By the width itself 3 % of the values are left at the 6 nodes that are chosen, and 12 leave 0.3 %."""
     numbers = drawn("coated metal", 2)

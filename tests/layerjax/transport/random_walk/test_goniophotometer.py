@@ -11,7 +11,7 @@ from layerjax.surfaces.interface import interface_reflection, interface_transmis
 from tests.helpers.cases import HEMISPHERES, fig7, flakes, haze, surface_3
 
 KEY = jax.random.key(20)
-PATHS = 200_000
+PATHS = 50_000
 INCIDENT = (0.5, 0.3)
 
 

@@ -224,6 +224,7 @@ def test_nothing_is_lost_without_absorption():
     np.testing.assert_allclose(apart, 1.0, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_finite_over_the_box(dtype):
     axes = [1e-6, 0.3, np.sqrt(1 - 0.7**2), 1.0], [1e-4, 0.1, 1.0], [0.25, 0.7, 0.999, 1.0, 1.5, 4.0], [0.0, 1e-3, 1.0]

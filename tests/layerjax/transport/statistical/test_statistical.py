@@ -104,6 +104,7 @@ def test_symmetric_model_is_reciprocal(stack):
     assert np.any(there > 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theta", [0.0, 1.1, 2.3])
 def test_forward_model_conserves_energy_in_a_furnace(theta):
     """A lossless slab: the energies of its lobes, and, within 4 standard errors, what its samples carry."""
@@ -125,7 +126,7 @@ def test_what_nothing_meets_is_not_in_the_albedo():
 @pytest.mark.parametrize(
     ("stack", "transport", "theta"),
     [
-        (COAT, FORWARD, 0.5),
+        pytest.param(COAT, FORWARD, 0.5, marks=pytest.mark.slow),
         (DIFFUSE, FORWARD, 1.2),
         pytest.param(SLAB, FORWARD, 0.5, marks=pytest.mark.slow),
         pytest.param(SLAB, FORWARD, 2.4, marks=pytest.mark.slow),
@@ -147,6 +148,7 @@ def test_samples_follow_their_density_and_have_the_albedo_as_mean_weight(stack, 
     assert abs(float(jnp.mean(weight[:, 0]) - expected)) < 4 * noise + 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ior", "absorbing"),
     [
@@ -165,7 +167,7 @@ def test_closed_form_of_a_coated_diffuse_base(ior, absorbing):
     wi = lj.direction(jnp.array([0.2, 0.6, 1.1]), 0.0)
     wo = lj.direction(jnp.array([0.5, 0.9, 0.4]), 1.4)
     values = lj.evaluate(stack, wi, wo, transport)
-    estimates, errors = lj.evaluate_with_error(stack, wi, wo, lj.RandomWalk(paths=1 << 16), key=jax.random.key(5))
+    estimates, errors = lj.evaluate_with_error(stack, wi, wo, lj.RandomWalk(paths=1 << 14), key=jax.random.key(5))
     np.testing.assert_array_less(np.abs(values - estimates), 4 * errors + 3e-3 * np.abs(estimates))
 
 

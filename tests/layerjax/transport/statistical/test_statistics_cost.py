@@ -43,6 +43,7 @@ def test_smooth_interfaces(microfacets):
     assert smooth < rough
 
 
+@pytest.mark.slow
 def test_bases():
     """No diffuse base asks for a solver unasked, but one that is not Lambertian; bare it is itself."""
     two = [COAT, lj.Interface(1.8, 0.1)]

@@ -12,6 +12,7 @@ from layerjax.transport.statistical import stream_layers, streams
 from layerjax.transport.statistical.diffuse_base import make_diffuse
 from layerjax.transport.statistical.hazy_base import HazyBase, is_hazy, make_hazy
 from layerjax.transport.statistical.streamed_base import StreamedBase, is_streamed, make_streamed
+from tests.helpers.compiled import compiled
 
 COAT, INNER, DYE = lj.Interface(1.5, 0.1), lj.Interface(1.9, 0.3), lj.Medium([0.3, 1.0], 0.0)
 HAZE = lj.Medium([0.5, 2.0], 0.9, lj.HenyeyGreenstein(0.7))
@@ -34,8 +35,8 @@ STRUCTURES = {
     "haze on haze": [HAZE, COAT, HAZE],
     "thinner than air": [lj.Interface(0.8, 0.1), HAZE],
 }
-OFTEN = ("two interfaces", "haze", "dye on a coat", "haze on a coat", "haze alone")
-"""One for each way that the base is reached; the others are slow tests."""
+OFTEN = ("haze on a coat",)
+"""The others are slow tests."""
 
 
 def made(stack: Stack) -> HazyBase | StreamedBase:
@@ -51,22 +52,28 @@ def test_light_from_the_base_is_as_solved(name: str) -> None:
     assert is_streamed(stack) is not is_hazy(stack)
     angles = np.random.default_rng(0).uniform(0.05, 1.4, (2, 200))
     wi, wo = ((jnp.sin(t), 0.0 * t, jnp.cos(t)) for t in map(jnp.asarray, angles))
-    part, solved = made(stack), make_diffuse(stack, stack.base, "multiple")
+
+    @compiled
+    def values_and_albedos(wi, wo):
+        parts = made(stack), make_diffuse(stack, stack.base, "multiple")
+        return [(part.value(wi, wo), part.albedo(wi)) for part in parts]
+
+    (values, albedos), (solved, solved_albedos) = values_and_albedos(wi, wo)
     error = FALLING if name == "down in index" else ERROR
-    for found, wanted in zip(part.value(wi, wo), solved.value(wi, wo), strict=True):
-        apart = np.asarray(found - wanted)
-        assert np.sqrt(np.sum(apart**2) / np.sum(np.asarray(wanted) ** 2)) < error
-    for found, wanted in zip(part.albedo(wi), solved.albedo(wi), strict=True):
+    for found, wanted in zip(values, solved, strict=True):
+        assert np.sqrt(np.sum((found - wanted) ** 2) / np.sum(wanted**2)) < error
+    for found, wanted in zip(albedos, solved_albedos, strict=True):
         np.testing.assert_allclose(found, wanted, atol=error)
 
 
+@pytest.mark.slow
 def test_a_map_is_its_stacks() -> None:
     """Over a diffuse base texels go together, and each is as its stack by itself; the exact solve stays an option."""
     depths = np.asarray([[0.1, 0.4], [1.0, 2.0]])[..., None]  # one number for all channels
     alphas = np.asarray([[0.1, 0.2], [0.3, 0.02]])
 
     def stack(alpha, depth):
-        return lj.Stack([lj.Interface(1.5, alpha), lj.Medium(depth, 0.8, lj.HenyeyGreenstein(0.5)), INNER], BASE)
+        return lj.Stack([lj.Interface(1.5, alpha), lj.Medium(depth, 0.8, lj.HenyeyGreenstein(0.5))], BASE)
 
     wi, wo = lj.direction(0.5, 0.0), lj.direction(0.9, 2.0)
     together = lj.evaluate(stack(alphas, depths), wi, wo, lj.Statistical())
@@ -80,7 +87,14 @@ def test_a_map_is_its_stacks() -> None:
 MILK = lj.Medium(3.0, 1.0, lj.HenyeyGreenstein(0.8))
 
 
-@pytest.mark.parametrize("layers", [[COAT, INNER], [COAT, MILK, INNER], [MILK], [MILK, COAT, MILK]])
+@pytest.mark.parametrize(
+    "layers",
+    [
+        [COAT, MILK, INNER],
+        [MILK],
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ([COAT, INNER], [MILK, COAT, MILK])),
+    ],
+)
 def test_nothing_is_lost(layers) -> None:
     """What diffuse light from the base does not return to it leaves: energy over a base that absorbs nothing is 1."""
     stack = simplify(lj.Stack(layers, lj.Lambertian(1.0)))
@@ -88,7 +102,8 @@ def test_nothing_is_lost(layers) -> None:
     np.testing.assert_allclose(energy, 1.0, atol=1e-13)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
     """Finite at the ends, along grazing light too, and as differences say, which at ends look inward."""
 
@@ -109,7 +124,7 @@ def test_derivatives_of_haze_on_top(dtype: jnp.dtype) -> None:
         values = jax.jit(jax.vmap(value))
         ahead = [values(at[:, 0] + k * step, *at[:, 1:].T) for k in (0, 1, 2)]
         slope = (-3.0 * ahead[0] + 4.0 * ahead[1] - ahead[2]) / (2.0 * step)
-        np.testing.assert_allclose(jax.vmap(jax.grad(value))(*at.T), slope, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(value)))(*at.T), slope, rtol=1e-5, atol=1e-9)
 
 
 @pytest.mark.parametrize("g", [-0.5, 0.0, 0.9])
@@ -149,19 +164,20 @@ def test_slabs_at_ends(dtype) -> None:
 
 
 def test_derivatives_of_slabs_at_ends() -> None:
+    @jax.jit
     def energy(thickness, albedo, g):
         reflected, passed = stream_layers.slab(thickness[None], albedo[None], g[None])
         return jnp.stack([streams.DIFFUSE @ part[0] @ streams.DIFFUSE for part in (reflected, passed)])
 
+    ahead, back = (jax.jit(mode(energy, argnums=(0, 1, 2))) for mode in (jax.jacfwd, jax.jacrev))
     for place in ((0.0, 0.5, 0.3), (1.0, 0.0, 0.0), (1e4, 1.0, 0.999), (2.0, 1.0, -0.999)):
-        place = tuple(map(jnp.asarray, place))
-        for mode in (jax.jacfwd, jax.jacrev):
-            assert np.all(np.isfinite(np.stack(mode(energy, argnums=(0, 1, 2))(*place))))
+        for derivatives in (ahead, back):
+            assert np.all(np.isfinite(np.stack(derivatives(*map(jnp.asarray, place)))))
     step, at = 1e-5, [jnp.asarray(x) for x in (0.8, 0.6, 0.4)]
-    slopes = jax.jacfwd(energy, argnums=(0, 1, 2))(*at)
+    slopes = ahead(*at)
     for k, slope in enumerate(slopes):
-        ahead, behind = ([x + s * step * (j == k) for j, x in enumerate(at)] for s in (1.0, -1.0))
-        np.testing.assert_allclose(slope, (energy(*ahead) - energy(*behind)) / (2.0 * step), rtol=1e-6, atol=1e-9)
+        above, below = ([x + s * step * (j == k) for j, x in enumerate(at)] for s in (1.0, -1.0))
+        np.testing.assert_allclose(slope, (energy(*above) - energy(*below)) / (2.0 * step), rtol=1e-6, atol=1e-9)
 
 
 def test_packing_keeps_the_matrices() -> None:
@@ -179,6 +195,7 @@ def test_packing_keeps_the_matrices() -> None:
     np.testing.assert_allclose(outward[:, 0] + inner[:, 0], first[None].repeat(3, 0), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_interfaces_are_as_their_quadrature() -> None:
     """Between the points of the table. No entry is further off than is stated."""
     random = np.random.default_rng(0)
