@@ -9,8 +9,8 @@ from fits._lazy import directory_of, names_from
 
 if TYPE_CHECKING:
     from fits.any_report import report as report
-    from fits.batch.fit_files import FittedFiles as FittedFiles
-    from fits.batch.fit_files import fit_files as fit_files
+    from fits.batch import FittedFiles as FittedFiles
+    from fits.batch import fit_files as fit_files
     from fits.data.formats.csv import write_csv as write_csv
     from fits.data.formats.rxt import Slab as Slab
     from fits.data.formats.rxt import read_slab as read_slab
@@ -69,13 +69,13 @@ if TYPE_CHECKING:
     from fits.sampling.posterior import Mode as Mode
     from fits.sampling.posterior import Posterior as Posterior
     from fits.sampling.sample import sample as sample
-    from fits.structure_search.library import Library as Library
-    from fits.structure_search.library import default_library as default_library
-    from fits.structure_search.library import read_library as read_library
-    from fits.structure_search.search import Candidate as Candidate
-    from fits.structure_search.search import Search as Search
-    from fits.structure_search.search import SearchOptions as SearchOptions
-    from fits.structure_search.search import search as search
+    from fits.structure_search import Candidate as Candidate
+    from fits.structure_search import Library as Library
+    from fits.structure_search import Search as Search
+    from fits.structure_search import SearchOptions as SearchOptions
+    from fits.structure_search import default_library as default_library
+    from fits.structure_search import read_library as read_library
+    from fits.structure_search import search as search
 
 _HOMES = {
     "Average": "prediction.average",
@@ -126,16 +126,16 @@ _HOMES = {
     "scores": "prediction.predict",
     "predict": "prediction.predict",
     "sample": "sampling.sample",
-    "Candidate": "structure_search.search",
-    "Search": "structure_search.search",
-    "SearchOptions": "structure_search.search",
-    "search": "structure_search.search",
-    "Library": "structure_search.library",
-    "default_library": "structure_search.library",
-    "read_library": "structure_search.library",
+    "Candidate": "structure_search",
+    "Search": "structure_search",
+    "SearchOptions": "structure_search",
+    "search": "structure_search",
+    "Library": "structure_search",
+    "default_library": "structure_search",
+    "read_library": "structure_search",
     "cross_validate": "prediction.cross_validation",
-    "fit_files": "batch.fit_files",
-    "FittedFiles": "batch.fit_files",
+    "fit_files": "batch",
+    "FittedFiles": "batch",
     "Problem": "problem.problem",
     "render": "reports.render",
     "report": "any_report",

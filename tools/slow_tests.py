@@ -78,7 +78,7 @@ def number() -> int:
 
 
 def collected() -> list[str]:
-    command = [sys.executable, "-m", "pytest", "-m", "slow", "-n", "0", "--collect-only", "-q"]
+    command = [sys.executable, "-m", "pytest", "-o", "addopts=", "-m", "slow", "--collect-only", "-q"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     return [line for line in done.stdout.splitlines() if "::" in line]
 

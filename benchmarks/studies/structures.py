@@ -17,8 +17,7 @@ from benchmarks.suite import coated_haze
 from fits.data.measurements import Measurements
 from fits.engines import Failure, run
 from fits.problem.compilation import cores
-from fits.structure_search.library import Library, Structure, default_library
-from fits.structure_search.search import named
+from fits.structure_search import Library, Structure, default_library, named
 
 NAME = "structures"
 REPEATS, QUICK = 40, 4

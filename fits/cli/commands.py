@@ -5,25 +5,17 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 
 import os
 from argparse import Namespace
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fits._files import write_bytes, write_text
-from fits.cli.input_output import read_options, refuse_alone, refuse_existing, require_free_place, show
-from fits.cli.interrupts import hint
-from fits.cli.many import fit_many as fit_many
-from fits.cli.many import search as search
-from fits.cli.maps import fit_map as fit_map
-from fits.cli.maps import is_map, report_map
-from fits.cli.materials import export as export
-from fits.cli.materials import render as render
-from fits.cli.materials import simulate as simulate
-from fits.cli.materials import write_measurements
-from fits.cli.setting import use_jax
-from fits.data.geometry import Geometry, slices
-from fits.data.measurements import Measurements
+from fits.cli.input_output import DONE, DOUBTFUL, hint, read_options, refuse_alone, require_free_place, show, use_jax
+from fits.cli.maps import fit_map, is_map, report_map
+from fits.cli.materials import export, render, simulate, write_measurements
+from fits.data.geometry import slices
 from fits.data.totals import Totals
 from fits.progress import show_progress
 
@@ -31,125 +23,99 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from fits.sampling.posterior import Posterior
 
-DONE, DOUBTFUL = 0, 1
+DRAWING = "pictures and report"
+
+# ---- a fit and what follows from it ----
 
 
 def fit(arguments: Namespace) -> int:
     """Fit a stack, save the result with its report, and print the table."""
     use_jax()
-    from fits.batch.fit_file import fit_into
+    from fits.batch import fit_file
     from fits.problem.stack_file import read_problem
     from fits.reports import results, tables, verdicts
 
-    directory = Path(arguments.out)
-    results.check_directory(directory, arguments.force)
+    directory, force = Path(arguments.out), arguments.force
+    results.check_directory(directory, force)
     data, held_out = read_options(arguments).split(arguments.data)
-    given = read_problem(arguments.stack)
+    given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed}
     resume = f"{directory} was not written; the same command resumes with the starts that are done"
     with show_progress() as progress, hint(resume):
-        result, predicted = fit_into(
-            directory,
-            given,
-            data,
-            held_out,
-            starts=arguments.starts,
-            seed=arguments.seed,
-            force=arguments.force,
-            progress=progress,
-        )
-    show(tables.parameter_table(result), *verdicts.summary(result), f"Report: {directory / results.REPORT}")
-    if predicted is not None:
-        show(tables.scores_table(predicted.prediction, predicted.data, "Held-out data"))
-    return DONE if result.converged else DOUBTFUL
+        whole = fit_file(directory, given, data, held_out, **how, force=force, progress=progress)
+    words = verdicts.summary(whole.fit)
+    show(tables.parameter_table(whole.fit), *words, f"Report: {directory / results.REPORT}")
+    if held_out is not None and whole.predicted is not None:
+        show(tables.scores_table(whole.predicted, held_out, "Held-out data"))
+    return DONE if whole.fit.converged else DOUBTFUL
 
 
 def sample(arguments: Namespace) -> int:
-    """Sample the posterior of a saved fit, resuming its chain."""
+    """Sample the posterior of a saved fit, resuming its chain, with the sampler and walkers that it has."""
     use_jax()
     from fits.reports import results, tables, verdicts
-    from fits.reports.html import write_report
+    from fits.reports.html import FitReport
     from fits.sampling.sample import sample as run_sampler
+    from fits.sampling.sample import settings_of
+    from fits.store import Store
 
     directory = Path(arguments.directory)
-    result = results.load_fit(directory)
+    result, chain = results.load_fit(directory), directory / results.CHAIN
     if not result.is_posterior:
         raise ValueError(f"{directory}: fitted with {result.problem.objective!r}, which has no posterior to sample")
-    settings = _chain_settings(directory / results.CHAIN, arguments)
+    sampler, walkers = "emcee", None
+    if not arguments.force and chain.is_file() and (kept := Store.read(chain)).fingerprint:
+        sampler, walkers, _ = settings_of(kept)
+    settings: dict[str, Any] = {name: getattr(arguments, name) for name in ("ess", "max_steps", "allow_unconverged")}
+    settings |= {"sampler": arguments.sampler or sampler, "walkers": arguments.walkers or walkers}
     with show_progress() as progress, hint(f"the chain is kept, `layerjax sample {directory}` resumes it"):
-        posterior = run_sampler(
-            result,
-            **settings,
-            ess=arguments.ess,
-            max_steps=arguments.max_steps,
-            path=directory / results.CHAIN,
-            resume=not arguments.force,
-            allow_unconverged=arguments.allow_unconverged,
-            progress=progress,
-        )
-        progress("pictures and report", 0, 1)
+        posterior = run_sampler(result, **settings, path=chain, resume=not arguments.force, progress=progress)
+        progress(DRAWING, 0, 1)
         if verdicts.reportable(posterior):
             results.save_posterior(posterior, directory)
         else:
             (directory / results.SUMMARY).unlink(missing_ok=True)
-        write_report(directory, directory.resolve().name, result, posterior)
-        progress("pictures and report", 1, 1)
+        name, held_out = directory.resolve().name, results.load_held_out(directory)
+        FitReport(result, posterior, name=name, held_out=held_out).write(directory)
+        progress(DRAWING, 1, 1)
     if verdicts.reportable(posterior):
         show(tables.posterior_table(posterior))
     show(*verdicts.sampled(posterior), f"Report: {directory / results.REPORT}")
-    reached = float(np.min(posterior.effective_samples))
-    enough = posterior.converged and reached >= posterior.options.ess
+    enough = posterior.converged and np.min(posterior.effective_samples) >= posterior.options.ess
     if not enough:
         ess = "" if arguments.ess is None else f" --ess {arguments.ess}"
         print(f"To resume: layerjax sample {directory}{ess} --max-steps {2 * len(posterior.chain)}")
     return DONE if enough else DOUBTFUL
 
 
-def _chain_settings(path: Path, arguments: Namespace) -> dict[str, Any]:
-    """Sampler and walkers: those of the chain that is kept, which arguments must not contradict, or defaults."""
-    from fits.sampling.sample import settings_of
-    from fits.store import Store
-
-    stored: dict[str, Any] = {}
-    if not arguments.force and path.is_file() and (there := Store.read(path)).fingerprint:
-        stored = dict(zip(("sampler", "walkers"), settings_of(there), strict=False))
-    settings: dict[str, Any] = {}
-    for name, default in (("sampler", "emcee"), ("walkers", None)):
-        given, before = getattr(arguments, name), stored.get(name)
-        if given is not None and before is not None and given != before:
-            raise ValueError(f"--{name} is {given}, the chain in {path} has {before} (--force starts it again)")
-        settings[name] = given if given is not None else default if before is None else before
-    return settings
-
-
 def predict(arguments: Namespace) -> int:
     """Write the prediction at other directions, or print how well measurements are predicted."""
-    if (arguments.incidence is None) == (arguments.score is None):
+    scored, out = arguments.score is not None, arguments.out
+    if bool(arguments.incidence) == scored:
         raise ValueError("predict needs one of --incidence and --score")
-    if arguments.score is None and arguments.out is None:
+    if not scored and out is None:
         raise ValueError("predict --incidence needs --out FILE")
-    if arguments.score is None:
-        refuse_alone(arguments, ("select", "read"), "score")
-    else:
+    if scored:
         refuse_alone(arguments, ("azimuth",), "incidence")
-    if arguments.out is not None:
-        require_free_place(arguments, ".csv", "predictions")
+    else:
+        refuse_alone(arguments, ("select", "read"), "score")
+    require_free_place(out, arguments.force, ".csv", "predictions")
     use_jax()
     from fits.prediction.predict import predict as run_prediction
     from fits.reports import tables
 
-    source = _result(Path(arguments.directory))
-    if arguments.score is None:
-        at: Geometry | Measurements = slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,))
-    else:
+    source, at = _result(Path(arguments.directory)), None
+    if scored:
         at = read_options(arguments).read(arguments.score)
-    found = run_prediction(source, at)
-    if isinstance(at, Measurements):
+        found = run_prediction(source, at)
+    else:
+        found = run_prediction(source, slices(np.concatenate(arguments.incidence), azimuth=arguments.azimuth or (0,)))
+    if at is not None:
         show(tables.scores_table(found, at, f"Prediction of {arguments.score}"))
-    if arguments.out is not None:
-        write_text(arguments.out, tables.prediction_csv(found), force=arguments.force)
+    if out is not None:
+        write_text(out, tables.prediction_csv(found), force=arguments.force)
         show(
-            f"{arguments.out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack "
-            "without model discrepancy (latent_*)",
+            f"{out}: predicted BSDF in 1/sr (bsdf_*), of a new measurement (predictive_*), of the stack without model "
+            "discrepancy (latent_*)",
             *([] if found.reliable else [tables.UNRELIABLE]),
         )
     return DONE
@@ -160,25 +126,24 @@ def report(arguments: Namespace) -> int:
     if is_map(arguments.directory) or Path(arguments.directory).suffix == ".zarr":
         return report_map(arguments)
     use_jax()
-    from fits.any_report import report as write_elsewhere
-    from fits.reports import html, results
+    from fits.reports import results
+    from fits.reports.html import FitReport
 
-    refuse_existing(arguments.out, arguments.force)
-    directory = Path(arguments.directory)
-    name, out = directory.resolve().name, arguments.out or directory / results.REPORT
+    directory, out = Path(arguments.directory), arguments.out
+    require_free_place(out, arguments.force)
     result, posterior = results.load_fit(directory), results.load_posterior(directory)
-    if arguments.out is None and not os.access(directory, os.W_OK):
+    if out is None and not os.access(directory, os.W_OK):
         raise ValueError(f"{directory}: cannot be written to (--out FILE writes the report elsewhere)")
-    others = _candidates([Path(other) for other in arguments.compare], reference=directory)
+    others = _candidates(arguments.compare, arguments.directory)
     with show_progress() as progress:
-        progress("pictures and report", 0, 1)
-        if arguments.out is None:
-            html.write_report(directory, name, result, posterior, others)
+        progress(DRAWING, 0, 1)
+        whole = FitReport(result, posterior, others, arguments.directory, results.load_held_out(directory))
+        if out is None:
+            whole.write(directory)
         else:
-            held_out = results.load_held_out(directory)
-            write_elsewhere(result, posterior, out, others=others, name=name, held_out=held_out, force=arguments.force)
-        progress("pictures and report", 1, 1)
-    print(f"Report: {out}")
+            write_text(out, whole.page(), force=arguments.force)
+        progress(DRAWING, 1, 1)
+    print(f"Report: {out or directory / results.REPORT}")
     return DONE
 
 
@@ -186,13 +151,13 @@ def compare(arguments: Namespace) -> int:
     """Print which of several saved fits predicts the data best."""
     if len(arguments.directories) < 2:
         raise ValueError(f"{arguments.directories[0]} is the only directory given, must be two or more")
-    refuse_existing(arguments.out, arguments.force)
+    require_free_place(arguments.out, arguments.force)
     use_jax()
     from fits.prediction.compare import compare as run_compare
     from fits.reports import tables
     from fits.reports.html import comparison_page
 
-    candidates = _candidates([Path(directory) for directory in arguments.directories])
+    candidates = _candidates(arguments.directories)
     with show_progress() as progress:
         compared = run_compare(candidates, refit=not arguments.no_refit, progress=progress)
     show(tables.comparison_table(compared), *compared.verdict)
@@ -202,19 +167,13 @@ def compare(arguments: Namespace) -> int:
     return DONE
 
 
-def _candidates(directories: list[Path], reference: Path | None = None) -> "dict[str, Fit | Posterior]":
-    """The fits of these directories, or their posteriors, under their names; whole paths where names repeat.
-
-    reference: the result that they are compared with, whose name is taken.
-    """
-    places = [directory.resolve() for directory in (*directories, *([] if reference is None else [reference]))]
-    names = [place.name for place in places]
-    candidates: dict[str, Fit | Posterior] = {}
+def _candidates(directories: list[str], *others: str) -> "dict[str, Fit | Posterior]":
+    """The fits of these directories, or their posteriors, under these words; others: which are not among them."""
+    places = [Path(directory).resolve() for directory in (*directories, *others)]
     for directory, place in zip(directories, places, strict=False):
         if places.count(place) > 1:
             raise ValueError(f"{directory} is given twice")
-        candidates[place.name if names.count(place.name) == 1 else str(directory)] = _result(directory)
-    return candidates
+    return {directory: _result(Path(directory)) for directory in directories}
 
 
 def _result(directory: Path) -> "Fit | Posterior":
@@ -225,26 +184,115 @@ def _result(directory: Path) -> "Fit | Posterior":
     return posterior if posterior is not None and verdicts.reportable(posterior) else results.load_fit(directory)
 
 
+# ---- many stacks, many files ----
+
+
+def search(arguments: Namespace) -> int:
+    """Search for the stack behind the data among those of a library, and write the report."""
+    data = read_options(arguments).read(arguments.data)
+    if isinstance(data, Totals):  # stacks are compared by cross-validation over incidences
+        raise ValueError(f"{arguments.data}: holds totals; a search needs measurements along directions")
+    use_jax()
+    from fits import structure_search
+
+    directory = Path(arguments.out)
+    settings = _search_settings(arguments, layers=arguments.layers, budget=arguments.budget)
+    with show_progress() as progress, hint(f"{directory} {RESUME}"):
+        found = structure_search.search(data, **settings, directory=directory, progress=progress)
+        structure_search.write_report(found, directory)
+    table, words = structure_search.search_table(found, 20), structure_search.search_sentences(found)
+    show(table, *words, f"Report: {directory / structure_search.PAGE}")
+    return DONE
+
+
+RESUME = "keeps what was fitted; the same command resumes it"
+
+
+def _search_settings(arguments: Namespace, **options: Any) -> dict[str, Any]:
+    """Arguments of `fits.search` from the options of a search; options: further ones of `SearchOptions`."""
+    from fits.problem.noise import Noise
+    from fits.problem.parameters import Free, LogNormal
+    from fits.problem.stack_file import read_instrument
+    from fits.structure_search import SearchOptions, read_library
+
+    sd = arguments.scale_sd or 0.0
+    bound, instrument = float(np.exp(4.0 * sd)), getattr(arguments, "instrument", None)
+    return {
+        "library": None if arguments.library is None else read_library(arguments.library),
+        "noise": Noise() if arguments.noise is None else Noise(relative=arguments.noise),
+        "scale": Free(1.0, 1.0 / bound, bound, LogNormal(1.0, sd)) if sd > 0.0 else None,
+        "instrument": None if instrument is None else read_instrument(instrument),
+        "options": SearchOptions(**options),
+    }
+
+
+def fit_many(arguments: Namespace) -> int:
+    """Fit every file by every stack, print the outcomes, and write the table and its page."""
+    use_jax()
+    from fits import batch
+    from fits.problem.compilation import cores
+
+    if not arguments.search:
+        refuse_alone(arguments, ("library", "noise", "scale_sd"), "search: a stack file states it")
+    out = Path(arguments.out)
+    with show_progress() as progress, hint(f"{out} {RESUME}"):
+        found = batch.fit_files(
+            arguments.data,
+            arguments.stacks,
+            out,
+            processes=arguments.processes or cores(),
+            client=arguments.scheduler,
+            search=_search_settings(arguments) if arguments.search else False,
+            read_options=read_options(arguments),
+            starts=arguments.starts,
+            force=arguments.force,
+            progress=progress,
+        )
+    table, words = batch.overview(found.rows, 40), batch.statements(found)
+    show(table, *words, f"Table: {out / batch.TABLE}", f"Report: {out / batch.PAGE}")
+    return DONE if found.complete else DOUBTFUL
+
+
+# ---- measurement files ----
+
+
 def info(arguments: Namespace) -> int:
     """Print what is in a measurement file, and draw it."""
-    from fits.reports.data_summary import data_statements, data_table, source_table
+    from fits.reports.data_summary import data_statements, data_table, source_rows
     from fits.reports.plots.data import as_png, data_picture, totals_picture
+    from fits.reports.tables import Table
 
-    out = arguments.out or f"{Path(arguments.data).stem}.png"
-    if arguments.out is not None:
-        refuse_existing(out, arguments.force)
+    out, force = arguments.out or f"{Path(arguments.data).stem}.png", arguments.force
+    require_free_place(arguments.out, force)
     data = read_options(arguments).read(arguments.data)
-    show(source_table(data), data_table(data), *data_statements(data))
-    if Path(out).exists() and not arguments.force:
+    show(Table(data.source.path, ("", ""), source_rows(data)), data_table(data), *data_statements(data))
+    if Path(out).exists() and not force:
         print(f"Picture: {out} exists already (--force draws it again)")
         return DONE
     picture = totals_picture(data) if isinstance(data, Totals) else data_picture(data)
-    write_bytes(out, as_png(picture), arguments.force)
+    write_bytes(out, as_png(picture), force)
     print(f"Picture: {out}")
     return DONE
 
 
 def convert(arguments: Namespace) -> int:
     """Read any supported format and write csv."""
-    require_free_place(arguments, ".csv", "measurements")
+    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
     return write_measurements(read_options(arguments).read(arguments.data), arguments)
+
+
+COMMANDS: dict[str, Callable[[Namespace], int]] = {
+    "fit": fit,
+    "fit-map": fit_map,
+    "sample": sample,
+    "predict": predict,
+    "report": report,
+    "compare": compare,
+    "search": search,
+    "fit-many": fit_many,
+    "info": info,
+    "convert": convert,
+    "simulate": simulate,
+    "render": render,
+    "export": export,
+}

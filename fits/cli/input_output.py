@@ -1,13 +1,35 @@
 """What goes into commands and comes out: refused before any work begins, and shown after it."""
 
+import os
 import sys
 from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fits.data.reading import ReadOptions
     from fits.reports.tables import Table
+
+DONE, DOUBTFUL = 0, 1
+
+
+def use_jax() -> None:
+    """Double precision, all cores, and compiled programs kept in the user's cache folder from one run to the next."""
+    # XLA reads it as it is loaded: below 3 it prints an alarm, as an error, for every program that is slow to compile.
+    # What fails is raised all the same.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    import jax
+
+    from fits.engines.worker import quieten
+    from fits.problem.compilation import devices_of_cores
+    from layerjax.compiling import keep_programs
+
+    quieten()
+    jax.config.update("jax_enable_x64", True)
+    devices_of_cores()
+    keep_programs()
 
 
 def read_options(arguments: Namespace) -> "ReadOptions":
@@ -26,17 +48,13 @@ def refuse_alone(arguments: Namespace, names: tuple[str, ...], needed: str) -> N
             raise ValueError(f"--{name.replace('_', '-')} is given without --{needed}")
 
 
-def require_free_place(arguments: Namespace, ending: str, what: str) -> None:
-    """ValueError unless the file of --out has this ending and can be written; what: the content."""
-    if Path(arguments.out).suffix.lower() != ending:
-        raise ValueError(f"{arguments.out}: {what} can be written as {ending} only")
-    refuse_existing(arguments.out, arguments.force)
-
-
-def refuse_existing(path: str | Path | None, force: bool) -> None:
-    """ValueError unless a file can be written there, and none would be overwritten without `force`."""
+def require_free_place(path: str | Path | None, force: bool, ending: str = "", what: str = "") -> None:
+    """ValueError unless a file, of this ending for this content, can be written there, and none would be overwritten
+    without `force`."""
     if path is None:
         return
+    if ending and Path(path).suffix.lower() != ending:
+        raise ValueError(f"{path}: {what} can be written as {ending} only")
     if Path(path).is_dir():
         raise ValueError(f"{path}: is a directory, must be a file")
     if not Path(path).resolve().parent.is_dir():
@@ -51,3 +69,12 @@ def show(*what: "Table | str") -> None:
 
     for one in what:
         print(one) if isinstance(one, str) else print_table(one, sys.stdout)
+
+
+@contextmanager
+def hint(what: str) -> Iterator[None]:
+    """An interrupt in the block says what became of the work."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(what) from None

@@ -4,18 +4,21 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-from fits.cli.input_output import refuse_alone, refuse_existing, show
-from fits.cli.interrupts import hint
-from fits.cli.setting import use_jax
+from fits.cli.input_output import DONE, DOUBTFUL, hint, refuse_alone, require_free_place, show, use_jax
 from fits.progress import show_progress
 
-DONE, DOUBTFUL = 0, 1
 EMULATOR = {"auto": None, "always": True, "never": False}
 
 
 def fit_map(arguments: Namespace) -> int:
     """Fit a stack to every texel of a map, or resume it, and print what was found."""
-    _require_store(arguments.out)
+    place = Path(arguments.out).resolve()  # what it holds is for `fits.fit_map` to judge
+    if place.suffix != ".zarr":
+        raise ValueError(f"{arguments.out}: a fitted map can be written as .zarr only")
+    if place.exists() and not place.is_dir():
+        raise ValueError(f"{arguments.out}: is a file, must be a store or nothing")
+    if not place.parent.is_dir():
+        raise ValueError(f"{arguments.out}: there is no directory {Path(arguments.out).parent}")
     from fits.maps.inputs import map_data
     from fits.maps.options import MapOptions, SpatialPrior
     from fits.problem.compilation import cores
@@ -27,9 +30,7 @@ def fit_map(arguments: Namespace) -> int:
         refuse_alone(arguments, ("spatial_scale",), "spatial-prior")
     else:
         if not arguments.spatial_scale:
-            raise ValueError(
-                f"--spatial-prior {arguments.spatial_prior} needs --spatial-scale, such as 0.05 of the bounds"
-            )
+            raise ValueError(f"--spatial-prior {arguments.spatial_prior} needs --spatial-scale, such as 0.05")
         scales = dict(arguments.spatial_scale)
         if len(scales) < len(arguments.spatial_scale) or ("" in scales and len(scales) > 1):
             raise ValueError("--spatial-scale: must be one number for all parameters, or one for each name")
@@ -54,17 +55,13 @@ def fit_map(arguments: Namespace) -> int:
             sigma=arguments.sigma,
             mask=arguments.mask,
             options=MapOptions(
-                scale=given.scale,
-                objective=given.objective,
-                instrument=given.instrument,
-                starts=arguments.starts,
-                seed=arguments.seed,
-                pilot_texels=arguments.pilot_texels,
-                chunk_size=arguments.chunk_size,
+                **{name: getattr(given, name) for name in ("scale", "objective", "instrument")},
+                **{
+                    name: getattr(arguments, name) for name in ("starts", "seed", "pilot_texels", "chunk_size", "force")
+                },
                 emulator=EMULATOR[arguments.emulator],
                 spatial_prior=prior,
                 processes=(arguments.processes or cores()) if arguments.scheduler is None else 1,
-                force=arguments.force,
                 progress=progress,
             ),
         )
@@ -83,7 +80,7 @@ def report_map(arguments: Namespace) -> int:
         raise ValueError(f"--compare: {arguments.directory} is a map, which is not compared with others")
     path = Path(arguments.directory)
     out = arguments.out or (path if path.name else path.resolve()).with_suffix(".html")
-    refuse_existing(out, arguments.force)
+    require_free_place(out, arguments.force)
     from fits.maps.report import page, summary
     from fits.maps.store import open_map
 
@@ -98,14 +95,3 @@ def report_map(arguments: Namespace) -> int:
 def is_map(place: str) -> bool:
     """Whether this is a directory of zarr, of whatever content."""
     return (Path(place) / "zarr.json").is_file()
-
-
-def _require_store(out: str) -> None:
-    """Before any work: the store may stand there. What it holds is for `fits.fit_map` to judge."""
-    place = Path(out)
-    if (place if place.name else place.resolve()).suffix != ".zarr":
-        raise ValueError(f"{out}: a fitted map can be written as .zarr only")
-    if place.exists() and not place.is_dir():
-        raise ValueError(f"{out}: is a file, must be a store or nothing")
-    if not place.resolve().parent.is_dir():
-        raise ValueError(f"{out}: there is no directory {place.parent}")

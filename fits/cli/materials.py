@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fits._files import write_bytes
-from fits.cli.input_output import refuse_existing, require_free_place
-from fits.cli.setting import use_jax
+from fits.cli.input_output import DONE, require_free_place, use_jax
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
 from fits.progress import show_progress
@@ -16,12 +15,10 @@ if TYPE_CHECKING:
     from fits.optimise.result import Fit
     from layerjax import Mixture, Stack
 
-DONE = 0
-
 
 def simulate(arguments: Namespace) -> int:
     """Write simulated measurements of a stack; names what of its file is not simulated: noise, scale, instrument."""
-    require_free_place(arguments, ".csv", "measurements")
+    require_free_place(arguments.out, arguments.force, ".csv", "measurements")
     use_jax()
     from fits.data.geometry import slices
     from fits.problem.simulate import simulate as run_simulation
@@ -62,7 +59,7 @@ def write_measurements(data: Measurements, arguments: Namespace) -> int:
 
 def render(arguments: Namespace) -> int:
     """Draw a material of the gallery, or of a file, or the best of a saved fit."""
-    require_free_place(arguments, ".png", "pictures")
+    require_free_place(arguments.out, arguments.force, ".png", "pictures")
     use_jax()
     from fits.optimise.result import Fit
     from fits.reports.plots.data import as_png
@@ -83,7 +80,7 @@ def render(arguments: Namespace) -> int:
 
 def export(arguments: Namespace) -> int:
     """Write a material, or the best of a saved fit, for renderers or for optical design."""
-    refuse_existing(arguments.out, arguments.force)
+    require_free_place(arguments.out, arguments.force)
     use_jax()
     from fits.exports.export import export as run_export
 

@@ -6,12 +6,15 @@ interrupted.
 """
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from io import TextIOWrapper
+from typing import Any
 
 from fits.cli.arguments import build_parser
-from fits.cli.interrupts import raised_again
 from fits.engines.failures import one_line
 
 MAX_MESSAGE = 1000
@@ -22,13 +25,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code; bad usage leaves through `SystemExit` as argparse does."""
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="replace")  # degrees and Greek are not in every encoding
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    arguments = parser.parse_args(argv)
+    if arguments.version:
+        from layerjax import __version__
+
+        print(f"layerjax {__version__}")
+        return 0
+    if arguments.command is None:
+        parser.error("COMMAND is required")
 
     try:
-        from fits.cli import commands
+        from fits.cli.commands import COMMANDS
 
         with raised_again():
-            code = int(getattr(commands, arguments.command.replace("-", "_"))(arguments))
+            code = COMMANDS[arguments.command](arguments)
         sys.stdout.flush()  # while an error can still be reported
         return code
     except KeyboardInterrupt as interrupt:
@@ -39,9 +50,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except Exception as error:
         _end_output()
-        if arguments.traceback or not (isinstance(error, ValueError | OSError | OverflowError) or _of_memory(error)):
+        # JAX has an error of its own for memory
+        memory = isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+        if arguments.traceback or not (memory or isinstance(error, ValueError | OSError | OverflowError)):
             raise  # an error of the program needs its traceback
-        print(f"layerjax: error: {_one_line(error)}", file=sys.stderr)
+        what = "memory is not enough: " if memory else "a number is too large: " * isinstance(error, OverflowError)
+        print(f"layerjax: error: {what}{one_line(error):.{MAX_MESSAGE}}", file=sys.stderr)
         return 2
 
 
@@ -53,13 +67,28 @@ def _end_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _of_memory(error: Exception) -> bool:
-    """Whether memory was not enough; JAX has an error of its own for it."""
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" in str(error))
+@contextmanager
+def raised_again() -> Iterator[None]:
+    """Within it, an interrupt that Python drops, as it does in callbacks of the garbage collector, is raised again.
 
+    JAX has such a callback, and a long computation spends time in it.
+    """
+    usual = sys.unraisablehook
 
-def _one_line(error: Exception) -> str:
-    words = f"{one_line(error):.{MAX_MESSAGE}}"
-    if _of_memory(error):
-        return f"memory is not enough: {words}"
-    return f"a number is too large: {words}" if isinstance(error, OverflowError) else words
+    def interrupt() -> None:
+        if hasattr(signal, "pthread_kill"):  # also in the midst of a system call
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        else:
+            signal.raise_signal(signal.SIGINT)
+
+    def hook(dropped: Any) -> None:
+        if dropped.exc_type is KeyboardInterrupt:  # once the callback has returned
+            threading.Timer(0.05, interrupt).start()
+        else:
+            usual(dropped)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    finally:
+        sys.unraisablehook = usual

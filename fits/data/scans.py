@@ -122,11 +122,6 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.sum(first * second) / norm) if norm > 0.0 else float("nan")
 
 
-def autocorrelation(data: Pairs, residuals: np.ndarray, longest: int = 20) -> np.ndarray:
-    """Correlation of residuals (N, C) at lags of 1, 2, ... `longest` measurements along scans; NaN without pairs."""
-    return np.array([correlation(*neighbours(data, residuals, lag)) for lag in range(1, longest + 1)])
-
-
 def _mean(angles: np.ndarray, turn: float | None = None) -> float:
     """Mean of angles that lie close to each other, to 0.01 degrees, modulo `turn`."""
     if turn is None:

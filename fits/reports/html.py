@@ -9,18 +9,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from fits._files import write_together
 from fits.data.measurements import Measurements
 from fits.data.totals import Totals
+from fits.optimise.uncertainty import UNIDENTIFIED_BEYOND
 from fits.reports import tables, verdicts
+from fits.reports.data_summary import source_rows
 from fits.reports.diagnostics import residual_label, standardised
-from fits.reports.pages import Pictures, document, html_table, image, made_with, section, sentences, verdict
+from fits.reports.pages import Pictures, Table, document, html_table, image, made_with, section, sentences, verdict
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
 from fits.reports.plots import parameters as parameter_pictures
-from fits.reports.results import REPORT, load_held_out
+from fits.reports.results import REPORT
 from fits.reports.verdicts import ReportOptions, reportable
 
 if TYPE_CHECKING:
@@ -34,31 +36,6 @@ if TYPE_CHECKING:
 Results = Mapping[str, "Fit | Posterior"]
 
 
-class HeldOut(NamedTuple):
-    """Held-out data and their prediction."""
-
-    data: Measurements
-    prediction: "Prediction"
-
-
-def predict_held_out(fit: "Fit", posterior: "Posterior | None", data: Measurements) -> HeldOut:
-    """The prediction of held-out data by the posterior, or by the fit where there is none to report from."""
-    from fits.prediction.predict import predict
-
-    return HeldOut(data, predict(posterior if posterior is not None and reportable(posterior) else fit, data))
-
-
-def write_report(
-    folder: Path, name: str, fit: "Fit", posterior: "Posterior | None" = None, others: Results | None = None
-) -> HeldOut | None:
-    """Writes the report of a result directory, its pictures beside it; returns the prediction of its held-out data."""
-    held_out = load_held_out(folder)
-    report = FitReport(fit, posterior, others or {}, name, held_out)
-    pictures = {f"{key}.png": image for key, image in report.images.items()}
-    write_together(folder, pictures | {REPORT: report.page().encode()})
-    return report.predicted
-
-
 @dataclass(frozen=True, eq=False)
 class FitReport:
     """What the report of a fit is made of; arguments as of `fits.report`."""
@@ -70,98 +47,117 @@ class FitReport:
     held_out: Measurements | None = None
     options: ReportOptions = verdicts.DEFAULT
 
+    @property
+    def estimates(self) -> "Posterior | None":
+        """The posterior, if there are estimates of it."""
+        return self.posterior if self.posterior is not None and reportable(self.posterior) else None
+
     @cached_property
-    def predicted(self) -> HeldOut | None:
+    def predicted(self) -> "Prediction | None":
         """The prediction of held-out data; None without any."""
-        return None if self.held_out is None else predict_held_out(self.fit, self.posterior, self.held_out)
+        from fits.prediction.predict import predict
+
+        return None if self.held_out is None else predict(self.estimates or self.fit, self.held_out)
 
     @cached_property
     def images(self) -> Pictures:
         """Every picture that applies, as PNG by name."""
-        fit, posterior, data = self.fit, self.posterior, self.fit.problem.data
-        estimates = posterior if posterior is not None and reportable(posterior) else None
+        fit, data = self.fit, self.fit.problem.data
         figures: dict[str, Figure | None] = {"correlation": parameter_pictures.correlation_picture(fit)}
         if isinstance(data, Totals):
             figures["totals"] = pictures.totals_picture(data, fit)
         else:
-            figures["model"] = model_pictures.curves_picture({self.name: fit}, estimates)
+            figures["model"] = model_pictures.curves_picture({self.name: fit}, self.estimates)
             figures["maps"] = model_pictures.maps_picture(fit)
             figures["residuals"] = pictures.residual_picture(data, standardised(fit), residual_label(fit))
-        if estimates is not None:
-            figures["corner"] = parameter_pictures.corner_picture(estimates)
-        if posterior is not None:
-            figures["trace"] = parameter_pictures.trace_picture(posterior)
-        if self.predicted is not None:
-            figures["held_out"] = model_pictures.prediction_picture(self.predicted.prediction, self.predicted.data)
+        if self.estimates is not None:
+            figures["corner"] = parameter_pictures.corner_picture(self.estimates)
+        if self.posterior is not None:
+            figures["trace"] = parameter_pictures.trace_picture(self.posterior)
+        if self.held_out is not None and self.predicted is not None:
+            figures["held_out"] = model_pictures.prediction_picture(self.predicted, self.held_out)
         if self.others:
             figures["comparison"] = model_pictures.curves_picture({self.name: fit, **_fits(self.others)})
         return {key: pictures.as_png(figure) for key, figure in figures.items() if figure is not None}
 
+    def write(self, folder: Path) -> None:
+        """Writes the report into a result directory, its pictures beside it."""
+        images = {f"{key}.png": image for key, image in self.images.items()}
+        write_together(folder, images | {REPORT: self.page().encode()})
+
     def page(self) -> str:
         """The HTML text, with the pictures inside."""
-        fit, images, held_out = self.fit, self.images, self.predicted
+        fit, images, posterior = self.fit, self.images, self.posterior
         facts = verdicts.assess(fit, self.options)
-        found = verdicts.verdict(fit, facts)
-        title = f"Fit of {source_name(fit.problem.data)}"
+        opening = verdicts.verdict(fit, facts)
         curves = "In the plane of incidence. Grey: one sigma of the noise model."
         if fit.problem.noise.discrepancy:
             curves += " Residuals are those of the curve with model discrepancy."
-        hemispheres = "From above, forward to the right, rings at 30°, 60° and 90°; the star is the light."
-        directions = verdicts.sentences(verdicts.identification(facts))
+        scores = None
+        if self.held_out is not None and self.predicted is not None:
+            scores = tables.scores_table(self.predicted, self.held_out, "Held-out data")
+        limit = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range"
+        count = f"{len(fit.unidentified)} of {len(facts.words)}" if fit.unidentified else "No"
+        sampling: list[str | Table | list[str] | None] = [
+            "<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>"
+            if fit.is_posterior
+            else "<p>There is none: the objective is a named residual, not a likelihood.</p>"
+        ]
+        if posterior is not None:
+            sampling = [
+                verdicts.sampled(posterior),
+                tables.posterior_table(posterior) if self.estimates else None,
+                image(images, "corner", "Samples of the posterior; orange: the best fit."),
+                image(images, "trace", "Every walker; estimates use the steps right of the orange line."),
+            ]
+        title = f"Fit of {source_name(fit.problem.data)}"
         body = [
             f"<h1>{html.escape(title)}</h1>",
-            verdict(found.sentences, found.sound),
-            sentences(found.remarks) if found.remarks else "",
-            section(
-                "Values",
-                tables.parameter_table(fit),
-                None if fit.without_discrepancy is None else tables.discrepancy_table(fit),
-                _stack_text(fit),
-            ),
+            verdict(opening.sentences, opening.sound),
+            sentences(opening.remarks) if opening.remarks else "",
+            section("Values", tables.parameter_table(fit, both=True), _stack_text(fit)),
             section(
                 "Data and model",
-                tables.problem_table(fit),
+                Table(
+                    fit.problem.data.source.path, ("", ""), (*source_rows(fit.problem.data), *tables.problem_rows(fit))
+                ),
                 image(images, "totals", "Shares of the incident flux with one sigma, and those of the fit."),
                 image(images, "model", curves),
-                image(images, "maps", hemispheres),
-                None if held_out is None else tables.scores_table(held_out.prediction, held_out.data, "Held-out data"),
+                image(images, "maps", "From above, forward to the right, rings at 30°, 60° and 90°; star: the light."),
+                scores,
                 image(images, "held_out", "Held-out data in the plane of incidence, and their prediction intervals."),
             ),
             section(
                 "Diagnostics",
-                verdicts.sentences(verdicts.residuals(facts)),
-                tables.incidence_table(facts.structure),
-                image(images, "residuals", "Residuals along angle, their distribution and their autocorrelation."),
-                verdicts.minima(fit),
+                [
+                    *(one.sentence for one in verdicts.statements(facts)["residuals"]),
+                    f"{verdicts.starts_in_words(fit)}.",
+                ],
+                tables.incidence_table(fit),
+                image(images, "residuals", "Residuals along angle, and their distribution."),
                 tables.minima_table(fit),
             ),
             section(
                 "Identifiability",
-                [f"The condition number of the scaled problem is {fit.condition_number:.3g}.", *directions],
+                [
+                    f"The condition number of the scaled problem is {fit.condition_number:.3g}. {count} principal "
+                    f"directions of parameter space have a standard error above {limit}.",
+                ],
                 tables.unidentified_table(fit) if fit.unidentified else None,
                 image(images, "correlation", "Correlation of the fitted parameters."),
             ),
-            section("Posterior", *_posterior(fit, self.posterior, images, self.options)),
+            section("Posterior", *sampling),
         ]
         if self.others:
             from fits.prediction.compare import compare
 
-            own = fit if self.posterior is None or not reportable(self.posterior) else self.posterior
-            body.append(_comparison(compare({self.name: own, **self.others}), images))
+            body.append(_comparison(compare({self.name: self.estimates or fit, **self.others}), images))
         return document(title, [*body, made_with()])
 
 
-def _posterior(fit: "Fit", posterior: "Posterior | None", images: Pictures, options: ReportOptions) -> tuple[str, ...]:
-    if posterior is None:
-        if fit.is_posterior:
-            return ("<p>Not sampled. <code>layerjax sample DIR</code> samples it.</p>",)
-        return ("<p>There is none: the objective is a named residual, not a likelihood.</p>",)
-    return (
-        sentences(verdicts.sampled(posterior, options)),
-        html_table(tables.posterior_table(posterior)) if reportable(posterior) else "",
-        image(images, "corner", "Samples of the posterior; orange: the best fit."),
-        image(images, "trace", "Every walker; estimates use the steps right of the orange line."),
-    )
+def source_name(data: Measurements) -> str:
+    """The file's name, or what the data is where there is none."""
+    return Path(data.source.path).name or f"{data.source.format} data"
 
 
 def _stack_text(fit: "Fit") -> str:
@@ -170,11 +166,6 @@ def _stack_text(fit: "Fit") -> str:
     from fits.problem.stack_file import material_to_dict
 
     return f"<pre>{html.escape(tomli_w.dumps(material_to_dict(fit.stack)))}</pre>"
-
-
-def source_name(data: Measurements) -> str:
-    """The file's name, or what the data is where there is none."""
-    return Path(data.source.path).name or f"{data.source.format} data"
 
 
 def comparison_page(candidates: Results, compared: "Comparison") -> str:
@@ -188,12 +179,8 @@ def comparison_page(candidates: Results, compared: "Comparison") -> str:
 
 
 def _comparison(compared: "Comparison", images: Pictures) -> str:
-    return section(
-        "Comparison",
-        compared.verdict,
-        tables.comparison_table(compared),
-        image(images, "comparison", "The fits beside the same data."),
-    )
+    picture = image(images, "comparison", "The fits beside the same data.")
+    return section("Comparison", compared.verdict, tables.comparison_table(compared), picture)
 
 
 def _fits(candidates: Results) -> "dict[str, Fit]":
@@ -210,11 +197,10 @@ def fit_fragment(fit: "Fit") -> str:
     fragments = []
     for name in fit.problem.problems:
         part = fit.part(name)
-        found = verdicts.verdict(part)
-        words = [*found.sentences, *found.remarks]
+        opening = verdicts.verdict(part)
         fragments += [
             f"<h4>{html.escape(name)}</h4>" if name else "",
-            _paragraph(words),
+            _paragraph([*opening.sentences, *opening.remarks]),
             html_table(tables.parameter_table(part)),
             html_table(tables.unidentified_table(part)) if part.unidentified else "",
         ]

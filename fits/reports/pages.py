@@ -29,8 +29,7 @@ class Table:
 
 
 Part = str | Table | Sequence[str] | None
-"""Of a section: HTML, a table, or sentences."""
-
+"""What a section holds: HTML, a table, or sentences."""
 
 _PAGE = Template("""<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -73,13 +72,13 @@ def verdict(words: Sequence[str], sound: bool) -> str:
 
 def section(head: str, *parts: Part) -> str:
     """A part of a page under a heading; empty parts are omitted."""
-    return "\n".join([f"<h2>{html.escape(head)}</h2>", *(_fragment(part) for part in parts if part)])
-
-
-def _fragment(part: Part) -> str:
-    if isinstance(part, Table):
-        return html_table(part)
-    return part if isinstance(part, str) else sentences(part or ())
+    shown = [f"<h2>{html.escape(head)}</h2>"]
+    for part in parts:
+        if isinstance(part, Table):
+            shown.append(html_table(part))
+        elif part:
+            shown.append(part if isinstance(part, str) else sentences(part))
+    return "\n".join(shown)
 
 
 def html_table(table: Table) -> str:

@@ -30,21 +30,11 @@ LIGHTS = {
 SUN, SKY = 0.8, 0.2
 """What a white diffuse surface shows of the light at normal incidence, and of the sky, which is all around."""
 
-SAMPLES = 2
-"""Points along each side of a pixel."""
-
-SIZES = (16, 1024)
-"""Pixels of a sphere's diameter; more take several GB, and the whole picture has no more across."""
-
-INCIDENCES = (0.0, 30.0, 60.0, 80.0)
-SKY_COSINES, SKY_AZIMUTHS = 24, 24
-"""Directions at which the reflected sky is tabulated."""
+SAMPLES, SKY_COSINES, SKY_AZIMUTHS = 2, 24, 24
+"""Points along each side of a pixel, and directions at which the reflected sky is tabulated."""
 
 INCIDENT, OUTGOING = np.linspace(0.0, 90.0, 91), np.linspace(-90.0, 90.0, 181)
-"""Edges of the cells of the matrix picture, degrees."""
-
-DECADES, MATRIX_BELOW = 4.0, np.radians(75.0)
-"""Largest share of its values, from the largest among angles below this."""
+"""Edges of the cells of the map of the BSDF, degrees."""
 
 
 def render(
@@ -69,15 +59,20 @@ def render(
         ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
             random or does not carry the stack.
     """
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise ValueError(f"size is {size}, must be in [{SIZES[0]}, {SIZES[1]}] pixels")
+    if not 16 <= size <= 1024:  # more take several GB, and the whole picture has no more across
+        raise ValueError(f"size is {size}, must be in [16, 1024] pixels")
     for part in stacks_of(stack):
-        _require_air_below(part)
+        indices = [float(layer.ior) for layer in part.layers if isinstance(layer, lj.Interface)]
+        if part.base is None and indices and indices[-1] != 1.0:
+            raise ValueError(
+                f"layers: the stack ends in a medium of index {indices[-1]:g}, and the picture is of a sheet in air: "
+                "close it with an Interface of ior 1, or give it a base"
+            )
     chosen = lj.AddingDoubling() if transport is None else transport
     if isinstance(chosen, lj.Transport) and chosen.random:
         raise ValueError(f"transport: {type(chosen).__name__} is random; use a deterministic one: AddingDoubling()")
     prepared = lj.prepare(stack, chosen)
-    maps = _in_plane(prepared, any(part.base is None for part in stacks_of(stack)))
+    maps = _maps(prepared, any(part.base is None for part in stacks_of(stack)))
     lights = [name for name in LIGHTS if "transmitted" in maps or name != "from behind"]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 7.2), layout="constrained")
@@ -90,17 +85,8 @@ def render(
             axes.set_axis_off()
         left, right = np.ravel(below.subfigures(1, 2, width_ratios=(1.0, 1.25), squeeze=False))
         _lobes(left.subplots(subplot_kw={"projection": "polar"}), prepared, "transmitted" in maps)
-        _matrix(right, maps)
+        _draw_maps(right, maps)
     return figure
-
-
-def _require_air_below(stack: lj.Stack) -> None:
-    interfaces = [layer for layer in stack.layers if isinstance(layer, lj.Interface)]
-    if stack.base is None and interfaces and float(interfaces[-1].ior) != 1.0:
-        raise ValueError(
-            f"layers: the stack ends in a medium of index {float(interfaces[-1].ior):g}, and the picture is of a sheet "
-            "in air: close it with an Interface of ior 1, or give it a base"
-        )
 
 
 def sphere(stack: lj.Stack | lj.Mixture, prepared: Prepared, light: tuple[float, float, float], size: int) -> Floats:
@@ -155,7 +141,7 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
     """Lobes in the plane of incidence: mean f |cos| by the angle from the normal, the light coming from the left."""
     angle = np.radians(np.linspace(-180.0, 180.0, 721) if transmits else np.linspace(-90.0, 90.0, 361))
     wo = lj.direction(angle, 0.0)
-    for incidence, colour in zip(INCIDENCES, CYCLE, strict=False):
+    for incidence, colour in zip((0.0, 30.0, 60.0, 80.0), CYCLE, strict=False):
         wi = lj.direction(-np.radians(incidence), 0.0)
         value = np.asarray(lj.evaluate(prepared, wi, wo) * jnp.abs(wo[:, 2:])).mean(axis=-1)
         axes.plot(angle, np.sqrt(value), color=colour, label=f"{incidence:.0f}°")
@@ -169,33 +155,27 @@ def _lobes(axes: Axes, prepared: Prepared, transmits: bool) -> None:
     axes.legend(title="incidence", loc="lower left", bbox_to_anchor=(-0.3, -0.05))
 
 
-def _in_plane(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
+def _maps(prepared: Prepared, open_below: bool) -> dict[str, Floats]:
     """The BSDF in the plane of incidence, (incident, outgoing) angles, of each side to which any light goes."""
-    wi = lj.direction(-_middle(INCIDENT), 0.0)[:, None]
-    sides = {"reflected": lj.direction(_middle(OUTGOING), 0.0)}
+    incident, outgoing = (np.radians(0.5 * (edges[1:] + edges[:-1])) for edges in (INCIDENT, OUTGOING))
+    wi, sides = lj.direction(-incident, 0.0)[:, None], {"reflected": lj.direction(outgoing, 0.0)}
     if open_below:
-        sides["transmitted"] = lj.direction(np.pi - _middle(OUTGOING), 0.0)
+        sides["transmitted"] = lj.direction(np.pi - outgoing, 0.0)
     maps = {name: np.asarray(lj.evaluate(prepared, wi, wo)).mean(axis=-1) for name, wo in sides.items()}
     return {name: values for name, values in maps.items() if name == "reflected" or np.any(values > 0)}
 
 
-def _matrix(figure: SubFigure, maps: dict[str, Floats]) -> None:
-    """Incident by outgoing angle, one map for each side; colours go from the least to the largest value off grazing."""
-    off = np.ix_(_middle(INCIDENT) < MATRIX_BELOW, np.abs(_middle(OUTGOING)) < MATRIX_BELOW)
-    largest = max(float(values[off].max()) for values in maps.values()) or 1.0
-    least = min(float(values[off].min()) for values in maps.values())
-    norm = LogNorm(min(max(least, largest * 10.0**-DECADES), 0.5 * largest), largest)
+def _draw_maps(figure: SubFigure, maps: dict[str, Floats]) -> None:
+    """Incident by outgoing angle, one map for each side; colours over the values off grazing, four decades at most."""
+    inner = [values[:75, 15:-15] for values in maps.values()]  # below 75 degrees
+    largest = max(float(values.max()) for values in inner) or 1.0
+    least = max(min(float(values.min()) for values in inner), 1e-4 * largest)
+    norm = LogNorm(min(least, 0.5 * largest), largest)
     panels = figure.subplots(len(maps), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (name, values) in zip(panels, maps.items(), strict=True):
-        shown = np.clip(values, norm.vmin, norm.vmax)
-        image = axes.pcolormesh(OUTGOING, INCIDENT, shown, norm=norm, cmap="viridis", rasterized=True)
-        axes.set_ylabel("incidence, degrees")
-        axes.set_title(f"BSDF in the plane of incidence, {name}")
+        within = np.clip(values, norm.vmin, norm.vmax)
+        image = axes.pcolormesh(OUTGOING, INCIDENT, within, norm=norm, cmap="viridis", rasterized=True)
+        axes.set(ylabel="incidence, degrees", title=f"BSDF in the plane of incidence, {name}")
         axes.grid(visible=False)
         figure.colorbar(image, ax=axes, label="1/sr", extend="both")
     panels[-1].set_xlabel("outgoing angle, degrees (+ forward, $-$ backward)")
-
-
-def _middle(edges: Floats) -> Floats:
-    """Angles in the middle between edges in degrees, radians."""
-    return np.radians(0.5 * (edges[1:] + edges[:-1]))

@@ -12,7 +12,7 @@ report.html    the report, and its pictures as *.png
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,33 +32,13 @@ if TYPE_CHECKING:
     from fits.problem.problem import Problem
     from fits.sampling.posterior import Posterior
 
-SCHEMA = 4
+SCHEMA = 5
 FIT, HELD_OUT, REPORT, SUMMARY, LOCK = "fit.json", "held_out.csv", "report.html", "summary.json", "chain.db.lock"
 DATA, PROBLEM, FITTED, CHAIN = "data.csv", "problem.toml", "fitted.toml", "chain.db"
-_NUMBERS = ("vector", "errors", "covariance", "cost", "condition_number")
-_PLAIN = (
-    "converged",
-    "status",
-    "iterations",
-    "at_bound",
-    "insensitive",
-    "dataset",
-    "settings",
-    "start_outcomes",
-    "resolution",
-)
-"""Fields of a fit that are stored as they are: numbers, which may be infinite, and all else."""
-_DERIVED = (
-    "scale",
-    "chi_square",
-    "degrees_of_freedom",
-    "reduced_chi_square",
-    "log_likelihood",
-    "correlation",
-    "predicted",
-    "residuals",
-)
 PACKAGES = ("jax", "equinox", "optimistix", "emcee", "numpy", "scipy")
+
+
+# ---- fits ----
 
 
 def save_fit(fit: "Fit", directory: str | Path, force: bool = False) -> None:
@@ -92,54 +72,38 @@ def write_fit(fit: "Fit", folder: Path, text: str | None = None) -> None:
     from fits.problem.stack_file import transport_to_dict, write_problem
     from layerjax import Transport
 
-    problem, transport = fit.problem, fit.problem.transport
+    problem, transport, data = fit.problem, fit.problem.transport, fit.problem.data
     if transport != "auto" and not isinstance(transport, Transport):
         raise ValueError(f"transport is {transport!r}: only 'auto' and layerjax's own can be saved")
-    scale = problem.scale if isinstance(problem.scale, Free) else None
-    spheres = None
-    if isinstance(problem.data, Totals):
-        totals_csv.write(problem.data.used(), folder / DATA)
-        spheres = problem.data.spheres  # which the file cannot hold
+    scale, spheres = problem.scale if isinstance(problem.scale, Free) else None, None
+    if isinstance(data, Totals):
+        totals_csv.write(data.used(), folder / DATA)
+        spheres = data.spheres  # which the file cannot hold
     else:
-        write_csv(problem.data, folder / DATA)
+        write_csv(data, folder / DATA)
     if text is not None:
         write_text(folder / PROBLEM, text)
     else:
-        write_problem(
-            folder / PROBLEM,
-            problem.stack,
-            transport=transport,
-            noise=problem.noise,
-            scale=scale,
-            objective=problem.objective,
-            instrument=problem.instrument,
-        )
+        names = ("noise", "objective", "instrument")
+        settings = {name: getattr(problem, name) for name in names}
+        write_problem(folder / PROBLEM, problem.stack, transport=transport, scale=scale, **settings)
     write_problem(folder / FITTED, fit.stack, transport=transport)
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
-        "transport": transport_to_dict(transport),
-        "source": asdict(problem.data.source),
+        "transport": transport_to_dict(transport),  # with the resolution that the fit chose
+        "source": asdict(data.source),
         "spheres": None if spheres is None else asdict(spheres),
         "fixed_scale": None if scale is not None else problem.scale,
-        "parameters": [
-            {
-                "name": name,
-                "value": value,
-                "standard_error": fit.standard_errors[name],
-                "unit": fit.units[name],
-                "low": float(problem.low[index]),
-                "high": float(problem.high[index]),
-                "at_bound": name in fit.at_bound,
-            }
-            for index, (name, value) in enumerate(fit.values.items())
-        ],
-        "fit": {name: getattr(fit, name) for name in (*_NUMBERS, *_PLAIN, "numerical_error")},
-        "without_discrepancy": None if fit.without_discrepancy is None else asdict(fit.without_discrepancy),
-        "unidentified": [asdict(direction) for direction in fit.unidentified],
+        **{
+            name: getattr(fit, name)
+            for name in ("values", "standard_errors", "units", "chi_square", "degrees_of_freedom")
+        },
+        "fit": {name: _stored(getattr(fit, name)) for name in _fields()},
         "minima": [{"values": one.values, "cost": one.cost, "count": one.count} for one in fit.minima],
-        "alternatives": [list(map(id, fit.minima)).index(id(one)) for one in fit.alternatives],
-        "derived": {name: getattr(fit, name) for name in _DERIVED},
+        "alternatives": [
+            index for index, one in enumerate(fit.minima) if any(one is same for same in fit.alternatives)
+        ],
         "checksums": {name: text_checksum(folder / name) for name in (DATA, PROBLEM)},
     }
     write_json(folder / FIT, content)
@@ -158,36 +122,37 @@ def load_fit(directory: str | Path) -> "Fit":
     content = _content(directory)
     try:
         problem = _problem(directory, content)
-        stored, count, found = content["fit"], len(problem.names), content["without_discrepancy"]
-        shapes: dict[str, Any] = {"vector": count, "errors": count, "covariance": (count, count)}
-        numbers: dict[str, Any] = {name: float(stored[name]) for name in ("cost", "condition_number")}
-        numbers |= {name: np.array(stored[name], float).reshape(shape) for name, shape in shapes.items()}
-        plain: dict[str, Any] = {name: tuple(x) if isinstance(x := stored[name], list) else x for name in _PLAIN}
+        stored = {name: _restored(content["fit"][name]) for name in _fields()}
+        stored |= {name: np.array(stored[name], float) for name in ("vector", "errors", "covariance")}
+        stored["unidentified"] = tuple(Direction(**one) for one in stored["unidentified"])
+        if stored["without_discrepancy"] is not None:
+            stored["without_discrepancy"] = WithoutDiscrepancy(**stored["without_discrepancy"])
         minima = tuple(
-            Minimum(values, float(one["cost"]), one["count"], problem.build(np.array(list(values.values()))).stack)
-            for one in content["minima"]
-            for values in (_numbers(one["values"]),)
+            Minimum(**one, stack=problem.build(np.array(list(one["values"].values()))).stack)
+            for one in _restored(content["minima"])
         )
-        without: Any = None if found is None else WithoutDiscrepancy(**{key: _numbers(found[key]) for key in found})
-        return Fit(
-            problem=problem,
-            **numbers,
-            **plain,
-            numerical_error=None if stored["numerical_error"] is None else float(stored["numerical_error"]),
-            unidentified=tuple(
-                Direction(float(one["error"]), one["weights"], _numbers(one["conditional_errors"]))
-                for one in content["unidentified"]
-            ),
-            minima=minima,
-            alternatives=tuple(minima[index] for index in content["alternatives"]),
-            without_discrepancy=without,
-        )
-    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
-        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
-    except ValueError as error:
-        if str(error).startswith(str(directory)):
+        alternatives = tuple(minima[index] for index in content["alternatives"])
+        return Fit(problem=problem, minima=minima, alternatives=alternatives, **stored)
+    except (LookupError, TypeError, AttributeError, ArithmeticError, ValueError) as error:
+        if isinstance(error, ValueError) and str(error).startswith(str(directory)):
             raise
-        raise ValueError(f"{directory / FIT}: {error}") from None
+        raise ValueError(f"{directory / FIT}: damaged, {type(error).__name__} {error}") from None
+
+
+def _content(directory: Path) -> dict[str, Any]:
+    """What fit.json holds, if it and the files with checksums in it are as they were written."""
+    require_there(directory, "no such directory")
+    if not (directory / FIT).is_file():
+        raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
+    content = read_json(directory / FIT)
+    if (version := content.get("layerjax_result")) != SCHEMA:
+        raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
+    for name in (DATA, PROBLEM):
+        path = directory / name
+        require_there(path)
+        if text_checksum(path) != content.get("checksums", {}).get(name):
+            raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
+    return content
 
 
 def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
@@ -197,29 +162,49 @@ def _problem(directory: Path, content: dict[str, Any]) -> "Problem":
 
     given, data, spheres = read_problem(directory / PROBLEM), read(directory / DATA), content["spheres"]
     source = Source(**content["source"] | {"notes": tuple(content["source"]["notes"])})
-    if isinstance(data, Totals):
-        if spheres is not None:
-            both = ("reflection", "transmission")
-            spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
-        data = replace(data, spheres=None if spheres is None else Spheres(**spheres))
-    transport = transport_from_dict(content["transport"])  # with the resolution that the fit chose
-    noise = given.noise if content["without_discrepancy"] is None else replace(given.noise, discrepancy=True)
+    if isinstance(data, Totals) and spheres is not None:
+        both = ("reflection", "transmission")
+        spheres |= {name: None if spheres[name] is None else Sphere(**spheres[name]) for name in both}
+        data = replace(data, spheres=Spheres(**spheres))
+    transport = transport_from_dict(content["transport"])
+    added = content["fit"]["without_discrepancy"] is not None
+    noise = replace(given.noise, discrepancy=True) if added else given.noise
     scale = given.scale if given.scale is not None else content["fixed_scale"]
     data = replace(data, source=source)
     return Problem(given.stack, data, transport, noise, scale, given.objective, given.instrument)
 
 
-def _numbers(value: Any) -> Any:
-    """Numbers, by name or by itself; one that is not finite is stored as a word."""
+def _fields() -> list[str]:
+    """Fields of a fit that are stored as they are."""
+    from fits.optimise.result import Fit
+
+    others = {"problem", "minima", "alternatives", "without_discrepancy_parts"}
+    return [one.name for one in fields(Fit) if one.name not in others]
+
+
+def _stored(value: Any) -> Any:
+    """The value with its dataclasses as mappings."""
+    if isinstance(value, tuple):
+        return [_stored(one) for one in value]
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+
+
+def _restored(value: Any) -> Any:
+    """The value as it was: numbers that are not finite are words in JSON, and tuples are lists."""
     if isinstance(value, dict):
-        return {name: _numbers(one) for name, one in value.items()}
-    return value if isinstance(value, int) else float(value)
+        return {name: _restored(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return tuple(_restored(one) for one in value)
+    return float(value) if value in ("nan", "inf", "-inf") else value
 
 
 def load_held_out(directory: str | Path) -> Measurements | None:
     """The held-out data of a result directory; None if there are none."""
     path = Path(directory) / HELD_OUT
     return read(path, format="csv") if path.is_file() else None
+
+
+# ---- posteriors ----
 
 
 def load_posterior(directory: str | Path) -> "Posterior | None":
@@ -252,28 +237,19 @@ def save_posterior(posterior: "Posterior", directory: str | Path) -> None:
     Raises:
         ValueError: the chain is too short to report from.
     """
+    names = ["converged", "allow_unconverged", "burn_in", "acceptance", "status", "divergences"]
+    names += ["autocorrelation_time", "effective_samples", "r_hat"]
     content = {
         "layerjax_result": SCHEMA,
         "versions": versions(),
-        "converged": posterior.converged,
-        "allow_unconverged": posterior.allow_unconverged,
         "steps": len(posterior.chain),
         "walkers": posterior.chain.shape[1],
-        "burn_in": posterior.burn_in,
-        "acceptance": posterior.acceptance,
-        "status": posterior.status,
-        "divergences": posterior.divergences,
+        **{name: getattr(posterior, name) for name in names},
         "modes": [asdict(mode) for mode in posterior.modes],
-        "parameters": [
-            {
-                "name": name,
-                **dict(zip(("median", "low_68", "high_68", "mean", "sd"), estimates, strict=True)),
-                "autocorrelation_time": posterior.autocorrelation_time[index],
-                "effective_samples": posterior.effective_samples[index],
-                "r_hat": posterior.r_hat[index],
-            }
-            for index, (name, estimates) in enumerate(posterior.summary().items())
-        ],
+        "parameters": {
+            name: dict(zip(("median", "low_68", "high_68", "mean", "sd"), estimates, strict=True))
+            for name, estimates in posterior.summary().items()
+        },
     }
     write_json(Path(directory) / SUMMARY, content, force=True)
 
@@ -285,21 +261,7 @@ def versions() -> dict[str, str]:
     return {"layerjax": layerjax.__version__} | {package: metadata.version(package) for package in PACKAGES}
 
 
-def _content(directory: Path) -> dict[str, Any]:
-    """What fit.json holds, if it and the files with checksums in it are as they were written."""
-    require_there(directory, "no such directory")
-    if not (directory / FIT).is_file():
-        raise ValueError(f"{directory}: is not a result directory, it holds no {FIT}")
-    content = read_json(directory / FIT)
-    version = content.get("layerjax_result")
-    if version != SCHEMA:
-        raise ValueError(f"{directory / FIT}: is version {version} of the format, must be {SCHEMA}")
-    for name in (DATA, PROBLEM):
-        path = directory / name
-        require_there(path)
-        if text_checksum(path) != content.get("checksums", {}).get(name):
-            raise ValueError(f"{path}: damaged or changed since the fit, its checksum is not that in {FIT}")
-    return content
+# ---- directories ----
 
 
 def check_directory(directory: Path, force: bool) -> None:

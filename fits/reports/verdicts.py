@@ -1,27 +1,28 @@
-"""What a report says of a fit: every statement with the condition under which it is made, in one list.
+"""What a report says of a fit: every statement with the condition under which it is made.
 
-`assess` collects the facts of a fit, and statements depend on these alone. Each says what it claims of the errors,
+`assess` collects the facts of a fit, and `statements` depend on these alone. Each says what it claims of the errors,
 the residuals, the noise or the parameters, so that a test can go through all combinations of facts and find that no two
 statements of a report contradict each other. With a model discrepancy, statements on residuals are about those whitened
 by the fitted covariance.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fits.data.checks import repeats
+from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
 from fits.optimise.limits import instrument_limits, limited_with
 from fits.optimise.options import FitOptions
+from fits.optimise.result import OUTCOMES
 from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND, Direction
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
-from fits.problem.parameters import is_free
-from fits.reports.diagnostics import ResidualStructure, residual_structure, standardised
+from fits.reports.diagnostics import standardised
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
@@ -40,17 +41,11 @@ class ReportOptions:
     """Median misfit, in standard deviations of the stated noise, above which a significant misfit means that the stack
     does not describe the sample; that of the true stack is 0.67."""
 
-    factor: float = 1.5
-    """Ratio of model and data from which a misfit is quoted as a factor instead of in percent."""
-
     correlated: float = 0.95
     """Absolute correlation from which the table of parameters names the partner of a parameter."""
 
     prior_dominated: float = 0.3
     """Standard error, as a share of the bounds, above which a parameter is called prior-dominated."""
-
-    r_hat: float = 1.01
-    """R-hat above which the shares of the modes of a posterior are called uncertain."""
 
     peak_points: int = 3
     """Measurements above half the height of a peak from which its width is called sampled."""
@@ -64,30 +59,26 @@ DEFAULT = ReportOptions()
 
 @dataclass(frozen=True)
 class Assessment:
-    """The facts of a fit that decide what is said of it.
+    """The facts of a fit that decide what is said of it; residuals are whitened where there is a model discrepancy.
 
     Attributes:
-        structure: of the residuals in units of the noise, whitened by the covariance with a model discrepancy.
+        count, lag_one, pairs: number of residuals, correlation of neighbours in angle (NaN without any), their number.
         ratio, freedom: chi-square per degree of freedom, and their number.
         excess: chi-square above its expectation, in its own standard deviations.
-        likelihood: whether the objective is one.
-        noise_assumed: whether no noise was stated.
+        likelihood, noise_assumed: whether the objective is one, and whether no noise was stated.
         described: whether the stack without discrepancy is as near to the data as noise and options allow.
         misfit: factors within which half and 95 % of the data are of that stack; None if no value is above zero.
         noise: median of the stated noise as a share of the value; NaN if none is above zero.
-        discrepancy: fitted parameters of the model discrepancy, and the share of the residual sum of squares that it
-            absorbs; None without one.
-        limits: roughnesses that the instrument limits, and the least that it resolves.
-        limited: other parameters that these limit, with the roughness and the shift in standard errors.
-        words: of each parameter, what the data say of it.
-        numerical_error: of the model, in standard deviations of the data; None where there is no resolution.
-        numerical_limit: of it, see `FitOptions`.
+        discrepancy: fitted parameters of the model discrepancy, and the reduced chi-square without it; or None.
+        words: of each parameter, what the data say of it; see `identifiability`.
+        alternatives: how many other minima fit equally well.
+        numerical_error, resolved: of the model, in standard deviations of the data, and whether it is small enough.
     """
 
     options: ReportOptions
-    structure: ResidualStructure
     count: int
-    objective: str
+    lag_one: float
+    pairs: int
     ratio: float
     freedom: int
     excess: float
@@ -99,40 +90,30 @@ class Assessment:
     noise: float
     discrepancy: tuple[Any, float] | None
     unidentified: tuple[Direction, ...]
-    insensitive: tuple[str, ...]
-    at_bound: tuple[str, ...]
-    limits: Mapping[str, float]
-    limited: Mapping[str, tuple[str, float]]
     words: Mapping[str, str]
     alternatives: int
     numerical_error: float | None
-    numerical_limit: float
+    resolved: bool
 
     @property
-    def large(self) -> bool:
-        """Whether the residuals are significantly larger than expected."""
-        return self.excess > self.options.significance
-
-    @property
-    def small(self) -> bool:
-        """Whether the residuals are significantly smaller than expected."""
-        return self.excess < -self.options.significance
+    def size(self) -> str:
+        """Whether the residuals are significantly larger or smaller than expected: "large", "small" or "expected"."""
+        limit = self.options.significance
+        return "large" if self.excess > limit else "small" if self.excess < -limit else "expected"
 
     @property
     def correlated(self) -> bool:
         """Whether neighbouring residuals are significantly correlated."""
-        return self.structure.lag_one_sigma > self.options.significance and self.structure.independent_share < 1.0
+        return self.lag_one * math.sqrt(self.pairs) > self.options.significance
 
     @property
     def error_factors(self) -> tuple[float, float]:
-        """Factors by which the standard errors are too small, for the size and the correlation of the residuals."""
-        share = self.structure.independent_share if self.correlated else 1.0
-        return math.sqrt(self.ratio) if self.large or self.small else 1.0, share**-0.5
+        """Factors by which the standard errors are too small, for the size and the correlation of the residuals.
 
-    @property
-    def error_factor(self) -> float:
-        """Both together."""
-        return math.prod(self.error_factors)
+        The effective number of residuals over their number is (1 - r) / (1 + r) for a correlation r of neighbours.
+        """
+        inflation = (1.0 + self.lag_one) / max(1.0 - self.lag_one, 1e-9) if self.correlated else 1.0
+        return 1.0 if self.size == "expected" else math.sqrt(self.ratio), math.sqrt(inflation)
 
     @property
     def which(self) -> str:
@@ -154,68 +135,54 @@ class Assessment:
         """Whether the data identify every one of these."""
         return all(word == IDENTIFIED or word.startswith(CORRELATED) for word in self.physical.values())
 
-    @property
-    def resolved(self) -> bool:
-        """Whether the numerical error of the model is small beside that of the data."""
-        return self.numerical_error is None or self.numerical_error <= self.numerical_limit
-
 
 def assess(fit: "Fit", options: ReportOptions = DEFAULT) -> Assessment:
     """The facts of a fit."""
-    used, likelihood = fit.problem.data.used(), fit.is_posterior
+    used, likelihood, freedom = fit.problem.data.used(), fit.is_posterior, max(fit.degrees_of_freedom, 1)
+    spread = math.sqrt(2.0 / freedom)  # of chi-square per degree of freedom about 1
     positive = used.values > 0.0
-    described, noise, discrepancy = True, math.nan, None
+    described, noise, misfit, discrepancy = True, math.nan, None, None
+    if positive.any():
+        # factors between model and data, in order; no interpolation, which would make NaN of two infinite ones
+        with np.errstate(divide="ignore", over="ignore"):
+            ratio = np.where(fit.predicted > 0.0, fit.predicted / np.where(positive, used.values, 1.0), 0.0)[positive]
+            ordered = np.sort(np.maximum(ratio, 1.0 / ratio))
+        misfit = float(ordered[len(ordered) // 2]), float(ordered[int(0.95 * len(ordered))])
     if likelihood:
         offsets = np.abs(np.asarray(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted), float))
-        significant = excess(float(np.sum(offsets**2)), fit.degrees_of_freedom) > options.significance
+        square = float(np.sum(offsets**2))  # by these parameters
+        significant = fit.degrees_of_freedom > 0 and square / freedom - 1.0 > options.significance * spread
         described = not (significant and float(np.median(offsets)) > options.misfit)
         if positive.any():
             sigma = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, used.values))
             noise = float(np.median(sigma[positive] / used.values[positive]))
-    fitted = fit.problem.build(fit.vector).correlation
-    if likelihood and fitted is not None:
-        remaining = np.asarray(fit.problem.call(Model.offsets_after_discrepancy_at, fit.vector, fit.predicted), float)
-        whole = float(np.sum(offsets**2))
-        discrepancy = fitted, 1.0 - float(np.sum(remaining**2)) / whole if whole > 0.0 else 0.0
+        if (term := fit.problem.build(fit.vector).correlation) is not None:
+            before = fit.without_discrepancy
+            ratio_before = square / freedom if before is None else before.chi_square / max(before.degrees_of_freedom, 1)
+            discrepancy = term, ratio_before
+    limit = float(fit.settings.get("numerical_error", FitOptions().numerical_error))
+    pairs = neighbours(fit.problem.data, standardised(fit))
     return Assessment(
         options=options,
-        structure=residual_structure(fit.problem.data, standardised(fit)),
         count=used.values.size,
-        objective=fit.problem.objective,
+        lag_one=correlation(*pairs),
+        pairs=pairs[0].size,
         ratio=fit.reduced_chi_square,
         freedom=fit.degrees_of_freedom,
-        excess=excess(fit.chi_square, fit.degrees_of_freedom),
+        excess=(fit.reduced_chi_square - 1.0) / spread,
         converged=fit.converged,
         likelihood=likelihood,
         noise_assumed=likelihood and fit.problem.noise_is_assumed,
         described=described,
-        misfit=_misfit(fit.predicted[positive], used.values[positive]) if positive.any() else None,
+        misfit=misfit,
         noise=noise,
         discrepancy=discrepancy,
         unidentified=fit.unidentified,
-        insensitive=fit.insensitive,
-        at_bound=fit.at_bound,
-        limits=instrument_limits(fit),
-        limited=limited_with(fit),
         words=identifiability(fit, options),
         alternatives=len(fit.alternatives),
         numerical_error=fit.numerical_error,
-        numerical_limit=float(fit.settings.get("numerical_error", FitOptions().numerical_error)),
+        resolved=fit.numerical_error is None or fit.numerical_error <= limit,
     )
-
-
-def excess(square: float, freedom: int) -> float:
-    """Chi-square above its expectation, in its own standard deviations."""
-    return (square / freedom - 1.0) / math.sqrt(2.0 / freedom) if freedom > 0 else math.nan
-
-
-def _misfit(predicted: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """Within which factor of the model half, and 95 %, of positive values are; infinite where the model is 0."""
-    with np.errstate(divide="ignore", over="ignore"):
-        ratio = np.where(predicted > 0.0, predicted / values, 0.0)
-        ordered = np.sort(np.maximum(ratio, 1.0 / ratio))  # no interpolation: it would make NaN of two infinite ones
-    half, most = (float(ordered[min(int(share * len(ordered)), len(ordered) - 1)]) for share in (0.5, 0.95))
-    return half, most
 
 
 IDENTIFIED, CORRELATED = "identified", "correlated with"
@@ -233,7 +200,7 @@ def identifiability(fit: "Fit", options: ReportOptions = DEFAULT) -> dict[str, s
     words = {}
     for index, name in enumerate(names):
         width, error = float(fit.problem.high[index] - fit.problem.low[index]), fit.standard_errors[name]
-        partner = int(np.nanargmax(np.abs(correlation[index]))) if np.isfinite(correlation[index]).any() else index
+        partner = int(np.argmax(np.abs(np.nan_to_num(correlation[index]))))
         along = [direction.error_of(name) for direction in fit.unidentified]
         if name in fit.insensitive:
             words[name] = "insensitive: no effect on the data"
@@ -267,40 +234,45 @@ class Statement(NamedTuple):
     claims: Mapping[str, str] = {}
 
 
-def opening(f: Assessment) -> list[Statement]:
-    """The verdict: how well the model describes the data, what the errors mean, and what the data identify."""
-    return [_description(f), _errors(f), _parameters(f)]
+def statements(f: Assessment) -> dict[str, list[Statement]]:
+    """All that is said of a fit: the three of the verdict, remarks that qualify it, and those on the residuals."""
+    return {
+        "verdict": [_description(f), _errors(f), _parameters(f)],
+        "remarks": _remarks(f),
+        "residuals": _residuals(f),
+    }
 
 
 def _description(f: Assessment) -> Statement:
+    """How well the model describes the data."""
     near, chi_square = "None of the measurements is above zero", f"(reduced chi-square {f.ratio:.3g})"
     if f.misfit is not None:
-        half, most = (in_words(factor, f.options) for factor in f.misfit)
+        half, most = map(_deviation, f.misfit)
         which = "stack without model discrepancy" if f.discrepancy else "model"
         near = f"Half of the {f.count:,} measurements are within {half} of the {which}, 95 % within {most}"
     if not f.likelihood:
-        return Statement(f"{near}; the objective is {f.objective}, which has no noise model to judge this by.")
+        return Statement(f"{near}; the objective is a named residual, which has no noise model to judge this by.")
     if not f.described:
-        return Statement(not_described(f), {"description": "no"})
-    if f.large:
-        words = f"{near}, which {f.expectation} does not explain {chi_square}."
-        return Statement(words, {"description": "no", "size": "large"})
-    if f.small:
-        words = f"{near}, closer than {f.expectation} predicts {chi_square}."
-        return Statement(words, {"description": "yes", "size": "small"})
-    words = f"{near}, as {f.expectation} predicts {chi_square}."
-    return Statement(words, {"description": "yes", "size": "expected"})
+        misfit = "" if f.misfit is None else f": median misfit {half}, stated noise {100.0 * f.noise:.2g} %"
+        return Statement(f"This stack does not describe the sample{misfit}.", {"description": "no"})
+    fitting = {
+        "large": f"which {f.expectation} does not explain",
+        "small": f"closer than {f.expectation} predicts",
+        "expected": f"as {f.expectation} predicts",
+    }
+    described = "no" if f.size == "large" else "yes"
+    return Statement(f"{near}, {fitting[f.size]} {chi_square}.", {"description": described, "size": f.size})
 
 
-def not_described(f: Assessment) -> str:
-    """That the stack does not describe the sample."""
-    if f.misfit is None:
-        return "This stack does not describe the sample."
-    median = in_words(f.misfit[0], f.options)
-    return f"This stack does not describe the sample: median misfit {median}, stated noise {100.0 * f.noise:.2g} %."
+def _deviation(factor: float) -> str:
+    """A factor between model and data in words: in percent while it is near 1."""
+    if factor < 1.5:
+        return f"{100.0 * (factor - 1.0):.2g} %"
+    return f"a factor of {factor:.2g}" if math.isfinite(factor) else "an infinite factor (the model is 0 there)"
 
 
 def _errors(f: Assessment) -> Statement:
+    """What the standard errors mean."""
     if not f.converged:
         words = "The fit did not converge: values are the best found, not a minimum, and have no valid errors."
         return Statement(words, {"errors": "invalid"})
@@ -319,15 +291,14 @@ def _errors(f: Assessment) -> Statement:
         words = f"{others} equally well: the standard errors are those of the best one only, sampling covers all."
         return Statement(words, {"errors": "one minimum"})
     size, correlation = f.error_factors
-    if size * correlation != 1.0:
+    if (factor := size * correlation) != 1.0:
         parts = [f"{size:.2g} for the size of the {f.which}"] if size != 1.0 else []
         if f.correlated:
-            count = f.structure.count
-            words = f"{count} of them are equivalent to {max(1.0, count / correlation**2):.0f} independent ones"
+            words = f"{f.count} of them are equivalent to {max(1.0, f.count / correlation**2):.0f} independent ones"
             parts.append(f"{correlation:.2g} for their correlation: {words}")
-        wrong, factor = ("small", f.error_factor) if f.error_factor > 1.0 else ("large", 1.0 / f.error_factor)
-        words = f"The standard errors are too {wrong} by a factor of about {factor:.2g} ({' times '.join(parts)})."
-        return Statement(words, {"errors": f"too {wrong}", "residuals": "misfit"})
+        wrong = "small" if factor > 1.0 else "large"
+        words = f"too {wrong} by a factor of about {max(factor, 1.0 / factor):.2g} ({' times '.join(parts)})"
+        return Statement(f"The standard errors are {words}.", {"errors": f"too {wrong}", "residuals": "misfit"})
     words = "The standard errors follow from the stated noise."
     if f.discrepancy:
         words = "The standard errors include the model discrepancy."
@@ -337,12 +308,21 @@ def _errors(f: Assessment) -> Statement:
 
 
 def _parameters(f: Assessment) -> Statement:
+    """What the data identify."""
     words = f.physical
     if f.identified:
         every = "every parameter" if len(words) == len(f.words) else "every parameter of the stack"
         return Statement(f"The data identify {every}.", {"parameters": "all"})
-    directions = [one for one in f.unidentified if any(_weak(one, name) for name in words)]
-    parts = [f"{not_identified(one)}{' (and more)' if directions[1:] else ''}" for one in directions[:1]]
+
+    def weak(direction: Direction) -> list[str]:
+        return [name for name in direction.weights if direction.error_of(name) > UNIDENTIFIED_BEYOND]
+
+    directions, parts = [one for one in f.unidentified if set(weak(one)) & set(words)], []
+    if directions:
+        names, more = weak(directions[0]), " (and more)" if directions[1:] else ""
+        kind = "unidentified" if directions[0].unconstrained else "weakly identified"
+        said = f"{listed(names)} are not identified separately" if names[1:] else f"{names[0]} is {kind}"
+        parts = [f"{said}{more}"]
     for begins, what in (
         ("insensitive", "without effect on the data"),
         ("at a bound", "at a bound"),
@@ -351,100 +331,46 @@ def _parameters(f: Assessment) -> Statement:
         *(() if directions else (("unidentified", "unidentified"), ("weakly", "weakly identified"))),
     ):
         names = [name for name, word in words.items() if word.startswith(begins)]
-        if names:
-            parts.append(f"{listed(names)} {'is' if len(names) == 1 else 'are'} {what}")
+        parts += [f"{listed(names)} {'are' if names[1:] else 'is'} {what}"] if names else []
     return Statement(f"{'; '.join(parts)}.", {"parameters": "not all"})
 
 
-def not_identified(direction: Direction) -> str:
-    """What is not identified along a direction: the parameters with a large error along it."""
-    names = [name for name in direction.weights if _weak(direction, name)] or [next(iter(direction.weights))]
-    if len(names) > 1:
-        return f"{listed(names)} are not identified separately"
-    return f"{names[0]} is {'unidentified' if direction.unconstrained else 'weakly identified'}"
-
-
-def _weak(direction: Direction, name: str) -> bool:
-    return direction.error_of(name) > UNIDENTIFIED_BEYOND
-
-
-def remarks(f: Assessment) -> list[Statement]:
+def _remarks(f: Assessment) -> list[Statement]:
     """Statements that qualify the verdict."""
-    found = []
+    remarks = []
     if f.discrepancy is not None:
-        term, absorbed = f.discrepancy
+        term, without = f.discrepancy
         amplitude, exponent = 100.0 * float(term.amplitude), float(term.grazing_exponent)
         grazing = f" at normal incidence, {amplitude * 2.0**exponent:.2g} % at 60°" if exponent > 0.0 else ""
         lengths = (
             f"{float(term.length_half):.2g}° (half angle), {float(term.length_difference):.2g}° (difference angle)"
         )
         words = f"Model discrepancy: {amplitude:.2g} % of the BSDF{grazing}; length scales {lengths}."
-        found.append(Statement(f"{words} It absorbs {100.0 * absorbed:.3g} % of the residual sum of squares."))
+        words = f"{words} The reduced chi-square is {f.ratio:.3g} with it and {without:.3g} without."
+        remarks.append(Statement(words))
     if not f.resolved:
         error = numerical_error(f.numerical_error)
-        words = f"The numerical error of the model is {error}: a finer resolution may give other values."
-        found.append(Statement(words))
-    for name, least in f.limits.items():
-        words = f"{name} is limited by the instrument: lobes below {least:.2g} are not resolved."
-        found.append(Statement(words, {"parameters": "not all"}))
-    for name, (roughness, shift) in f.limited.items():
-        words = (
-            f"{name} is limited by the instrument with {roughness}: up to that width it shifts by {shift:.2g} of its"
-        )
-        found.append(Statement(f"{words} its standard errors.", {"parameters": "not all"}))
-    return found
+        remarks.append(Statement(f"The numerical error of the model is {error}: a finer resolution may change values."))
+    return remarks
 
 
-def residuals(f: Assessment) -> list[Statement]:
+def _residuals(f: Assessment) -> list[Statement]:
     """Whether the residuals are what the noise model predicts; with a discrepancy, all is about the whitened ones."""
-    which, structure = f.which, f.structure
+    residuals = [Statement("Residuals are in units of their own scatter: a named residual has no noise model.")]
     if f.likelihood:
-        of = " of the whitened residuals" if f.discrepancy else ""
-        words = f"The reduced chi-square{of} is {f.ratio:.3g} with {f.freedom} degrees of freedom; the true model and"
-        found = [Statement(f"{words} noise give 1 ± {math.sqrt(2.0 / max(f.freedom, 1)):.2g}.")]
-        if f.large:
-            words = f"The {which} are larger than {f.expectation} predicts."
-            found.append(Statement(words, {"size": "large", "residuals": "misfit"}))
-        elif f.small and f.correlated:
-            words = f"The {which} are smaller than {f.expectation} predicts, but correlated."
-            found.append(Statement(words, {"size": "small", "residuals": "misfit"}))
-        elif f.small:
-            words = (
-                f"The {which} are smaller than {f.expectation} predicts: sigma is too large, or holds a common error."
-            )
-            found.append(Statement(words, {"size": "small", "residuals": "misfit", "noise": "too large"}))
-        else:
-            found.append(Statement(f"The size of the {which} is what {f.expectation} predicts.", {"size": "expected"}))
-    else:
-        found = [Statement("Residuals are in units of their own scatter: a named residual has no noise model.")]
-    if math.isfinite(structure.lag_one):
-        words = f"correlated by {structure.lag_one:+.2f} ± {structure.pairs**-0.5:.2g} ({structure.pairs} pairs)"
-        words = f"Neighbouring {which} are {words}; their root mean square is {structure.rms:.2f}."
-        found.append(Statement(f"{words} Independent ones of unit variance have 0 and 1."))
-    if f.correlated:
-        words = "Correlated residuals come from structure that is not in the model, or from a smooth calibration error."
-        found.append(Statement(words, {"residuals": "misfit"}))
-    words = f"{structure.beyond_three:.1%} of the {which} are beyond 3 sigma (normal distribution: 0.3 %)."
-    return [*found, Statement(words)]
-
-
-def identification(f: Assessment) -> list[Statement]:
-    """What the data identify: directions of parameter space, and parameters at a bound."""
-    limit = f"{100.0 * UNIDENTIFIED_BEYOND:g} % of the prior range"
-    words = f"The standard error along every principal direction of parameter space is at most {limit}."
-    found = [Statement(words, {"directions": "all"})]
-    if f.unidentified:
-        words = f"{len(f.unidentified)} of {len(f.words)} principal directions of parameter space have a standard error"
-        found = [Statement(f"{words} above {limit}; there, priors dominate.", {"directions": "not all"})]
-    if f.at_bound:
-        words = f"At a bound: {', '.join(f.at_bound)}. The best value may lie beyond it. Parameters at a bound have no"
-        found.append(Statement(f"{words} standard error; the other errors are conditional on them."))
-    return found
-
-
-def sentences(statements: Iterable[Statement]) -> list[str]:
-    """The sentences of statements."""
-    return [one.sentence for one in statements]
+        spread = math.sqrt(2.0 / max(f.freedom, 1))
+        words = f"The reduced chi-square of the {f.which} is {f.ratio:.3g} with {f.freedom} degrees of freedom, for"
+        words, claims = f"{words} which {f.expectation} predicts 1 ± {spread:.2g}", {"size": f.size}
+        if f.size == "small" and not f.correlated:
+            words, claims = f"{words}: sigma is too large, or holds a common error", claims | {"noise": "too large"}
+        claims |= {} if f.size == "expected" else {"residuals": "misfit"}
+        residuals = [Statement(f"{words}.", claims)]
+    if math.isfinite(f.lag_one):
+        words = f"Neighbouring {f.which} are correlated by {f.lag_one:+.2f}; of {f.pairs} independent pairs, by 0 ±"
+        cause = ": structure that is not in the model, or a smooth calibration error" if f.correlated else ""
+        claims = {"residuals": "misfit"} if f.correlated else {}
+        residuals.append(Statement(f"{words} {f.pairs**-0.5:.2g}{cause}.", claims))
+    return residuals
 
 
 # ---- what is said of a fit ----
@@ -461,44 +387,36 @@ class Verdict(NamedTuple):
 def verdict(fit: "Fit", facts: Assessment | None = None) -> Verdict:
     """How well the model describes the data, what the errors mean, and what the data identify."""
     facts = facts or assess(fit)
-    three = opening(facts)
-    claims = {topic: claim for one in three for topic, claim in one.claims.items()}
-    notes = [*sentences(remarks(facts)), *automatic_discrepancy(fit), *noise_statements(fit.problem)]
+    said = statements(facts)
+    claims = {topic: claim for one in said["verdict"] for topic, claim in one.claims.items()}
+    remarks = [one.sentence for one in said["remarks"]]
+    if (independent := fit.without_discrepancy) is not None:
+        remarks.append(
+            "The discrepancy term was added automatically because, with independent noise, neighbouring residuals "
+            f"correlate by {independent.residual_autocorrelation:+.2f} ({independent.pairs} pairs). Set `discrepancy = "
+            "false` to disable it."
+        )
     sound = claims.get("description") == "yes" and claims["errors"] == "valid" and facts.identified and facts.resolved
-    return Verdict(sentences(three), notes, sound)
+    return Verdict([one.sentence for one in said["verdict"]], [*remarks, *noise_statements(fit.problem)], sound)
 
 
 def summary(fit: "Fit") -> list[str]:
     """A few lines for the terminal: the verdict, chi-square, starts and numerical error."""
-    found = verdict(fit)
+    opening = verdict(fit)
     good = f"chi2/dof {fit.reduced_chi_square:.4g} ({fit.chi_square:.6g} / {fit.degrees_of_freedom})"
-    if fit.problem.noise.discrepancy:
-        good = f"{good} with the discrepancy term, {ratio_without_discrepancy(fit):.4g} without"
-    starts = f"{fit.minima[0].count} of {started(fit)} reached the best minimum"
     accurate = f"; numerical error of the model: {numerical_error(fit.numerical_error)}" if fit.resolution else ""
-    return [*found.sentences, *found.remarks, f"{good}; {starts}{accurate}"]
+    return [*opening.sentences, *opening.remarks, f"{good}; {starts_in_words(fit)}{accurate}"]
 
 
-def automatic_discrepancy(fit: "Fit") -> list[str]:
-    """Why a model discrepancy was added to a fit, if it was."""
-    found = fit.without_discrepancy
-    if found is None:
-        return []
-    correlation = f"{found.residual_autocorrelation:+.2f} ({found.pairs} pairs; reduced chi-square"
-    return [
-        "The discrepancy term was added automatically because, with independent noise, neighbouring residuals correlate"
-        f" by {correlation} {ratio_without_discrepancy(fit):.3g}). Set `discrepancy = false` to disable it."
-    ]
-
-
-def ratio_without_discrepancy(fit: "Fit") -> float:
-    """Chi-square per degree of freedom with independent noise: as fitted so, else with these parameters."""
-    if fit.without_discrepancy is not None:
-        square, freedom = fit.without_discrepancy.chi_square, fit.without_discrepancy.degrees_of_freedom
-    else:
-        square = float(np.sum(np.square(fit.problem.call(Model.offsets_at, fit.vector, fit.predicted))))
-        freedom = fit.degrees_of_freedom
-    return square / freedom if freedom > 0 else math.nan
+def starts_in_words(fit: "Fit") -> str:
+    """How many starts there were, and how they ended."""
+    counts = fit.start_outcomes
+    if not (total := sum(counts.values())):
+        return "starts are not recorded"
+    term = " with the discrepancy term" if fit.without_discrepancy is not None else ""
+    words = [f"{counts['best minimum']} of {total} starts{term} converged to the best minimum"]
+    words += [f"{counts[key]} {word}" for key, word in OUTCOMES.items() if key != "best minimum" and counts[key]]
+    return ", ".join(words) + ("; more starts may find a better one" if counts["best minimum"] == 1 < total else "")
 
 
 def noise_statements(problem: "Problem") -> list[str]:
@@ -508,43 +426,26 @@ def noise_statements(problem: "Problem") -> list[str]:
         return []
     if problem.noise_is_assumed:
         words = f"No noise is stated: {100.0 * DEFAULT_RELATIVE:g} % of the model's value is assumed."
-        found = None if isinstance(used, Totals) else repeats(used)
-        if found is None or not found.noise > 0.0:
-            where = "`relative` under [noise], or `--noise` of a search"
-            return [f"{words} State it as {where}; with start, low and high it is fitted."]
-        scatter = f"{found.count:,} repeated measurements scatter by about {100.0 * found.noise:.2g} %"
-        where = f"`relative = {found.noise:.2g}` under [noise], or `--noise` of a search, states that."
-        return [f"{words} {scatter}: {where}"]
+        pairs = None if isinstance(used, Totals) else repeats(used)
+        if pairs is None or not pairs.noise > 0.0:
+            return [f"{words} State it as `relative` under [noise], or `--noise` of a search."]
+        scatter = f"{pairs.count:,} repeated measurements scatter by about {100.0 * pairs.noise:.2g} %"
+        return [
+            f"{words} {scatter}: `relative = {pairs.noise:.2g}` under [noise], or `--noise` of a search, states that."
+        ]
     if used.sigma is None or not noise.use_sigma or noise.relative in (None, 0):
         return []
-    share = used.sigma[used.values > 0.0] / used.values[used.values > 0.0]
-    own = f", {100.0 * float(np.median(share)):.2g} % in the median" if share.size else ""
-    more = "a fitted relative part" if is_free(noise.relative) else f"relative = {noise.relative:g}"
     return [
-        f"Noise: the data's own sigma{own}, and {more}, added in quadrature. Leave `relative` out if sigma holds it "
+        "Noise: the data's own sigma and `relative` are added in quadrature. Leave `relative` out if sigma holds it "
         "already; `use_sigma = false` ignores sigma."
     ]
 
 
-def minima(fit: "Fit") -> list[str]:
-    """How many starts agree on the minimum."""
-    best, total = fit.minima[0], sum(fit.start_outcomes.values()) or sum(minimum.count for minimum in fit.minima)
-    starts = started(fit) if fit.start_outcomes else f"{total} starts"
-    found = "no other was found" if len(fit.minima) == 1 else f"{len(fit.minima)} minima were found"
-    only = ["Only one start found it: more starts may find a better one."] if best.count == 1 and total > 1 else []
-    return [f"{best.count} of {starts} reached the best minimum; {found}.", *only]
-
-
-def started(fit: "Fit") -> str:
-    """How many starts led to the fit."""
-    refitted = " with the discrepancy term" if fit.without_discrepancy is not None else ""
-    return f"{sum(fit.start_outcomes.values())} starts{refitted}"
-
-
-def sampled(posterior: "Posterior", options: ReportOptions = DEFAULT) -> list[str]:
+def sampled(posterior: "Posterior") -> list[str]:
     """How long the chain is, whether that is long enough for its estimates, and which modes it has."""
     steps, walkers = posterior.chain.shape[:2]
     longest, worst = float(np.max(posterior.autocorrelation_time)), float(np.max(posterior.r_hat))
+    options = posterior.options
     words = [
         f"{walkers} walkers made {steps} steps; the first {posterior.burn_in} are burn-in, the others are "
         f"{(steps - posterior.burn_in) / longest:.0f} times the longest autocorrelation time of {longest:.0f} steps.",
@@ -564,8 +465,8 @@ def sampled(posterior: "Posterior", options: ReportOptions = DEFAULT) -> list[st
         words.append(f"The sampler: {posterior.status}.")
     if not posterior.converged:
         words.append(
-            f"The chain has not converged: {posterior.options.autocorrelation_times:g} autocorrelation times and R-hat "
-            f"of at most {posterior.options.r_hat:g} are needed: "
+            f"The chain has not converged: {options.autocorrelation_times:g} autocorrelation times and R-hat of at "
+            f"most {options.r_hat:g} are needed: "
             + ("do not quote these estimates." if reportable(posterior) else "it gives no estimates yet.")
         )
     return words
@@ -574,13 +475,6 @@ def sampled(posterior: "Posterior", options: ReportOptions = DEFAULT) -> list[st
 def reportable(posterior: "Posterior") -> bool:
     """Whether estimates may be had from the chain."""
     return posterior.converged or posterior.allow_unconverged
-
-
-def in_words(factor: float, options: ReportOptions = DEFAULT) -> str:
-    """A factor in words: in percent while it is near 1."""
-    if factor < options.factor:
-        return f"{100.0 * (factor - 1.0):.2g} %"
-    return f"a factor of {factor:.2g}" if math.isfinite(factor) else "an infinite factor (the model is 0 there)"
 
 
 def numerical_error(error: float | None) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.studies import structures
 from benchmarks.studies.structures import TRUTHS, Repeat
-from fits.structure_search.search import named
+from fits.structure_search import named
 
 
 def repeat(index: int, place: int | None = 0, best: str | None = None, clear_diff: float | None = -1.0) -> Repeat:

@@ -28,11 +28,8 @@ INK, GREY = "#222222", "#9a9a9a"
 CYCLE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 NAMED = {"red": "#D55E00", "green": "#009E73", "blue": "#0072B2"}
 ANGLE_LABEL = "viewing angle θₒ, degrees (+ forward, $-$ backward)"
-DISC = 24_000.0  # square points that all points of a map have together
 LOG_ABOVE = 10.0  # ratio of the largest to the smallest value from which an axis is logarithmic
-MOST_NAMES = 12  # of channels along an axis; of more, some
-MOST_CHANNELS = 6  # in one picture, evenly spaced among all
-MOST_INCIDENCES = 9  # in one picture; data with more is shown at evenly spaced ones
+MOST_CHANNELS, MOST_INCIDENCES = 6, 9  # in one picture, evenly spaced among all
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -51,25 +48,42 @@ STYLE: dict[Any, Any] = {
 }
 
 
+def as_png(figure: Figure, trimmed: bool = True) -> bytes:
+    """The figure as the content of a PNG file. trimmed: without empty margins, else of the size that it has."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=130, bbox_inches="tight" if trimmed else None)
+    return buffer.getvalue()
+
+
+# ---- pictures ----
+
+
 def data_picture(data: "Measurements") -> Figure:
     """What a file holds: in-plane values against angle, one panel per channel, and maps where data leaves the plane.
 
     Of more than six channels some are shown, evenly spaced and with both ends.
     """
     data = data.of_channels(evenly_spaced(data.channels, MOST_CHANNELS))
-    shown = chosen(incidences(data))
+    flat, used, shown = in_plane(data), data.mask, chosen(data)
     maps = mapped(data, shown)
+    sizes = [3.6] * bool(flat.any()) + [2.6] * bool(maps)
     with mpl.rc_context(STYLE):
-        plots = 1 if in_plane(data).any() else 0
-        sizes = [3.6] * plots + [2.6] * bool(maps)
         figure = Figure(figsize=(9.5, sum(sizes)), layout="constrained")
         parts = np.ravel(figure.subfigures(len(sizes), 1, height_ratios=sizes, squeeze=False))
-        if plots:
-            _curves(parts[0].subplots(1, data.values.shape[1], sharey=True, squeeze=False)[0], data, shown)
+        if flat.any():
+            panels = parts[0].subplots(1, len(data.channels), sharey=True, squeeze=False)[0]
+            for channel, axes in enumerate(panels):
+                for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
+                    rows = incidence.rows[flat[incidence.rows]]
+                    draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
+                    draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
+                value_axis(axes, data.values[flat], value_label(data, channel))
+            if panels[0].get_legend_handles_labels()[0]:
+                panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
             parts[0].supxlabel(ANGLE_LABEL, fontsize="medium")
         if maps:
-            values = np.where(data.mask, data.values[:, 0], np.nan)
-            norm = value_norm(values[data.mask])
+            values = np.where(used, data.values[:, 0], np.nan)
+            norm = value_norm(values[used])
             panels = parts[-1].subplots(1, len(maps), squeeze=False)[0]
             for panel, incidence in zip(panels, maps, strict=True):
                 image = hemisphere_map(panel, data, incidence, values, norm, "viridis")
@@ -77,23 +91,74 @@ def data_picture(data: "Measurements") -> Figure:
     return figure
 
 
-def _curves(panels: Sequence[Axes], data: "Measurements", shown: list[Incidence]) -> None:
-    flat, used = in_plane(data), data.mask
-    for channel, axes in enumerate(panels):
+def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) -> Figure:
+    """What structure standardised residuals (N, C) have along angle, and their distribution; label: what they are."""
+    from scipy import stats
+
+    finite, shown = residuals[np.isfinite(residuals)], chosen(data)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 3.6), layout="constrained")
+        along, often = figure.subplots(1, 2, width_ratios=(2.0, 1.0))
+        along.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
         for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-            rows = incidence.rows[flat[incidence.rows]]
-            if not rows.size:
-                continue
-            draw_points(axes, data, rows[used[rows]], channel, colour, incidence.label, data.sigma)
-            draw_points(axes, data, rows[~used[rows]], channel, GREY, None, None)
-        value_axis(axes, data.values[flat], value_label(data, channel))
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(loc="best", ncols=2 if len(shown) > 4 else 1)
+            angle = np.repeat(signed_angle(data)[incidence.rows], residuals.shape[1])
+            points: dict[str, Any] = {"markersize": 2.5, "markeredgewidth": 0.0, "label": incidence.label}
+            along.plot(angle, residuals[incidence.rows].ravel(), "o", color=colour, **points)
+        along.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
+        along.legend(ncols=min(len(shown), 5), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
+        edge = float(np.clip(np.abs(finite).max(), 4.0, 12.0))
+        bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
+        grid = np.linspace(-edge, edge, 301)
+        often.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
+        often.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
+        often.set(xlabel=label, ylabel="density", title="Distribution")
+        often.legend(loc="upper right")
+    return figure
 
 
-def value_label(data: "Measurements", channel: int) -> str:
-    """The name of an axis of values; it says which channel where there are several."""
-    return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
+def totals_picture(totals: Totals, fit: "Fit | None" = None) -> Figure:
+    """A panel for each kind: measured shares of the incident flux against the channel, or the angle of incidence where
+    there is but one channel, and those of the fit."""
+    kinds, channels = [kind for kind in KINDS if kind in totals.kinds], np.arange(len(totals.channels))
+    angles = list(dict.fromkeys(f"{angle:g}°" for angle in totals.theta_i))
+    predicted = np.full(totals.values.shape, np.nan)
+    if fit is not None:
+        predicted[totals.mask] = fit.predicted
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 3.2), layout="constrained")
+        panels = figure.subplots(1, len(kinds), squeeze=False)[0]
+        marks: dict[str, Any] = {}
+        for axes, kind in zip(panels, kinds, strict=True):
+            lines: list[tuple[Any, Any, Any, str]]
+            rows = np.flatnonzero([one == kind for one in totals.kinds])
+            if len(channels) == 1:
+                rows = rows[np.argsort(totals.theta_i[rows], kind="stable")]
+                lines = [(totals.theta_i[rows], rows, 0, "")]
+                axes.set_xlabel("angle of incidence, degrees")
+            else:
+                lines = [(channels, row, channels, f"{totals.theta_i[row]:g}°") for row in rows]
+                shown = channels[:: -(-len(channels) // 12)]
+                axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
+            for x, row, channel, angle in lines:
+                colour, label = CYCLE[0], ""
+                if angle and len(angles) > 1:
+                    colour, label = CYCLE[angles.index(angle) % len(CYCLE)], f" at {angle}"
+                errors = None if totals.sigma is None else totals.sigma[row, channel]
+                points: dict[str, Any] = {"fmt": "o", "color": INK, "markersize": 3, "capsize": 2}
+                axes.errorbar(x, totals.values[row, channel], errors, label=f"measured{label}", **points)
+                if fit is not None:
+                    shape = "-" if len(x) > 1 else "x"
+                    axes.plot(x, predicted[row, channel], shape, color=colour, label=f"fit{label}")
+            axes.margins(y=0.1)
+            axes.set_ylim(bottom=0.0)
+            axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
+            marks |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        panels[0].set_ylabel("share of the incident flux")
+        figure.legend(marks.values(), marks.keys(), loc="outside lower center", ncols=min(len(marks), 6))
+    return figure
+
+
+# ---- what pictures are made of ----
 
 
 def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
@@ -101,9 +166,9 @@ def evenly_spaced(items: Sequence[Any], most: int) -> list[Any]:
     return [items[place] for place in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
 
 
-def chosen(all_incidences: list[Incidence]) -> list[Incidence]:
+def chosen(data: "Measurements") -> list[Incidence]:
     """At most `MOST_INCIDENCES` of the incidences."""
-    return evenly_spaced(all_incidences, MOST_INCIDENCES)
+    return evenly_spaced(incidences(data), MOST_INCIDENCES)
 
 
 def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
@@ -111,6 +176,21 @@ def mapped(data: "Measurements", shown: list[Incidence]) -> list[Incidence]:
     off_plane = ~in_plane(data) & data.mask
     spread = [incidence for incidence in shown if np.count_nonzero(off_plane[incidence.rows]) >= 10]
     return evenly_spaced(spread, 4) if spread else []
+
+
+def value_label(data: "Measurements", channel: int) -> str:
+    """The name of an axis of values; it says which channel where there are several."""
+    return "BRDF, 1/sr" if len(data.channels) == 1 else f"BRDF {data.channels[channel]}, 1/sr"
+
+
+def ordered_colours(count: int) -> list[str]:
+    """`count` colours that run from dark to light, for values that have an order."""
+    return [mpl.colors.to_hex(mpl.colormaps["viridis"](place)) for place in np.linspace(0.0, 0.85, count)]
+
+
+def channel_colour(channel: str, index: int) -> str:
+    """The channel's own colour for red, green and blue, otherwise the next of the cycle."""
+    return NAMED.get(channel, CYCLE[index % len(CYCLE)])
 
 
 def draw_points(
@@ -125,11 +205,10 @@ def draw_points(
     """Values of `rows` against the signed angle, with error bars from `sigma` (N, C); nothing when `rows` is empty."""
     if not rows.size:
         return
-    error = None if sigma is None else np.nan_to_num(sigma[rows, channel])
     axes.errorbar(
         signed_angle(data)[rows],
         data.values[rows, channel],
-        yerr=error,
+        yerr=None if sigma is None else np.nan_to_num(sigma[rows, channel]),
         fmt="o",
         markersize=2.5 if len(rows) > 60 else 3.5,
         color=colour,
@@ -139,6 +218,12 @@ def draw_points(
         label=label,
         zorder=2,
     )
+
+
+def is_logarithmic(values: np.ndarray) -> bool:
+    """Whether the positive ones among `values` span more than a factor `LOG_ABOVE`."""
+    positive = values[values > 0.0]
+    return bool(positive.size and positive.max() > LOG_ABOVE * positive.min())
 
 
 def value_axis(axes: Axes, values: np.ndarray, label: str) -> None:
@@ -155,12 +240,6 @@ def value_axis(axes: Axes, values: np.ndarray, label: str) -> None:
         axes.set_ylim(0.0, 1.1 * values.max())
     axes.set_ylabel(label)
     axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(30.0))
-
-
-def is_logarithmic(values: np.ndarray) -> bool:
-    """Whether the positive ones among `values` span more than a factor `LOG_ABOVE`."""
-    positive = values[values > 0.0]
-    return bool(positive.size and positive.max() > LOG_ABOVE * positive.min())
 
 
 def value_norm(values: np.ndarray) -> Normalize:
@@ -182,7 +261,7 @@ def hemisphere_map(
     rows = rows[values[rows] > 0.0] if isinstance(norm, LogNorm) else rows
     radius = np.minimum(data.theta_o, 180.0 - data.theta_o)[rows]  # transmission is drawn from below
     azimuth = np.radians(relative_azimuth(data)[rows])
-    size = np.clip(DISC / max(len(rows), 1), 1.0, 30.0)
+    size = np.clip(24_000.0 / max(len(rows), 1), 1.0, 30.0)  # square points
     x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
     image = axes.scatter(x, y, c=values[rows], norm=norm, cmap=colours, s=size, linewidths=0.0)
     for ring in (30.0, 60.0, 90.0):
@@ -191,118 +270,3 @@ def hemisphere_map(
     axes.set(aspect="equal", xlim=(-94.0, 94.0), ylim=(-94.0, 94.0), title=f"{incidence.label} (light: star)")
     axes.set_axis_off()
     return image
-
-
-def ordered_colours(count: int) -> list[str]:
-    """`count` colours that run from dark to light, for values that have an order."""
-    return [mpl.colors.to_hex(mpl.colormaps["viridis"](place)) for place in np.linspace(0.0, 0.85, count)]
-
-
-def channel_colour(channel: str, index: int) -> str:
-    """The channel's own colour for red, green and blue, otherwise the next of the cycle."""
-    return NAMED.get(channel, CYCLE[index % len(CYCLE)])
-
-
-def as_png(figure: Figure, trimmed: bool = True) -> bytes:
-    """The figure as the content of a PNG file. trimmed: without empty margins, else of the size that it has."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, bbox_inches="tight" if trimmed else None)
-    return buffer.getvalue()
-
-
-def residual_picture(data: "Measurements", residuals: np.ndarray, label: str) -> Figure:
-    """What structure standardised residuals (N, C) have: along angle, as a histogram, and between neighbours.
-
-    label: what the residuals are, for the axes.
-    """
-    from scipy import stats
-
-    from fits.data.scans import autocorrelation
-    from fits.reports.diagnostics import residual_structure
-
-    structure = residual_structure(data, residuals)
-    finite = residuals[np.isfinite(residuals)]
-    shown = chosen(incidences(data))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 5.6), layout="constrained")
-        panels = figure.subplot_mosaic([["angle", "angle"], ["histogram", "lags"]])
-
-        axes = panels["angle"]
-        axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
-        for incidence, colour in zip(shown, ordered_colours(len(shown)), strict=True):
-            rows = incidence.rows
-            angle = np.repeat(signed_angle(data)[rows], residuals.shape[1])
-            points: dict[str, Any] = {"markersize": 2.5, "markeredgewidth": 0.0, "label": incidence.label}
-            axes.plot(angle, residuals[rows].ravel(), "o", color=colour, **points)
-        axes.set(xlabel=ANGLE_LABEL, ylabel=label, title="Along angle; grey: ±1")
-        axes.legend(ncols=len(shown), loc="lower right", bbox_to_anchor=(1.0, 1.0), columnspacing=1.0)
-
-        axes = panels["histogram"]
-        edge = float(np.clip(np.abs(finite).max(), 4.0, 12.0))
-        grid = np.linspace(-edge, edge, 301)
-        bins = np.linspace(-edge, edge, int(np.clip(np.sqrt(finite.size) * 1.5, 16, 60)))
-        axes.hist(np.clip(finite, -edge, edge), bins=bins.tolist(), density=True, color=CYCLE[5], label="residuals")
-        axes.plot(grid, stats.norm.pdf(grid), color=INK, linewidth=1.2, label="unit normal")
-        title = f"Histogram: rms {structure.rms:.2f}, mean {structure.mean:+.2f}"
-        axes.set(xlabel=label, ylabel="density", title=title)
-        axes.legend(loc="upper right")
-
-        axes = panels["lags"]
-        correlation = autocorrelation(data, residuals)
-        axes.bar(np.arange(1, len(correlation) + 1), correlation, color=CYCLE[0], width=0.7)
-        if structure.pairs:
-            noise = 2.0 / np.sqrt(structure.pairs)
-            axes.axhspan(-noise, noise, color="#dddddd", zorder=0, label="white noise, 95 %")
-            axes.legend(loc="upper right")
-        axes.set(xlabel="lag, measurements in one plane", ylabel="correlation", ylim=(-1.0, 1.0))
-        axes.set_title("Neighbours in angle")
-        axes.xaxis.set_major_locator(mpl.ticker.MultipleLocator(5.0))
-    return figure
-
-
-def totals_picture(totals: Totals, fit: "Fit | None" = None) -> Figure:
-    """A panel for each kind: measured shares of the incident flux against the channel, or the angle of incidence where
-    there is but one channel, and those of the fit."""
-    kinds = [kind for kind in KINDS if kind in totals.kinds]
-    predicted, angles = (
-        np.full(totals.values.shape, np.nan),
-        list(dict.fromkeys(f"{angle:g}°" for angle in totals.theta_i)),
-    )
-    if fit is not None:
-        predicted[totals.mask] = fit.predicted
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 3.2), layout="constrained")
-        panels = figure.subplots(1, len(kinds), squeeze=False)[0]
-        for axes, kind in zip(panels, kinds, strict=True):
-            rows = np.flatnonzero([one == kind for one in totals.kinds])
-            _panel(axes, totals, rows, predicted, angles)
-            axes.set_title("collimated transmittance" if kind == "unscattered" else f"total {kind}")
-        panels[0].set_ylabel("share of the incident flux")
-        every = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
-        marks = {label: handle for handle, label in every}
-        figure.legend(marks.values(), marks.keys(), loc="outside lower center", ncols=min(len(marks), 6))
-    return figure
-
-
-def _panel(axes: Axes, totals: Totals, rows: np.ndarray, predicted: np.ndarray, angles: list[str]) -> None:
-    """The rows of one kind; angles: of incidence of all kinds, each of which has a colour."""
-    channels = len(totals.channels)
-    if channels == 1:
-        order = rows[np.argsort(totals.theta_i[rows], kind="stable")]
-        lines = [(totals.theta_i[order], order, np.zeros(len(order), int), "")]
-        axes.set_xlabel("angle of incidence, degrees")
-    else:
-        places = np.arange(channels)
-        lines = [(places, np.full(channels, row), places, f"{totals.theta_i[row]:g}°") for row in rows]
-        shown = places[:: -(-channels // MOST_NAMES)]
-        axes.set_xticks(shown, [totals.channels[place] for place in shown], rotation=45, ha="right")
-    for x, row, channel, angle in lines:
-        colour = CYCLE[angles.index(angle) % len(CYCLE) if angle else 0]
-        label = f" at {angle}" if angle and len(angles) > 1 else ""
-        errors = None if totals.sigma is None else totals.sigma[row, channel]
-        measured = totals.values[row, channel]
-        axes.errorbar(x, measured, errors, fmt="o", color=INK, markersize=3, capsize=2, label=f"measured{label}")
-        if np.isfinite(predicted).any():
-            axes.plot(x, predicted[row, channel], "-" if len(x) > 1 else "x", color=colour, label=f"fit{label}")
-    axes.margins(y=0.1)
-    axes.set_ylim(bottom=0.0)

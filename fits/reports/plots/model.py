@@ -1,7 +1,6 @@
 """Pictures of a fit, and of predictions, beside data: curves per incidence, residuals, and maps out of plane."""
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -10,10 +9,10 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from fits.data.geometry import Floats, direction
-from fits.data.scans import Incidence, in_plane, incidences, signed_angle
+from fits.data.scans import Incidence, in_plane, signed_angle
 from fits.prediction.predict import with_discrepancy
 from fits.problem.model import Model
-from fits.reports.diagnostics import bsdf, misfit, misfit_label, over_all_rows
+from fits.reports.diagnostics import bsdf, misfit, over_all_rows, residual_label
 from fits.reports.plots.data import (
     ANGLE_LABEL,
     CYCLE,
@@ -42,19 +41,6 @@ STEP = 1.0  # degrees between the points of a model curve
 FEWEST_IN_PLANE = 3  # measurements that make a panel
 
 
-@dataclass(frozen=True)
-class _Curve:
-    """The model along one incidence: viewing angles (M,), values (M, C), and an interval's two ends (2, M, C) or None.
-
-    latent: (M, C), of the stack without the model discrepancy, as is the interval; None where there is no discrepancy.
-    """
-
-    angle: Floats
-    values: Floats
-    latent: Floats | None
-    interval: Floats | None
-
-
 def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None) -> Figure | None:
     """Data and models per incidence against the signed viewing angle, with residuals in units of sigma below each.
 
@@ -66,16 +52,15 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
     None where no incidence has at least three measurements in the plane of incidence.
     """
     first = next(iter(fits.values()))
-    data = first.problem.data
-    flat = in_plane(data)
-    shown = [
-        one for one in chosen(incidences(data)) if np.count_nonzero((flat & data.mask)[one.rows]) >= FEWEST_IN_PLANE
-    ]
+    data, signed = first.problem.data, signed_angle(first.problem.data)
+    shown = _in_plane(data)
     if not shown:
         return None
     curves = {name: _curves(fit, shown, posterior if fit is first else None) for name, fit in fits.items()}
+    residuals = {name: misfit(fit) for name, fit in fits.items()}
     columns = 1 if len(shown) == 1 else 2 if len(shown) <= 4 else 3
     blocks = -(-len(shown) // columns)
+    coloured = len(data.channels) > 1 and len(fits) == 1  # by channel, else by fit
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 4.0 * blocks), layout="constrained")
         grid = figure.add_gridspec(2 * blocks, columns, height_ratios=[3.0, 1.2] * blocks)
@@ -85,11 +70,17 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
             block, column = divmod(index, columns)
             upper = figure.add_subplot(grid[2 * block, column], sharex=upper)
             lower = figure.add_subplot(grid[2 * block + 1, column], sharex=upper, sharey=lower)
-            rows = incidence.rows[flat[incidence.rows]]
-            _points(upper, fits, rows)
-            for place, (name, every) in enumerate(curves.items()):
-                _lines(upper, every[index], data.channels, None if len(fits) == 1 else name, place)
-            _residuals(lower, fits, rows)
+            lower.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
+            lower.axhline(0.0, color=INK, linewidth=0.6)
+            rows = incidence.rows
+            _points(upper, first, rows, coloured)
+            for place, name in enumerate(fits):
+                for channel, channel_name in enumerate(data.channels):
+                    colour = channel_colour(channel_name, channel) if coloured else CYCLE[place % len(CYCLE)]
+                    label = None if channel else "model" if len(fits) == 1 else name
+                    _line(upper, curves[name][index], channel, colour, label, place)
+                    points: dict[str, Any] = {"markersize": 2.2, "color": colour, "markeredgewidth": 0.0}
+                    lower.plot(signed[rows], residuals[name][rows, channel], "o", **points)
             value_axis(upper, data.values[rows[data.mask[rows]]], "BRDF, 1/sr" if column == 0 else "")
             upper.set_title(incidence.label)
             upper.tick_params(labelbottom=False)
@@ -101,90 +92,35 @@ def curves_picture(fits: "dict[str, Fit]", posterior: "Posterior | None" = None)
     return figure
 
 
-def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
-    """Data, model and residual over the viewer's hemisphere, a row per incidence; None for data that stays in plane."""
-    data = fit.problem.data
-    shown = mapped(data, chosen(incidences(data)))
-    if not shown:
-        return None
-    values = np.where(data.mask, data.values[:, channel], np.nan)
-    predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
-    norm = value_norm(values[data.mask])
-    limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(9.5, 2.6 * len(shown) + 0.3), layout="constrained")
-        panels = figure.subplots(len(shown), 3, squeeze=False)
-        for row, incidence in zip(panels, shown, strict=True):
-            image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
-            hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
-            signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-limit, limit), "PuOr")
-            model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
-            for axes, what in zip(row, ("data", model, "residual"), strict=True):
-                axes.set_title(f"{incidence.label}: {what}")
-        bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
-        figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
-        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=misfit_label(fit), extend="both", **bar)
-    return figure
+def _in_plane(data: "Measurements") -> list[Incidence]:
+    """Incidences that have a panel, with their rows in the plane of incidence."""
+    flat = in_plane(data)
+    enough = [one for one in chosen(data) if np.count_nonzero((flat & data.mask)[one.rows]) >= FEWEST_IN_PLANE]
+    return [Incidence(one.theta, one.phi, one.rows[flat[one.rows]]) for one in enough]
 
 
-def _points(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
-    fit = next(iter(fits.values()))
-    data, sigma = fit.problem.data, over_all_rows(fit, assumed_sigma(fit))
-    used, several = data.mask[rows], len(data.channels) > 1
-    what = r"data and assumed $\sigma$" if fit.is_posterior else "data"
-    for channel, name in enumerate(data.channels):
-        colour = channel_colour(name, channel) if several and len(fits) == 1 else INK
-        draw_points(axes, data, rows[used], channel, colour, f"{what}, {name}" if several else what, sigma)
-        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
+class _Curve(NamedTuple):
+    """The model along one incidence: viewing angles (M,), values (M, C), and an interval's two ends (2, M, C) or None.
 
+    latent: (M, C), of the stack without the model discrepancy, as is the interval; None where there is no discrepancy.
+    """
 
-def _lines(axes: Axes, curve: _Curve, channels: tuple[str, ...], name: str | None, place: int) -> None:
-    for channel, channel_name in enumerate(channels):
-        own = len(channels) > 1 and name is None
-        colour = channel_colour(channel_name, channel) if own else CYCLE[place % len(CYCLE)]
-        what = name or "model" if curve.latent is None else f"{name or 'model'} with discrepancy"
-        label = what if channel == 0 else None
-        axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=label, zorder=3)
-        which = ""
-        if curve.latent is not None:
-            label, which = ("without discrepancy" if channel == 0 and place == 0 else None), ", without discrepancy"
-            axes.plot(curve.angle, curve.latent[:, channel], "--", color=colour, linewidth=1.0, label=label, zorder=3)
-        if curve.interval is not None:
-            label = f"95 % of the posterior{which}" if channel == 0 else None
-            low, high = curve.interval[:, :, channel]
-            axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=label, zorder=2.5)
-
-
-def _residuals(axes: Axes, fits: "dict[str, Fit]", rows: np.ndarray) -> None:
-    axes.axhspan(-1.0, 1.0, color="#eeeeee", zorder=0)
-    axes.axhline(0.0, color=INK, linewidth=0.6)
-    for place, fit in enumerate(fits.values()):
-        data, residuals = fit.problem.data, misfit(fit)
-        for channel, name in enumerate(data.channels):
-            own = len(data.channels) > 1 and len(fits) == 1
-            colour = channel_colour(name, channel) if own else CYCLE[place % len(CYCLE)]
-            angle = signed_angle(data)[rows]
-            axes.plot(angle, residuals[rows, channel], "o", markersize=2.2, color=colour, markeredgewidth=0.0)
-
-
-def assumed_sigma(fit: "Fit") -> Floats:
-    """Scale of the noise that the fit assumed at each used sample, (N, C), 1/sr; NaN where its objective has none."""
-    if not fit.is_posterior:
-        return np.full(np.shape(fit.predicted), np.nan)
-    return np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
+    angle: Floats
+    values: Floats
+    latent: Floats | None
+    interval: Floats | None
 
 
 def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -> list[_Curve]:
-    data = fit.problem.data
-    flat, signed = in_plane(data), signed_angle(data)
+    """The model along each incidence, all of them predicted at once."""
+    data, signed = fit.problem.data, signed_angle(fit.problem.data)
     angles, wi, wo = [], [], []
     for incidence in shown:
-        own = signed[incidence.rows[flat[incidence.rows]]]
+        own = signed[incidence.rows]
         angle = np.arange(np.floor(own.min()), np.ceil(own.max()) + STEP / 2, STEP)
-        angle = np.clip(angle, -STEEPEST, STEEPEST)
-        angles.append(angle)
+        angles.append(np.clip(angle, -STEEPEST, STEEPEST))
         wi.append(np.tile(direction(incidence.theta, incidence.phi), (len(angle), 1)))
-        wo.append(direction(angle, incidence.phi + 180.0))
+        wo.append(direction(angles[-1], incidence.phi + 180.0))
     vectors = fit.vector[None]
     if posterior is not None:
         picked = np.linspace(0, len(posterior.samples) - 1, INTERVAL_DRAWS).astype(int)
@@ -194,13 +130,68 @@ def _curves(fit: "Fit", shown: list[Incidence], posterior: "Posterior | None") -
     values = np.broadcast_to(values, (*values.shape[:2], data.values.shape[1]))  # a grey stack is the same in all
     interval = None if posterior is None else np.quantile(values[1:], [0.025, 0.975], axis=0)
     best = with_discrepancy(fit, *towards, values[0])
-    ends = np.cumsum([len(angle) for angle in angles])
     curves = []
-    for angle, end in zip(angles, ends, strict=True):
+    for angle, end in zip(angles, np.cumsum([len(angle) for angle in angles]), strict=True):
         own = slice(end - len(angle), end)
         latent = values[0, own] if fit.problem.noise.discrepancy else None
         curves.append(_Curve(angle, best[own], latent, None if interval is None else interval[:, own]))
     return curves
+
+
+def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
+    """The data of an incidence, with the noise that the fit assumed."""
+    data, what, sigma = fit.problem.data, "data", None
+    if fit.is_posterior:
+        assumed = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
+        what, sigma = r"data and assumed $\sigma$", over_all_rows(fit, assumed)
+    used = data.mask[rows]
+    for channel, name in enumerate(data.channels):
+        colour = channel_colour(name, channel) if coloured else INK
+        label = f"{what}, {name}" if len(data.channels) > 1 else what
+        draw_points(axes, data, rows[used], channel, colour, label, sigma)
+        draw_points(axes, data, rows[~used], channel, GREY, None if channel else "not used", None)
+
+
+def _line(axes: Axes, curve: _Curve, channel: int, colour: str, label: str | None, place: int) -> None:
+    """One channel of a model, labelled for the legend where it is the first."""
+    discrepancy = curve.latent is not None
+    what = f"{label} with discrepancy" if label and discrepancy else label
+    axes.plot(curve.angle, curve.values[:, channel], color=colour, linewidth=1.3, label=what, zorder=3)
+    if curve.latent is not None:
+        what = "without discrepancy" if label and not place else None
+        axes.plot(curve.angle, curve.latent[:, channel], "--", color=colour, linewidth=1.0, label=what, zorder=3)
+    if curve.interval is not None:
+        which = ", without discrepancy" if discrepancy else ""
+        what = f"95 % of the posterior{which}" if label else None
+        low, high = curve.interval[:, :, channel]
+        axes.fill_between(curve.angle, low, high, color=colour, alpha=0.3, linewidth=0.0, label=what, zorder=2.5)
+
+
+def maps_picture(fit: "Fit", channel: int = 0) -> Figure | None:
+    """Data, model and residual over the viewer's hemisphere, a row per incidence; None for data that stays in plane."""
+    data = fit.problem.data
+    shown = mapped(data, chosen(data))
+    if not shown:
+        return None
+    values = np.where(data.mask, data.values[:, channel], np.nan)
+    predicted, residuals = bsdf(fit)[:, channel], misfit(fit)[:, channel]
+    norm = value_norm(values[data.mask])
+    limit = float(np.clip(np.nanquantile(np.abs(residuals), 0.98), 3.0, 30.0))
+    model = "with discrepancy" if fit.problem.noise.discrepancy else "model"
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.5, 2.6 * len(shown) + 0.3), layout="constrained")
+        panels = figure.subplots(len(shown), 3, squeeze=False)
+        for row, incidence in zip(panels, shown, strict=True):
+            image = hemisphere_map(row[0], data, incidence, values, norm, "viridis")
+            hemisphere_map(row[1], data, incidence, predicted, norm, "viridis")
+            signed = hemisphere_map(row[2], data, incidence, residuals, Normalize(-limit, limit), "PuOr")
+            for axes, what in zip(row, ("data", model, "residual"), strict=True):
+                axes.set_title(f"{incidence.label}: {what}")
+        bar: dict[str, Any] = {"shrink": 0.7, "aspect": 30}
+        figure.colorbar(image, ax=panels[:, :2].ravel().tolist(), label=value_label(data, channel), **bar)
+        label = residual_label(fit, whitened=False)
+        figure.colorbar(signed, ax=panels[:, 2].tolist(), label=label, extend="both", **bar)
+    return figure
 
 
 def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure | None:
@@ -210,33 +201,27 @@ def prediction_picture(prediction: "Prediction", data: "Measurements") -> Figure
     None where no incidence has at least three measurements in the plane of incidence.
     """
     used = data.used()
-    flat, angle = in_plane(used), signed_angle(used)
-    shown = [one for one in chosen(incidences(used)) if np.count_nonzero(flat[one.rows]) >= FEWEST_IN_PLANE]
+    shown, signed, channels = _in_plane(used), signed_angle(used), len(used.channels)
     if not shown:
         return None
-    channels = len(used.channels)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.5, 3.0 * channels), layout="constrained")
         grid = figure.subplots(channels, len(shown), squeeze=False, sharex="col")
-        for column, incidence in enumerate(shown):
-            rows = incidence.rows[flat[incidence.rows]]
-            rows = rows[np.argsort(angle[rows], kind="stable")]
-            for channel in range(channels):
-                axes = grid[channel, column]
-                _intervals(axes, angle[rows], prediction, rows, channel)
-                axes.plot(angle[rows], used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
-                value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
-                axes.set_title(incidence.label if channel == 0 else "")
+        for (channel, column), axes in np.ndenumerate(grid):
+            rows = shown[column].rows
+            rows = rows[np.argsort(signed[rows], kind="stable")]
+            angle = signed[rows]
+            low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
+            latent = prediction.latent.quantiles[2, rows, channel]
+            fill: dict[str, Any] = {"color": CYCLE[0], "linewidth": 0}
+            axes.fill_between(angle, low, high, alpha=0.2, label="95 % prediction interval", **fill)
+            axes.fill_between(angle, quarter, three, alpha=0.35, label="50 %", **fill)
+            axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
+            axes.plot(angle, latent, color=CYCLE[1], linewidth=1.0, linestyle="dashed", label="without discrepancy")
+            axes.plot(angle, used.values[rows, channel], ".", color=INK, markersize=3, label="measurements")
+            value_axis(axes, used.values[rows], value_label(used, channel) if column == 0 else "")
+            axes.set_title("" if channel else shown[column].label)
         figure.supxlabel(ANGLE_LABEL, fontsize="medium")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
     return figure
-
-
-def _intervals(axes: Axes, angle: np.ndarray, prediction: "Prediction", rows: np.ndarray, channel: int) -> None:
-    low, quarter, middle, three, high = prediction.predictive.quantiles[:, rows, channel]
-    axes.fill_between(angle, low, high, color=CYCLE[0], alpha=0.2, linewidth=0, label="95 % prediction interval")
-    axes.fill_between(angle, quarter, three, color=CYCLE[0], alpha=0.35, linewidth=0, label="50 %")
-    axes.plot(angle, middle, color=CYCLE[0], linewidth=1.2, label="median")
-    latent = prediction.latent.quantiles[2, rows, channel]
-    axes.plot(angle, latent, color=CYCLE[1], linewidth=1.0, linestyle="dashed", label="without discrepancy")

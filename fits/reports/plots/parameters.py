@@ -1,6 +1,5 @@
 """Pictures of parameters: their posterior (corner and trace), and their correlations."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
@@ -60,12 +59,7 @@ def trace_picture(posterior: "Posterior") -> Figure:
 
 def correlation_picture(fit: "Fit") -> Figure:
     """The correlation matrix of the fitted parameters, with its numbers."""
-    return matrix_picture(list(fit.values), fit.correlation)
-
-
-def matrix_picture(names: Sequence[str], correlation: np.ndarray) -> Figure:
-    """A correlation matrix with its numbers."""
-    matrix = np.round(correlation, 2)
+    names, matrix = list(fit.values), np.round(fit.correlation, 2)
     side = float(np.clip(0.75 * len(names) + 2.0, 3.5, 9.0))
     with mpl.rc_context(STYLE | {"axes.grid": False}):
         figure = Figure(figsize=(side + 0.8, side), layout="constrained")

@@ -1,4 +1,4 @@
-"""Disks that fill up, processes that are killed or that meet, and damaged files: what was kept stays, and is seen."""
+"""Commands that are interrupted or killed, full disks, and processes that meet: what was kept stays, and is resumed."""
 
 import os
 import shutil
@@ -16,16 +16,18 @@ import pytest
 from fits.cli.parser import main
 from fits.optimise import multi_start as starts
 from fits.optimise.result import Fit
+from fits.reports.html import FitReport
 from fits.reports.plots.data import data_picture
-from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior, writing
-from fits.sampling.posterior import Posterior
-from fits.sampling.sample import load, sample
+from fits.reports.results import load_fit, load_posterior, save_fit
+from fits.sampling.sample import sample
 from fits.store import Store
-from tests.helpers.files import contents, largest_file, mounted, read_only
+from tests.helpers.coats import make_folder
+from tests.helpers.files import contents, largest_file, read_only
 from tests.helpers.places import ROOT
 
-MANY = {"walkers": 400, "seed": 1, "max_steps": 300, "ess": 1e6}  # a step is 9.6 kB
-MANY_STARTS = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "200"]
+FIT = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result"]
+MANY_STARTS = [*FIT, "--starts", "200"]
+FIT_MANY = ["fit-many", "scans", "--stacks", "bare.toml", "--out", "out", "--starts", "2", "--processes", "1"]
 
 
 def refusal(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -54,33 +56,56 @@ def stopped(words: list[str], cache: Path, when: Callable[[], bool]) -> Iterator
             process.kill()
 
 
-@pytest.fixture(scope="module")
-def many(result: Fit) -> Posterior:
-    return sample(result, **MANY)
+@pytest.mark.parametrize(
+    ("place", "words", "hint"),
+    [
+        ("fits.sampling.sample.sample", ["sample", "result"], "the chain is kept, `layerjax sample result` resumes it"),
+        ("fits.batch.fit_one", FIT_MANY, "out keeps what was fitted; the same command resumes it"),
+        ("fits.structure_search.search", ["search", "data.csv", "--out", "out"], "out keeps what was fitted"),
+    ],
+)
+def test_an_interrupt_says_how_to_resume(
+    work: Path,
+    capsys: pytest.CaptureFixture[str],
+    coat_fit: Fit,
+    monkeypatch: pytest.MonkeyPatch,
+    place: str,
+    words: list[str],
+    hint: str,
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    save_fit(coat_fit, "result")
+    make_folder(work)
+    monkeypatch.setattr(place, interrupted)
+    assert main(words) == 130
+    assert hint in capsys.readouterr().err
+    assert (work / "out" / "table.csv").is_file() == (words is FIT_MANY)
 
 
-def assert_it_goes_on(result: Fit, path: Path, many: Posterior) -> None:
-    """What was kept is the beginning of the chain of a run that was never interrupted, and grows into all of it."""
-    kept = load(result, path)
-    assert 0 < len(kept.chain) <= len(many.chain)
-    np.testing.assert_array_equal(kept.chain, many.chain[: len(kept.chain)])
-    np.testing.assert_array_equal(sample(result, path=path, **MANY).chain, many.chain)
-
-
-def test_a_chain_survives_a_full_disk(result: Fit, many: Posterior, tmp_path: Path) -> None:
-    path = tmp_path / "chain.db"
-    with largest_file(1_500_000), pytest.raises(OSError, match="No space left") as error:
-        sample(result, path=path, **MANY)
-    assert error.value.filename == str(path)
-    assert_it_goes_on(result, path, many)
-
-
-def test_a_chain_on_a_small_disk_goes_on_with_more_room(result: Fit, many: Posterior, tmp_path: Path) -> None:
-    with mounted(tmp_path, "-t", "tmpfs", "-o", "size=2m", "tmpfs"):
-        with pytest.raises(OSError, match="No space left"):
-            sample(result, path=tmp_path / "chain.db", **MANY)
-        subprocess.run(["mount", "-o", "remount,size=20m", str(tmp_path)], check=True)
-        assert_it_goes_on(result, tmp_path / "chain.db", many)
+def test_an_interrupted_fit_exits_with_130_and_leaves_its_starts_alone(work: Path) -> None:
+    before = contents(work)
+    command = [sys.executable, "-m", "fits.cli", *FIT, "--starts", "100000"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(work.parent / "cache")}
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring would be inherited
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    signal.signal(signal.SIGINT, ours)
+    assert process.stderr is not None
+    first = process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    try:
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert first.startswith("layerjax: fit ")
+    assert process.returncode == 130
+    assert error.splitlines()[-1] == (
+        "layerjax: interrupted: result was not written; the same command resumes with the starts that are done"
+    )
+    after = contents(work)
+    assert after.pop(str(work / ".result.starts"))
+    assert after == before
 
 
 @pytest.mark.parametrize(
@@ -90,7 +115,7 @@ def test_a_chain_on_a_small_disk_goes_on_with_more_room(result: Fit, many: Poste
         (["simulate", "--stack", "coat.toml", "--out", "out.csv", "--force"], "out.csv"),
         (["render", "coat.toml", "--size", "16", "--out", "out.png", "--force"], "out.png"),
         (["info", "data.csv", "--out", "out.png", "--force"], "out.png"),
-        (["compare", "one", "two", "--out", "out.html", "--force"], "out.html"),
+        (["compare", "one", "two", "--no-refit", "--out", "out.html", "--force"], "out.html"),
         (["report", "one"], "one"),
         (["sample", "one"], "one/chain.db"),
     ],
@@ -147,7 +172,7 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
 ) -> None:
     save_fit(coat_fit, "result")
     before = contents(work)
-    words = ["fit", "data.csv", "--stack", "coat.toml", "--out", "result", "--starts", "3", "--force"]
+    words = [*FIT, "--starts", "3", "--force"]
     with largest_file(30_000):
         assert refusal(words, capsys) == "layerjax: error: result: file too large"
     after = contents(work)
@@ -155,19 +180,25 @@ def test_a_fit_on_a_full_disk_keeps_its_starts_and_the_earlier_result(
     assert len(Store.read(".result.starts").keys()) == 3
     assert after == before
     monkeypatch.setattr(starts, "rough_descent", None)  # no start is run again
+    monkeypatch.setattr(FitReport, "write", lambda *_: None)
     assert main(words) == 0
     assert not list(work.glob(".*"))
 
 
 def test_beside_a_running_sampler_others_only_read(
-    work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit, tmp_path_factory: pytest.TempPathFactory
+    work: Path,
+    capsys: pytest.CaptureFixture[str],
+    coat_fit: Fit,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(FitReport, "page", lambda _: "drawn")
     for name in ("result", "other"):
         save_fit(coat_fit, name)
     directory = work / "result"
-    words = ["sample", "result", "--walkers", "32", "--ess", "20000"]
+    words = ["sample", "result", "--walkers", "32", "--ess", "6000"]
 
-    def seen() -> dict[str, tuple[int, int, bytes]]:
+    def state() -> dict[str, tuple[int, int, bytes]]:
         entries = [(path, path.stat()) for path in directory.iterdir()]
         return {path.name: (stat.st_ino, stat.st_mtime_ns, path.read_bytes()) for path, stat in entries}
 
@@ -175,19 +206,19 @@ def test_beside_a_running_sampler_others_only_read(
         return (directory / "chain.db").is_file() and (directory / "chain.db").stat().st_size > 30_000
 
     with stopped(words, tmp_path_factory.getbasetemp() / "cache", some_steps) as process:
-        before = seen()
+        before = state()
         assert {"chain.db", "chain.db.lock"} < set(before)
         for other in (words, [*words, "--force"], [*MANY_STARTS, "--force"]):
             assert f"in use by another process ({process.pid})" in refusal(other, capsys)
         posterior = load_posterior(directory)
-        assert main(["compare", "result", "other"]) == 0
+        assert main(["compare", "result", "other", "--no-refit"]) == 0
         assert main(["report", "result", "--out", "report.html"]) == 0
-        assert seen() == before
+        assert state() == before
     assert process.returncode == -signal.SIGKILL
     assert posterior is not None
     loaded = load_fit(directory)
-    whole = sample(loaded, walkers=32, seed=0, path=directory / "chain.db", ess=20_000)
-    again = sample(loaded, walkers=32, seed=0, ess=20_000)
+    whole = sample(loaded, walkers=32, seed=0, path=directory / "chain.db", ess=6_000)
+    again = sample(loaded, walkers=32, seed=0, ess=6_000)
     assert 0 < len(posterior.chain) < len(again.chain)
     np.testing.assert_array_equal(posterior.chain, again.chain[: len(posterior.chain)])
     np.testing.assert_array_equal(whole.chain, again.chain)
@@ -213,6 +244,7 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
     assert 2 < kept < 200
     solve, solved = starts.rough_descent, []
     monkeypatch.setattr(starts, "rough_descent", lambda *given, **how: solved.append(how) or solve(*given, **how))
+    monkeypatch.setattr(FitReport, "write", lambda *_: None)
     assert main(MANY_STARTS) == 0
     assert solved.count({}) == 200 - kept
     assert not list(work.glob(".*"))
@@ -222,10 +254,13 @@ def test_a_killed_fit_goes_on_with_the_starts_that_are_done(
 
 
 def test_a_killed_batch_goes_on_with_the_fits_that_are_done(
-    work: Path, capsys: pytest.CaptureFixture[str], tmp_path_factory: pytest.TempPathFactory
+    work: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     (work / "scans").mkdir()
-    for name in ("a.csv", "b.csv", "c.csv"):
+    for name in ("a.csv", "b.csv"):
         shutil.copy("data.csv", work / "scans" / name)
     words = ["fit-many", "scans", "--stacks", "coat.toml", "--starts", "2", "--processes", "1", "--out"]
     store = work / "out" / "batch.store"
@@ -238,44 +273,11 @@ def test_a_killed_batch_goes_on_with_the_fits_that_are_done(
         assert f"in use by another process ({process.pid})" in refusal([*words, "out"], capsys)
         assert contents(work) == before
     first = before[str(work / "out" / "a.csv" / "coat" / "fit.json")]
+    monkeypatch.setattr(FitReport, "write", lambda *_: None)
     for out in ("out", "whole"):
         assert main([*words, out]) == 0
     assert (work / "out" / "a.csv" / "coat" / "fit.json").read_bytes() == first  # not fitted again
-    for name in ("a.csv", "b.csv", "c.csv"):
+    for name in ("a.csv", "b.csv"):
         one, other = (load_fit(work / out / name / "coat") for out in ("out", "whole"))
         np.testing.assert_array_equal(one.vector, other.vector)
     assert not list((work / "out").rglob(".*"))
-
-
-def test_a_chain_without_steps_is_no_posterior_yet(coat_fit: Fit, tmp_path: Path) -> None:
-    save_fit(coat_fit, tmp_path / "result")
-    path = tmp_path / "result" / "chain.db"
-    path.write_bytes(b"")
-    assert load_posterior(tmp_path / "result") is None
-    with pytest.raises(ValueError, match="no steps yet"):
-        load(coat_fit, path)
-
-
-def test_a_chain_that_begins_again_is_not_allowed_what_the_last_one_was(coat_fit: Fit, tmp_path: Path) -> None:
-    save_fit(coat_fit, tmp_path / "result")
-    options = {"walkers": 16, "path": tmp_path / "result" / "chain.db"}
-    save_posterior(sample(coat_fit, max_steps=200, allow_unconverged=True, **options), tmp_path / "result")
-    assert load_posterior(tmp_path / "result").allow_unconverged
-    sample(coat_fit, max_steps=100, resume=False, **options)
-    assert not load_posterior(tmp_path / "result").allow_unconverged
-
-
-def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:
-    """By the next one that writes: half of a result goes, and a result that was aside comes back."""
-    directory = tmp_path / "result"
-    save_fit(coat_fit, directory)
-    before = contents(directory)
-    directory.rename(tmp_path / ".result.layerjax-old")
-    (tmp_path / ".result.layerjax-new").mkdir()
-    (tmp_path / ".result.lock").write_text("1\n")
-    with pytest.raises(ValueError, match="holds a result already"):
-        save_fit(coat_fit, directory)
-    assert contents(directory) == before
-    assert [path.name for path in tmp_path.iterdir()] == ["result"]
-    with writing(directory, force=True), pytest.raises(ValueError, match="in use"):
-        save_fit(coat_fit, directory, force=True)

@@ -1,12 +1,13 @@
 """Bad input and bad usage of `layerjax`: one line on stderr, exit code 2, and nothing written."""
 
+import shutil
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from fits.cli import commands
+from fits.cli.commands import COMMANDS
 from fits.cli.parser import main
 from fits.optimise.result import Fit
 from fits.reports.results import save_fit
@@ -67,6 +68,15 @@ REFUSALS = (
     ("predict saved --score nowhere.csv", "nowhere.csv"),
     ("predict saved --score data.csv --select incidence=40", "incidence 40 is not in the data"),
     ("predict saved --incidence 130 --out new.csv --azimuth 400", "400"),
+    ("render fabric --out a.png --size 100000", "size is 100000, must be in [16, 1024]"),
+    ("render fabrik --out a.png", "neither a .toml file nor a material of the gallery: window_shade"),
+    ("render fabric --out a.jpg", "pictures can be written as .png only"),
+    ("render fabric --out data.csv", "pictures can be written as .png only"),
+    ("fit-many scans", "neither a stack nor a search is given"),
+    ("fit-many scans --stacks coat.toml --select everything", "'everything' is no selection"),
+    ("fit-many scans --stacks coat.toml --read strata=flux", "lookup and strata apply to MERL files only"),
+    ("fit-many scans --stacks coat.toml --noise 0.1", "--noise is given without --search"),
+    ("fit-many scans --stacks coat.toml --scale-sd 0", "--scale-sd is given without --search"),
 )
 
 
@@ -80,27 +90,51 @@ def test_refusals(work: Path, capsys: pytest.CaptureFixture[str], coat_fit: Fit,
     (work / "root.toml").write_text('objective = "cube_root"\n' + (work / "coat.toml").read_text())
     if "saved" in command:
         save_fit(coat_fit, "saved")
+    if "fit-many" in command:
+        (work / "scans").mkdir()
+        shutil.copy("data.csv", "scans")
+        command = f"{command} --out out"
     assert fragment in refused(command.split(), capsys, work)
 
 
+MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans --stacks coat.toml --out out"
+
+
 @pytest.mark.parametrize(
-    "command",
+    ("command", "fragment"),
     [
-        "",
-        "fot",
-        "fit data.csv",
-        f"{FIT} --starts 0",
-        f"{FIT} --min-retro-angle nan",
-        "simulate --stack coat.toml --out x.csv --noise -1",
+        ("", "COMMAND"),
+        ("fot", "invalid choice: 'fot'"),
+        ("fit data.csv", "required: --out, --stack"),
+        (f"{FIT} --starts 0", "0 given, must be a whole number >= 1"),
+        (f"{FIT} --min-retro-angle nan", "nan given, must be a number in [0, 90]"),
+        ("simulate --stack coat.toml --out x.csv --noise -1", "-1 given, must be a number >= 0"),
+        (f"{MANY} --processes 2 --scheduler tcp://x:1", "--scheduler: not allowed with argument --processes"),
+        (f"{MAP} --spatial-prior wide", "invalid choice: 'wide'"),
+        (f"{MAP} --spatial-prior gaussian --spatial-scale scale=x", "'x' given, must be a number >= 0"),
+        (f"{MAP} --chunk-size -1", "must be a whole number >= 1"),
+        (f"{MAP} --emulator maybe", "invalid choice: 'maybe'"),
     ],
 )
-def test_bad_usage(work: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
+def test_bad_usage(work: Path, capsys: pytest.CaptureFixture[str], command: str, fragment: str) -> None:
     before = contents(work)
     with pytest.raises(SystemExit) as stop:
         main(command.split())
+    error = capsys.readouterr().err
     assert stop.value.code == 2
     assert contents(work) == before
-    assert "error: " in capsys.readouterr().err
+    assert "error: " in error
+    assert fragment in error
+    assert error.count("\n") == 1
+
+
+def test_a_cluster_that_is_not_there_is_named(work: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dask = pytest.importorskip("dask")
+    pytest.importorskip("distributed")
+    words = ["fit-many", "data.csv", "--stacks", "coat.toml", "--out", "out", "--scheduler", "tcp://127.0.0.1:9"]
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}):
+        assert main(words) == 2
+    assert "tcp://127.0.0.1:9: there is no scheduler" in capsys.readouterr().err.splitlines()[-1]
 
 
 MACHINE = {
@@ -121,11 +155,11 @@ def test_errors_of_the_machine(
     def fails(_: object) -> int:
         raise error
 
-    monkeypatch.setattr(commands, "info", fails)
+    monkeypatch.setitem(COMMANDS, "info", fails)
     assert fragment in refused(["info", "data.csv"], capsys, work)
 
 
 def test_an_error_of_the_program_has_its_traceback(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands, "info", lambda _: {}["nothing"])
+    monkeypatch.setitem(COMMANDS, "info", lambda _: {}["nothing"])
     with pytest.raises(KeyError):
         main(["info", "data.csv"])

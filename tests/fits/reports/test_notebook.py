@@ -45,15 +45,12 @@ def test_a_fit_is_its_verdict_and_its_values(coat_fit: Fit) -> None:
 
 
 def test_what_is_not_identified_is_named(result: Fit) -> None:
-    bound = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]))
-    found = {row[0]: row for row in rows(bound._repr_html_())}
-    assert found[A][-1] == "at a bound"
-    assert found[A][2] == "unknown"
-    assert f"{A} is at a bound." in text(bound._repr_html_())
-    combination = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
-    loose = replace(result, unidentified=(combination,))._repr_html_()
-    assert f"{A} and {B} are not identified separately" in text(loose)
-    assert any(row[2:4] == ["unidentified", f"+0.8 {A}, -0.6 {B}"] for row in rows(loose))
+    direction = fits.Direction(float("inf"), {A: 0.8, B: -0.6}, {A: 0.1, B: 0.2})
+    case = replace(result, at_bound=(A,), errors=np.array([np.nan, 0.1]), unidentified=(direction,))
+    shown = case._repr_html_()
+    assert {row[0]: row[2] for row in rows(shown)}[A] == "unknown"
+    assert f"{A} and {B} are not identified separately; {A} is at a bound." in text(shown)
+    assert any(row[2:4] == ["unidentified", f"+0.8 {A}, -0.6 {B}"] for row in rows(shown))
 
 
 def test_a_joint_fit_is_shown_by_measurement_and_names_are_no_html() -> None:

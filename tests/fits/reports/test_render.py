@@ -31,8 +31,7 @@ def test_what_loses_nothing_cannot_be_seen_under_a_sky() -> None:
 
 
 def test_an_opaque_material_has_no_picture_from_behind() -> None:
-    figure = render(WHITE, SINGLE, title="white", size=16)
-    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    titles = [axes.get_title(loc="left") for axes in render(WHITE, SINGLE, title="white", size=16).axes]
     assert "lit from the front" in titles
     assert "from behind" not in titles
     assert not any("transmitted" in title for title in titles)
@@ -48,38 +47,16 @@ def test_bad_arguments_are_named() -> None:
         render(WHITE, lj.RandomWalk(), size=16)
 
 
-def test_the_command(tmp_path, capsys) -> None:
-    stack = tmp_path / "haze.toml"
+def test_the_command_draws_files_and_the_best_of_a_fit(tmp_path, coat_fit, monkeypatch) -> None:
+    stack, picture, drawn = tmp_path / "haze.toml", tmp_path / "haze.png", []
     stack.write_text(
         'transport = "SingleScattering"\n[[layers]]\nkind = "Medium"\n'
         'thickness = { start = 0.5, low = 0.0, high = 2.0 }\n[base]\nkind = "Lambertian"\nalbedo = 0.5\n'
     )
-    picture = tmp_path / "haze.png"
     assert main(["render", str(stack), "--out", str(picture), "--size", "16"]) == 0
     assert picture.read_bytes().startswith(b"\x89PNG")
-    for words, complaint in (
-        ([str(stack), "--out", str(picture)], "exists already"),
-        (["fabric", "--out", str(tmp_path / "a.png"), "--size", "100000"], "size is 100000, must be in [16, 1024]"),
-        (
-            ["fabrik", "--out", str(tmp_path / "a.png")],
-            "neither a .toml file nor a material of the gallery: window_shade",
-        ),
-        (["fabric", "--out", str(tmp_path / "a.jpg")], "pictures can be written as .png only"),
-    ):
-        assert main(["render", *words]) == 2
-        assert complaint in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["haze.png", "haze.toml"]
-
-
-def test_the_best_of_a_fit_is_drawn(tmp_path, coat_fit, monkeypatch) -> None:
-    drawn = []
-
-    def draw(stack, transport, **_):
-        drawn.append((stack, transport))
-        return Figure()
-
-    monkeypatch.setattr("fits.reports.render.render", draw)
     save_fit(coat_fit, tmp_path / "result")
+    monkeypatch.setattr("fits.reports.render.render", lambda *given, **_: drawn.append(given) or Figure())
     assert main(["render", str(tmp_path / "result"), "--out", str(tmp_path / "coat.png")]) == 0
     assert (tmp_path / "coat.png").exists()
     ((stack, transport),) = drawn

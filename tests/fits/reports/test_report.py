@@ -12,16 +12,17 @@ import layerjax as lj
 from fits.any_report import report
 from fits.data.geometry import direction, slices
 from fits.data.measurements import Measurements, Source
-from fits.data.scans import autocorrelation, in_plane, incidences, relative_azimuth, signed_angle
+from fits.data.scans import correlation, in_plane, incidences, neighbours, relative_azimuth, signed_angle
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.reports import tables
-from fits.reports.diagnostics import residual_structure, standardised
+from fits.reports.diagnostics import standardised
 from fits.reports.html import FitReport
 from fits.reports.plots import data as pictures
 from fits.reports.plots import model as model_pictures
+from fits.reports.verdicts import assess
 
 
 def measurements(theta_i: list[float], phi_i: list[float], theta_o: list[float], phi_o: list[float]) -> Measurements:
@@ -42,35 +43,27 @@ def test_the_viewing_angle_is_positive_on_the_mirror_side() -> None:
     assert in_plane(normal).all()
 
 
+JITTER = [(0.15, None, [4, 5]), (30.27, 0.0, [0, 1, 2]), (30.74, 0.0, [3]), (50.0, 90.0, [6]), (50.0, 90.6, [7])]
+
+
 @pytest.mark.parametrize(
-    ("theta", "phi", "found"),
+    ("theta", "phi", "groups"),
     [
         # incidences differ by either angle
         (
             [10, 30, 10, 30, 10],
-            [180, 180, 0, 180, 180.0],
+            [180, 180, 0, 180, 180],
             [(10.0, 0.0, [2]), (10.0, 180.0, [0, 4]), (30.0, 180.0, [1, 3])],
         ),
         # and are the same within the jitter of an instrument
-        (
-            [30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50.0, 50.0],
-            [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6],
-            [
-                (0.15, None, [4, 5]),
-                (30.27, 0.0, [0, 1, 2]),
-                (30.74, 0.0, [3]),
-                (50.0, 90.0, [6]),
-                (50.0, 90.6, [7]),
-            ],
-        ),
+        ([30.24, 30.26, 30.3, 30.74, 0.1, 0.2, 50, 50], [359.9, 0.1, 0.0, 0.0, 10.0, 200.0, 90.0, 90.6], JITTER),
     ],
 )
 def test_rows_of_one_incidence(
-    theta: list[float], phi: list[float], found: list[tuple[float, float | None, list[int]]]
+    theta: list[float], phi: list[float], groups: list[tuple[float, float | None, list[int]]]
 ) -> None:
-    for group, (polar, azimuth, rows) in zip(
-        incidences(measurements(theta, phi, [5] * len(theta), [0] * len(theta))), found, strict=True
-    ):
+    found = incidences(measurements(theta, phi, [5] * len(theta), [0] * len(theta)))
+    for group, (polar, azimuth, rows) in zip(found, groups, strict=True):
         assert group.rows.tolist() == rows
         assert group.theta == pytest.approx(polar, abs=0.005)
         assert azimuth is None or group.phi == pytest.approx(azimuth, abs=0.005)
@@ -85,44 +78,32 @@ def series(correlation: float, count: int, seed: int) -> np.ndarray:
     return np.array(values)
 
 
-def long_track(count: int) -> Measurements:
-    angle = np.linspace(-80, 80, count)
-    return measurements([30] * count, [180] * count, np.abs(angle).tolist(), np.where(angle < 0, 180.0, 0.0).tolist())
-
-
-@pytest.mark.parametrize("correlation", [0.0, 0.8])
-def test_the_correlation_of_neighbours_is_recovered(correlation: float) -> None:
+@pytest.mark.parametrize("given", [0.0, 0.8])
+def test_the_correlation_of_neighbours_is_recovered(given: float) -> None:
     count = 4000
-    shuffled = np.random.default_rng(0).permutation(count)
-    data = long_track(count)
-    data = replace(data, wo=data.wo[shuffled])
-    residuals = series(correlation, count, seed=5)[shuffled, None]
-    structure = residual_structure(data, residuals)
+    shuffled, angle = np.random.default_rng(0).permutation(count), np.linspace(-80, 80, count)
+    phi_o = np.where(angle < 0, 180.0, 0.0)
+    data = measurements([30] * count, [180] * count, np.abs(angle).tolist(), phi_o.tolist())
+    pairs = neighbours(replace(data, wo=data.wo[shuffled]), series(given, count, seed=5)[shuffled, None])
     # the standard error of a lag-one correlation r is sqrt((1 - r^2) / n)
-    assert abs(structure.lag_one - correlation) < 4 * np.sqrt((1 - correlation**2) / count)
-    assert structure.pairs == count - 1
-    assert (structure.lag_one_sigma > 4) == (correlation > 0)
-    assert abs(autocorrelation(data, residuals)[1] - correlation**2) < 0.08
+    assert abs(correlation(*pairs) - given) < 4 * np.sqrt((1 - given**2) / count)
+    assert pairs[0].size == count - 1
 
 
-def test_independent_share_is_what_the_mean_of_a_correlated_series_says() -> None:
+def test_errors_are_too_small_by_what_the_mean_of_a_correlated_series_says(coat_fit: Fit) -> None:
     means = [series(0.6, 400, seed).mean() for seed in range(1500)]
-    share = residual_structure(long_track(4000), series(0.6, 4000, seed=1)[:, None]).independent_share
-    # Var(mean) = 1 / (n share); 1500 means give the variance to sqrt(2 / 1500) = 4 %, 4000 residuals the share to 5 %
-    assert share == pytest.approx(1 / (400 * np.var(means)), rel=0.2)
+    facts = replace(assess(coat_fit), lag_one=0.6)
+    # 1500 means give their variance to sqrt(2 / 1500) = 4 %
+    assert facts.error_factors == (1.0, pytest.approx(np.sqrt(400 * np.var(means)), rel=0.06))
 
 
-def test_masked_rows_have_no_residual_and_bias_is_structure(coat_fit: Fit) -> None:
+def test_masked_rows_have_no_residual(coat_fit: Fit) -> None:
     residuals = standardised(coat_fit)
     assert np.isnan(residuals[-10:]).all()
     assert np.isfinite(residuals[:-10]).all()
-    structure = residual_structure(coat_fit.problem.data, residuals)
-    assert structure.count == len(residuals) - 10
-    assert structure.rms**2 * structure.count == pytest.approx(coat_fit.chi_square)
-    # a shift by 2 sigma correlates white neighbours by 4 / (4 + 1)
-    shifted = residual_structure(coat_fit.problem.data, residuals + 2.0)
-    assert shifted.lag_one == pytest.approx(0.8, abs=0.1)
-    assert shifted.mean == pytest.approx(structure.mean + 2.0)
+    label, count, _, rms = tables.incidence_table(coat_fit).rows[-1]
+    assert (label, int(count)) == ("all", len(residuals) - 10)
+    assert float(rms) ** 2 * int(count) == pytest.approx(coat_fit.chi_square, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -142,45 +123,37 @@ def test_numbers_stand_to_two_digits_of_their_error(value: float, error: float, 
 def test_the_report_holds_everything(coat_fit: Fit, tmp_path: Path) -> None:
     strange = Source("<coat> & paint.csv", "csv", "brdf_cos", ("a note",), "Somebody's laboratory")
     named = replace(coat_fit, problem=replace(coat_fit.problem, data=replace(coat_fit.problem.data, source=strange)))
-    report(named, path=tmp_path / "report.html", others={"the other": coat_fit})
-    text = (tmp_path / "report.html").read_text()
-    for word in ("&lt;coat&gt; &amp; paint.csv", "brdf_cos", "a note", "Somebody&#x27;s laboratory", "10 masked"):
-        assert word in text, word
-    for word in (
-        "layers[0].thickness",
-        "base.albedo",
-        "optical depth",
-        "reduced chi-square",
-        "condition number",
-    ):
-        assert word in text, word
-    for word in ("Not sampled", "Comparison", "the other", "starts", "kind = &quot;Lambertian&quot;", "jax "):
+    path = tmp_path / "report.html"
+    report(named, path=path, others={"the other": coat_fit})
+    text = path.read_text()
+    words = ["&lt;coat&gt; &amp; paint.csv", "brdf_cos", "a note", "Somebody&#x27;s laboratory", "10 masked"]
+    words += ["layers[0].thickness", "base.albedo", "optical depth", "reduced chi-square", "condition number", "jax "]
+    words += ["Not sampled", "Comparison", "the other", "starts", "kind = &quot;Lambertian&quot;"]
+    for word in words:
         assert word in text, word
     assert "<coat>" not in text
     pictured = re.findall(r'src="([^"]{30})', text)
     assert len(pictured) == 5  # curves, maps, residuals, correlation, comparison
     assert all(start.startswith("data:image/png;base64,") for start in pictured)
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+    with pytest.raises(ValueError, match="exists"):  # it replaces an earlier one only by force
+        report(coat_fit, path=path, force=False)
+    assert path.read_text() == text
 
 
-def test_the_report_lists_the_incidences_that_were_fitted(coat_fit: Fit) -> None:
+def test_the_report_begins_with_the_verdict_and_lists_the_incidences_that_were_fitted(coat_fit: Fit) -> None:
     data = coat_fit.problem.data
     kept = data.where(np.isclose(data.theta_i, 10.0), "held out: incidence=50")
-    report = FitReport(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)))
-    vars(report)["images"] = {}  # none is drawn
-    text = report.page()
+    part = FitReport(replace(coat_fit, problem=replace(coat_fit.problem, data=kept)))
+    vars(part)["images"] = {}  # none is drawn
+    text = part.page()
     assert "<td>incidence</td><td>10°</td>" in text
     heads = re.findall("<h2>(.*?)</h2>", text)
     assert heads == ["Values", "Data and model", "Diagnostics", "Identifiability", "Posterior"]
     assert text.index('class="verdict') < text.index("<h2>")
 
 
-def test_the_report_replaces_an_earlier_one_only_by_force(coat_fit: Fit, tmp_path: Path) -> None:
-    path = tmp_path / "report.html"
-    path.write_text("mine")
-    with pytest.raises(ValueError, match="exists"):
-        report(coat_fit, path=path, force=False)
-    assert path.read_text() == "mine"
+# ---- pictures ----
 
 
 def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
@@ -188,10 +161,10 @@ def test_a_grey_stack_is_drawn_in_all_channels(coat_data: Measurements) -> None:
     data = replace(coat_data, values=values, sigma=None, channels=("red", "green", "blue"))
     stack = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(Free(0.5, 0.0, 1.0)))
     grey = fit(stack, data, transport=lj.SingleScattering(), noise=Noise(relative=0.03), starts=1)
+    assert grey.predicted.shape == data.used().values.shape
     figure = model_pictures.curves_picture({"grey": grey})
     assert isinstance(figure, Figure)
-    curves = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 100]
-    assert len(curves) == 3
+    assert sum(len(line.get_xdata()) > 100 for line in figure.axes[0].lines) == 3
 
 
 def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
@@ -207,21 +180,19 @@ def test_curves_show_data_model_and_residuals(coat_fit: Fit) -> None:
     rows = np.flatnonzero(used & in_plane(data) & (data.theta_i == 10))
     expected = np.full(len(used), np.nan)
     expected[used] = coat_fit.predicted[:, 0]
-    drawn = np.interp(signed_angle(data)[rows], *line.get_data())
     # the angles of the data are points of the curve
-    np.testing.assert_allclose(drawn, expected[rows], rtol=1e-6)
-    shown = np.concatenate([np.asarray(line.get_ydata()) for line in lower.lines if len(line.get_xdata()) > 2])
-    assert np.nanmax(np.abs(shown)) <= np.abs(coat_fit.residuals).max() + 1e-12
+    np.testing.assert_allclose(np.interp(signed_angle(data)[rows], *line.get_data()), expected[rows], rtol=1e-6)
+    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lower.lines if len(line.get_xdata()) > 2])
+    assert np.nanmax(np.abs(drawn)) <= np.abs(coat_fit.residuals).max() + 1e-12
 
 
 def test_maps_only_where_data_leaves_the_plane(coat_fit: Fit) -> None:
-    assert isinstance(model_pictures.maps_picture(coat_fit), Figure)
     data = coat_fit.problem.data
-    flat = replace(coat_fit, problem=replace(coat_fit.problem, data=data.where(in_plane(data))))
+    assert isinstance(model_pictures.maps_picture(coat_fit), Figure)
     assert len(pictures.data_picture(data).axes) == 4  # curves, two maps and their colour bar
     kept = in_plane(data)
     only = replace(data, wi=data.wi[kept], wo=data.wo[kept], values=data.values[kept], sigma=None, mask=data.mask[kept])
-    assert model_pictures.maps_picture(replace(flat, problem=replace(coat_fit.problem, data=only))) is None
+    assert model_pictures.maps_picture(replace(coat_fit, problem=replace(coat_fit.problem, data=only))) is None
     assert len(pictures.data_picture(only).axes) == 1
 
 

@@ -1,6 +1,7 @@
 """Result directories: what is saved comes back, and writing is all or nothing."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from fits.optimise.uncertainty import Direction
 from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogNormal
 from fits.problem.problem import Problem
-from fits.reports.results import load_fit, load_posterior, save_fit, writing
-from fits.sampling.sample import sample
+from fits.reports.results import load_fit, load_posterior, save_fit, save_posterior, writing
+from fits.sampling.sample import load, sample
 from tests.helpers.files import contents
 
 STORED = ("vector", "errors", "covariance", "cost", "condition_number")
@@ -145,7 +146,7 @@ def test_a_transport_that_has_no_name_is_refused(coat_fit: Fit, tmp_path: Path) 
         ("fit.json", "{", "not valid JSON"),
         ("fit.json", "[]", "must be an object"),
         ("fit.json", '{"layerjax_result": 99}', "version 99"),
-        ("fit.json", '{"layerjax_result": 4}', "damaged"),
+        ("fit.json", '{"layerjax_result": 5}', "damaged"),
         ("data.csv", None, "data.csv"),
         ("data.csv", "", "data.csv: damaged or changed"),
         ("problem.toml", "layers = 3", "problem.toml: damaged or changed"),
@@ -170,6 +171,83 @@ def test_one_of_several_measurements_is_not_sampled_by_itself_where_it_was_saved
         sample(load_fit(tmp_path / "fit"))
 
 
-def test_there_is_no_posterior_before_sampling(coat_fit: Fit, tmp_path: Path) -> None:
+# ---- posteriors ----
+
+
+def test_there_is_no_posterior_before_the_first_step(coat_fit: Fit, tmp_path: Path) -> None:
     save_fit(coat_fit, tmp_path / "result")
     assert load_posterior(tmp_path / "result") is None
+    (tmp_path / "result" / "chain.db").write_bytes(b"")
+    assert load_posterior(tmp_path / "result") is None
+    with pytest.raises(ValueError, match="no steps yet"):
+        load(coat_fit, tmp_path / "result" / "chain.db")
+
+
+def test_a_chain_that_begins_again_is_not_allowed_what_the_last_one_was(coat_fit: Fit, tmp_path: Path) -> None:
+    save_fit(coat_fit, tmp_path / "result")
+    options = {"walkers": 16, "path": tmp_path / "result" / "chain.db"}
+    save_posterior(sample(coat_fit, max_steps=200, allow_unconverged=True, **options), tmp_path / "result")
+    assert load_posterior(tmp_path / "result").allow_unconverged
+    sample(coat_fit, max_steps=100, resume=False, **options)
+    assert not load_posterior(tmp_path / "result").allow_unconverged
+
+
+# ---- damage and kills: whatever is read is what was written, or an error that names the file ----
+
+
+def damaged(content: bytes, step: int) -> Iterator[bytes]:
+    """Copies with 64 bytes zeroed, then inverted, every `step` bytes."""
+    for place in range(0, len(content), step):
+        run = content[place : place + 64]
+        for other in (bytes(len(run)), bytes(255 - byte for byte in run)):
+            if other != run:
+                yield content[:place] + other + content[place + 64 :]
+
+
+def test_damage_to_a_chain_is_seen(result: Fit, tmp_path: Path) -> None:
+    """Wherever it matters: some bytes of a page of SQLite are of no use."""
+    path, refused = tmp_path / "chain.db", 0
+    sample(result, walkers=16, seed=1, max_steps=100, path=path)
+    whole, posterior = path.read_bytes(), load(result, path)
+    copies = [*damaged(whole, 4096), whole[:100], whole[:-1]]
+    for bad in copies:
+        path.write_bytes(bad)
+        try:
+            np.testing.assert_array_equal(load(result, path).chain, posterior.chain)
+        except ValueError as error:
+            refused += "chain.db: damaged" in str(error)
+    assert refused > 0.8 * len(copies)
+
+
+def test_damage_to_a_result_is_seen(coat_fit: Fit, tmp_path: Path) -> None:
+    directory = tmp_path / "result"
+    save_fit(coat_fit, directory)
+    for name in ("fit.json", "data.csv", "problem.toml"):
+        path = directory / name
+        whole = path.read_bytes()
+        for bad in damaged(whole, 512):
+            path.write_bytes(bad)
+            with pytest.raises(ValueError, match=name):
+                load_fit(directory)
+        path.write_bytes(whole)
+    content = json.loads((directory / "fit.json").read_text())
+    content["fit"]["cost"] += 1e-9
+    (directory / "fit.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"fit\.json: damaged or changed"):
+        load_fit(directory)
+
+
+def test_what_killed_processes_left_is_tidied_up(coat_fit: Fit, tmp_path: Path) -> None:
+    """By the next one that writes: half of a result goes, and a result that was aside comes back."""
+    directory = tmp_path / "result"
+    save_fit(coat_fit, directory)
+    before = contents(directory)
+    directory.rename(tmp_path / ".result.layerjax-old")
+    (tmp_path / ".result.layerjax-new").mkdir()
+    (tmp_path / ".result.lock").write_text("1\n")
+    with pytest.raises(ValueError, match="holds a result already"):
+        save_fit(coat_fit, directory)
+    assert contents(directory) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+    with writing(directory, force=True), pytest.raises(ValueError, match="in use"):
+        save_fit(coat_fit, directory, force=True)

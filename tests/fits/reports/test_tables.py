@@ -11,19 +11,14 @@ from fits.data.measurements import Measurements
 from fits.reports.data_summary import data_table
 from fits.reports.tables import Table, degrees, print_table
 
-INCIDENCES, OUTGOING = (8.123456, 30.0, 55.5, 75.0), (0.0012345, 12.3456, 45.0, 89.851123)
-
 
 def measured(channels: int) -> Measurements:
-    theta_i, theta_o = (grid.ravel() for grid in np.meshgrid(INCIDENCES, OUTGOING, indexing="ij"))
-    return Measurements(
-        wi=direction(theta_i, 180),
-        wo=direction(theta_o, 33.3333),
-        values=10 ** np.random.default_rng(0).uniform(-4, 2, (len(theta_i), channels)),
-        sigma=None,
-        mask=np.ones(len(theta_i), bool),
-        channels=tuple(f"{400 + 10 * channel}nm" for channel in range(channels)),
-    )
+    angles = np.meshgrid((8.123456, 30.0, 55.5, 75.0), (0.0012345, 12.3456, 45.0, 89.851123), indexing="ij")
+    theta_i, theta_o = (grid.ravel() for grid in angles)
+    values = 10 ** np.random.default_rng(0).uniform(-4, 2, (len(theta_i), channels))
+    names = tuple(f"{400 + 10 * channel}nm" for channel in range(channels))
+    wi, wo = direction(theta_i, 180), direction(theta_o, 33.3333)
+    return Measurements(wi, wo, values, None, np.ones(len(theta_i), bool), names)
 
 
 class Terminal(io.StringIO):
@@ -40,8 +35,7 @@ def printed(table: Table, width: int, patch: pytest.MonkeyPatch) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", terminal.getvalue())
 
 
-@pytest.mark.parametrize("width", [60, 80, 200])
-@pytest.mark.parametrize("channels", [1, 3, 11])
+@pytest.mark.parametrize(("channels", "width"), [(1, 60), (3, 80), (3, 120), (11, 60), (11, 200)])
 def test_angles_stay_beside_many_channels(channels: int, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     table = data_table(measured(channels))
     text = printed(table, width, monkeypatch)
@@ -54,20 +48,10 @@ def test_angles_stay_beside_many_channels(channels: int, width: int, monkeypatch
     assert not re.search(r"\d\.\d{3,}°", text)
     heads = [index for index, line in enumerate(lines) if "theta_i" in line]
     assert (len(heads) == 1) == ("(1 of " not in text)
+    assert len(heads) == 1 or width < 120 or channels > 3
     for head in heads:  # each part says which incidence a line is of
         assert "phi_i" in lines[head]
         assert [line.split()[:2] for line in lines[head + 2 : head + 6]] == [list(row[:2]) for row in table.rows]
-
-
-def test_a_wide_terminal_gets_one_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert printed(data_table(measured(3)), 120, monkeypatch).count("theta_i") == 1
-
-
-def test_a_terminal_narrower_than_two_columns_folds_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    table = Table("", ("angle", "range"), (("12.5°", "0.000123 to 0.456789"),))
-    text = printed(table, 16, monkeypatch)
-    assert max(map(len, text.splitlines())) <= 16
-    assert re.sub(r"[\s─]", "", text) == "anglerange12.5°0.000123to0.456789"
 
 
 def test_texts_are_wrapped_before_a_table_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:

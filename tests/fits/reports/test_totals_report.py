@@ -11,7 +11,7 @@ import fits
 import layerjax as lj
 from fits.cli.parser import main
 from fits.data.formats import totals_csv
-from fits.reports.data_summary import data_table, source_table
+from fits.reports.data_summary import data_table, source_rows
 from fits.reports.plots.data import totals_picture
 from tests.helpers.commands import refused
 
@@ -76,6 +76,8 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
     assert (folder / "result" / "report.html").is_file()
     assert main(["convert", "totals.csv", "copy.csv"]) == 0
     np.testing.assert_array_equal(fits.read("copy.csv").values, fits.read("totals.csv").values)
+    sphere = "200 25 12 1 0.96"
+    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
     capsys.readouterr()
     fit = ["fit", "totals.csv", "--stack", "slab.toml", "--out", "r"]
     for words, message in (
@@ -83,22 +85,16 @@ def test_on_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str], m
         ([*fit, "--max-polar-angle", "50"], "--max-polar-angle does not apply"),
         (["info", "totals.csv", "--read", "quantity=brdf_cos"], "'brdf_cos', a totals file holds shares of the light"),
         (["search", "totals.csv", "--out", "r"], "a search needs measurements along directions"),
+        (["convert", "slab.rxt", "slab.csv"], "slab.rxt: integrating spheres"),
     ):
         assert message in refused(words, capsys, folder)
-
-
-def test_totals_of_spheres_are_not_converted(folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    monkeypatch.chdir(folder)
-    sphere = "200 25 12 1 0.96"
-    (folder / "slab.rxt").write_text(f"IAD1 1.4 1.5 2.0 1.0 5 0.98 1 {sphere} {sphere} 2 0.3 0.4\n")
-    assert "slab.rxt: integrating spheres" in refused(["convert", "slab.rxt", "slab.csv"], capsys, folder)
 
 
 def test_many_channels_have_a_range(tmp_path: Path) -> None:
     names = tuple(f"{nm} nm" for nm in range(400, 700, 10))
     totals = fits.Totals.of(reflectance=np.linspace(0.1, 0.5, 30)[None], channels=names)
     assert data_table(totals).rows == (("reflectance", "0°", "0.1", "0.5"),)
-    assert dict(source_table(totals).rows)["quantity"] == "shares of the incident flux"
+    assert dict(source_rows(totals))["quantity"] == "shares of the incident flux"
     panel = totals_picture(totals).axes[0]
     assert len(panel.get_xticks()) == 10
     assert panel.get_xticklabels()[0].get_text() == "400 nm"
@@ -120,12 +116,3 @@ def test_an_angle_has_one_colour_in_all_panels_and_is_in_the_legend() -> None:
                 colours.setdefault(label, set()).add(line.get_color())
     assert all(len(one) == 1 for one in colours.values())
     assert len(set.union(*colours.values())) == 3
-
-
-def test_a_stack_of_one_channel_beside_data_of_three(tmp_path: Path) -> None:
-    geometry = fits.slices((10.0, 40.0), np.arange(-60.0, 61.0, 20.0))
-    values = np.full((len(geometry), 3), 0.1) * (1.0 + 0.01 * np.random.default_rng(0).standard_normal((1, 3)))
-    data = fits.Measurements(geometry.wi, geometry.wo, values, None, np.ones(len(geometry), bool), ("r", "g", "b"))
-    fit = fits.fit(lj.Stack([], lj.Lambertian(fits.Free(0.5, 0.0, 1.0))), data, starts=1)
-    assert fit.predicted.shape == values.shape
-    fits.report(fit, path=tmp_path / "report.html")

@@ -1,4 +1,4 @@
-"""The search for the stack behind data: stacks from a library grow and shrink by a layer, level by level.
+"""Which stack is behind data: stacks from a library of layers and bases grow and shrink by a layer, level by level.
 
 Every stack of a level is fitted with independent noise at a coarse resolution, which is cheap, and those with the
 lowest Bayesian information criterion (BIC) are fitted as `fits.fit` does and cross-validated, one incidence held out
@@ -7,11 +7,13 @@ predicts better beyond its error nor has a clearly lower BIC: with model discrep
 predict as well as one that lacks one.
 """
 
+import html
 import math
+import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -20,7 +22,9 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+import layerjax as lj
 from fits._files import named as errors_named
+from fits._files import write_text
 from fits.data.measurements import Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.fit import fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
@@ -32,20 +36,125 @@ from fits.problem.compilation import cores, make_room
 from fits.problem.instrument import Instrument
 from fits.problem.model import Transport
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free
+from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
+from fits.problem.stack_file import check_keys, read_tables, require_table, stack_from_dict
 from fits.progress import Progress, silent
+from fits.reports.html import source_name
+from fits.reports.pages import Table, document, section
 from fits.reports.results import load_fit, save_fit
+from fits.reports.tables import parameter_table
+from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, holds_other_files
-from fits.structure_search.library import Library, Structure, default_library
 from layerjax._checks import in_short, require_kind
 from layerjax.compiling import programs_kept
 
-STORE = "search.store"
+STORE, PAGE = "search.store", "search.html"
 TOGETHER = 8
 """Structures at a time, at most: as many programs as a process can hold beside those that it has."""
 
+Structure = tuple[str, ...]
+"""Names of layers from top to bottom, and of the base."""
+
 Result = TypeVar("Result")
+
+# ---- what stacks are made of ----
+
+
+@dataclass(frozen=True)
+class Library:
+    """Layers and bases by name; a base is a surface, or a stack of its own that lets no light pass.
+
+    Raises:
+        ValueError: no layer or base, or a name that would be no name of a file, or that of another part: they are
+            letters, digits, blanks, hyphens and underscores, and differ by more than case, blanks and hyphens.
+    """
+
+    layers: Mapping[str, lj.Interface | lj.Medium]
+    bases: Mapping[str, lj.Stack]
+
+    def __post_init__(self) -> None:
+        files: dict[str, str] = {}
+        for kind, parts in (("base", self.bases), ("layer", self.layers)):
+            if not parts:
+                raise ValueError(f"library: it has no {kind}; it must have at least one")
+            for name in parts:
+                if not re.fullmatch(r"\w[\w -]*", name):
+                    raise ValueError(f"library: {name!r} is no name; it must be letters, digits, blanks, - and _")
+                key = name.replace(" ", "-").casefold()
+                if key in files:
+                    raise ValueError(f"library: {files[key]!r} and {name!r} are one name as files; they must differ")
+                files[key] = name
+
+    def stack(self, structure: Structure) -> lj.Stack:
+        """The stack with these layers over this base."""
+        base = self.bases[structure[-1]]
+        return lj.Stack([*(self.layers[name] for name in structure[:-1]), *base.layers], base.base)
+
+
+def default_library(channels: int = 1) -> Library:
+    """Interfaces, haze, particles and flakes over diffuse, rough diffuse and metallic bases and deep pigment.
+
+    channels: of the data; what has a colour has a value for each.
+    """
+
+    def coloured(start: float) -> Free:
+        return (
+            Free(start, 0.0, 1.0) if channels == 1 else Free((start,) * channels, (0.0,) * channels, (1.0,) * channels)
+        )
+
+    alpha, thickness = Free(0.3, 0.02, 1.0), Free(0.5, 0.01, 20.0, LogUniform())
+    index, extinction = Free(1.5, 0.05, 9.0, LogUniform()), Free(0.5, 0.01, 9.0, LogUniform())
+    forward, anywhere = (lj.HenyeyGreenstein(Free(*g)) for g in ((0.3, -0.6, 0.9), (0.5, -0.9, 0.9)))
+    pigment = lj.Medium(50.0, coloured(0.5), lj.HenyeyGreenstein(Free(0.0, -0.9, 0.9)))
+    return Library(
+        layers={
+            "interface": lj.Interface(Free(1.5, 1.01, 3.0), alpha),
+            "haze": lj.Medium(Free(0.1, 1e-3, 5.0, LogUniform()), 1.0, forward),
+            "particles": lj.Medium(thickness, coloured(0.9), anywhere),
+            "flakes": lj.Medium(thickness, f0=Free(0.03, 1e-3, 0.3, LogUniform()), phase=lj.SGGX("surface", alpha)),
+        },
+        bases={
+            "diffuse": lj.Stack([], lj.Lambertian(coloured(0.2))),
+            "rough diffuse": lj.Stack([], lj.OrenNayar(coloured(0.2), Free(0.5, 0.0, 1.0))),
+            "metal": lj.Stack([], lj.Conductor(index, extinction, alpha)),
+            "pigment": lj.Stack([pigment]),
+        },
+    )
+
+
+def read_library(path: str | Path) -> Library:
+    """A library from a TOML file: tables ``[layers.NAME]`` and ``[bases.NAME]``, as layers and bases stand in a stack
+    file; of a base of several layers ``[[bases.NAME.layers]]`` and ``[bases.NAME.base]``.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: on one line, which names the file and the place in it.
+    """
+    _, tables = read_tables(Path(path))
+
+    def part(place: str, table: Any) -> lj.Stack:
+        try:
+            return stack_from_dict(table)
+        except ValueError as error:
+            raise ValueError(f"{place}: {error}") from None
+
+    def whole(table: Any) -> Any:
+        """The table of a base as that of a stack."""
+        return table if isinstance(table, dict) and {"layers", "base"} & set(table) else {"base": table}
+
+    try:
+        check_keys("the file", tables, ("layers", "bases"))
+        layers, bases = (require_table(kind, tables.get(kind, {})) for kind in ("layers", "bases"))
+        return Library(
+            layers={name: part(f"layers.{name}", {"layers": [table]}).layers[0] for name, table in layers.items()},
+            bases={name: part(f"bases.{name}", whole(table)) for name, table in bases.items()},
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+# ---- the search ----
 
 
 @dataclass(frozen=True)
@@ -72,8 +181,10 @@ class SearchOptions:
     fit: FitOptions = DEFAULT
 
     def __post_init__(self) -> None:
-        most = {"layers": (0, 6), "starts": (1, math.inf), "beam": (1, math.inf), "cross_validated": (1, math.inf)}
-        for name, (low, high) in most.items():
+        for name, low, high in (
+            ("layers", 0, 6),
+            *((one, 1, math.inf) for one in ("starts", "beam", "cross_validated")),
+        ):
             number = getattr(self, name)
             if not (isinstance(number, int) and low <= number <= high):
                 raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
@@ -114,13 +225,11 @@ class Search:
 
     Attributes:
         candidates: all stacks that were fitted, best first: by predictive score, then by BIC.
-        indistinguishable: names of those whose predictive score is within its error of the best.
         options: of the search.
         stopped: whether its budget ended it before it was done.
     """
 
     candidates: tuple[Candidate, ...]
-    indistinguishable: tuple[str, ...]
     options: SearchOptions = SearchOptions()
     stopped: bool = False
 
@@ -128,6 +237,12 @@ class Search:
     def best(self) -> Candidate:
         """The one with the best predictive score."""
         return self.candidates[0]
+
+    @property
+    def indistinguishable(self) -> tuple[str, ...]:
+        """Names of those whose predictive score is within its error of the best."""
+        others = [(one.name, one.model_score) for one in self.candidates[1:]]
+        return tuple(name for name, score in others if score is not None and score.indistinguishable)
 
     @property
     def ranking(self) -> tuple[str, ...]:
@@ -174,21 +289,29 @@ def search(
     Raises:
         ValueError: the directory is in use, or holds another search or something else; as `fit`, `cross_validate`.
     """
+    for name, value, kind in (
+        ("library", library, Library),
+        ("noise", noise, Noise),
+        ("options", options, SearchOptions),
+    ):
+        require_kind(name, value, kind, None)
     require_kind("data", data, Measurements)
-    require_kind("library", library, Library, None)
-    require_kind("noise", noise, Noise, None)
-    require_kind("options", options, SearchOptions, None)
-    library = default_library(len(data.channels)) if library is None else library
-    options = options or SearchOptions()
+    library, options = library or default_library(len(data.channels)), options or SearchOptions()
     settings = {"transport": transport, "noise": noise or Noise(), "scale": scale, "instrument": instrument}
     until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
-    used = data.used()
-    numbers = [used.wi, used.wo, used.values, used.sigma]
-    # how far it goes is no part of whose search it is: one may go on where another has ended
-    starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
-    whose = fingerprint(data=numbers, library=library, **settings, **starting)
-    with nullcontext() if directory is None else _opened(Path(directory), whose) as store:
-        work = _Work(data, library, settings, options, seed, store, until, progress or silent)
+    store: Any = nullcontext()
+    if directory is not None:
+        directory, used = Path(directory), data.used()
+        if holds_other_files(directory, STORE):
+            raise ValueError(f"{directory}: is not empty, and holds no search")
+        with errors_named(directory):
+            directory.mkdir(parents=True, exist_ok=True)
+        # how far it goes is no part of whose search it is: one may go on where another has ended
+        starting = {"starts": options.starts, "seed": seed, "fit": options.fit}
+        numbers = [used.wi, used.wo, used.values, used.sigma]
+        store = Store.open(directory / STORE, fingerprint(data=numbers, library=library, **settings, **starting))
+    with store as opened:
+        work = _Work(data, library, settings, options, seed, opened, until, progress or silent)
         coarse: dict[Structure, Fit] = {}
         full: dict[Structure, _CrossValidated] = {}
         level: list[Structure] = [(base,) for base in library.bases]
@@ -202,9 +325,9 @@ def search(
             coarse |= work.in_parallel(f"{len(level[0]) - 1} layers", work.fit_coarsely, level)
             fitted = sorted((one for one in level if one in coarse), key=lambda one: _bic(coarse[one]))
             # those of the lowest BIC as `fits.fit` fits them, cross-validated
-            chosen = fitted[: options.cross_validated]
-            full |= work.in_parallel("cross-validation", partial(work.cross_validate, coarse), chosen)
-            stopped = len(fitted) < len(level) or any(one not in full for one in chosen)
+            best_of_level = fitted[: options.cross_validated]
+            full |= work.in_parallel("cross-validation", partial(work.cross_validate, coarse), best_of_level)
+            stopped = len(fitted) < len(level) or any(one not in full for one in best_of_level)
             # a level that neither predicts better nor lowers the BIC clearly is the last
             ahead = not leader or _scores(full)[named(leader[0])].clear_diff > 0.0
             if not ahead and not min(map(_bic, coarse.values())) < lowest - options.bic_gain:
@@ -213,7 +336,15 @@ def search(
             grown = _neighbours(library, dict.fromkeys(_ranked(full)[:1] + by_bic[: options.beam]), options.layers)
             level = [one for one in grown if one not in coarse]
         work.progress("cross-validation", 1, 1, "")
-    return _result(coarse, full, options, stopped)
+    # all that was fitted, ranked
+    scores, bic = _scores(full), {structure: _bic(fit) for structure, fit in coarse.items()}
+    order = [*_ranked(full), *sorted((one for one in coarse if one not in full), key=bic.__getitem__)]
+    candidates = []
+    for structure in order:
+        fit = full[structure].fit if structure in full else coarse[structure]
+        above = bic[structure] - min(bic.values())
+        candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
+    return Search(tuple(candidates), options, stopped)
 
 
 class _CrossValidated(NamedTuple):
@@ -222,17 +353,6 @@ class _CrossValidated(NamedTuple):
     fit: Fit
     checked: CrossValidation
     evidence: Evidence
-
-
-@contextmanager
-def _opened(directory: Path, whose: Mapping[str, str]) -> Iterator[Store]:
-    """The store of a search in its directory, which is made if it is not there."""
-    if holds_other_files(directory, STORE):
-        raise ValueError(f"{directory}: is not empty, and holds no search")
-    with errors_named(directory):
-        directory.mkdir(parents=True, exist_ok=True)
-    with Store.open(directory / STORE, whose) as store:
-        yield store
 
 
 class _Work(NamedTuple):
@@ -257,26 +377,24 @@ class _Work(NamedTuple):
         """The fit as `fits.fit` fits it, with each incidence held out, and its evidence."""
 
         def fitted() -> Fit:
-            problem, options = self._problem(structure), self.options
+            problem, options, independent = self._problem(structure), self.options, coarse[structure]
             if not undecided(problem):
                 return self._fit(problem)
-            if needs_discrepancy(without_discrepancy(coarse[structure]), options.fit):
-                return fit_with_discrepancy(
-                    problem, coarse[structure], starts=options.starts, seed=self.seed, options=options.fit
-                )
+            if needs_discrepancy(without_discrepancy(independent), options.fit):
+                seed, starts = self.seed, options.starts
+                return fit_with_discrepancy(problem, independent, starts=starts, seed=seed, options=options.fit)
             return self._fit(self._problem(structure, independent=True))
 
-        fit = self._load_or_fit(structure, "+full", fitted)
-        kept = None if self.store is None else self.store.get(named(structure))
-        if kept is not None:
-            checked = kept["cross-validation"]
+        fit, key = self._load_or_fit(structure, "+full", fitted), named(structure)
+        record = None if self.store is None else self.store.get(key)
+        if record is not None:
+            checked = record["cross-validation"]
             checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
-            return _CrossValidated(fit, CrossValidation(**checked), Evidence(**kept["evidence"]))
-        found = _CrossValidated(fit, *out_of_sample(fit))
+            return _CrossValidated(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
+        result = _CrossValidated(fit, *out_of_sample(fit))
         if self.store is not None:
-            record = {"cross-validation": vars(found.checked), "evidence": vars(found.evidence)}
-            self.store.put(named(structure), record)
-        return found
+            self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
+        return result
 
     def _problem(self, structure: Structure, independent: bool = False) -> Problem:
         problem = Problem(self.library.stack(structure), self.data, **self.settings)
@@ -293,8 +411,8 @@ class _Work(NamedTuple):
         path = self.store.path.with_name("+".join(name.replace(" ", "-") for name in structure) + kind)
         if path.is_dir():
             return load_fit(path)
-        save_fit(found := fitted(), path)
-        return found
+        save_fit(fit := fitted(), path)
+        return fit
 
     def in_parallel(
         self, stage: str, call: Callable[[Structure], Result], structures: list[Structure]
@@ -341,24 +459,63 @@ def _ranked(full: Mapping[Structure, _CrossValidated]) -> list[Structure]:
 def _scores(full: Mapping[Structure, _CrossValidated]) -> dict[str, ModelScore]:
     """Scores side by side by name, best first."""
     ranked = {named(one): full[one] for one in _ranked(full)}
-    return rank_models(
-        {name: one.checked for name, one in ranked.items()}, {name: one.evidence for name, one in ranked.items()}
+    checked = {name: one.checked for name, one in ranked.items()}
+    return rank_models(checked, {name: one.evidence for name, one in ranked.items()})
+
+
+# ---- what it found ----
+
+
+def write_report(search: Search, directory: str | Path) -> None:
+    """Write the page into the directory of a search."""
+    title = f"Stacks behind {source_name(search.best.fit.problem.data)}"
+    body = [
+        f"<h1>{html.escape(title)}</h1>",
+        section("What the data say", search_sentences(search)),
+        section("Structures", search_table(search)),
+        section("The best", parameter_table(search.best.fit)),
+    ]
+    write_text(Path(directory) / PAGE, document(title, body), force=True)
+
+
+def search_table(search: Search, most: int | None = None) -> Table:
+    """A row for each structure, best first."""
+    rows = []
+    for one in search.candidates[:most]:
+        score, without = one.model_score, one.fit.without_discrepancy
+        count, ratio, cells = one.parameters, one.fit.reduced_chi_square, ("", "", "", "")
+        if without is not None:  # of the stack alone
+            count, ratio = len(without.values), without.chi_square / max(without.degrees_of_freedom, 1)
+        if score is not None:
+            difference = f"{score.elpd_diff:.1f} ± {score.dse:.1f}"
+            cells = (f"{score.elpd:.1f}", difference, f"{score.weight:.2f}", f"{score.model_probability:.2g}")
+        rows.append((one.name, str(count), f"{ratio:.3g}", f"{one.bic:.1f}", *cells))
+    hidden = len(search.candidates) - len(rows)
+    note = (
+        "First the cross-validated models, by elpd (sum of log predictive densities of held-out data); then the "
+        "others, by BIC with independent noise." + (f" {hidden} more are in the report." if hidden else "")
     )
+    heads = ("from the top", "parameters", "chi2/dof", "BIC - best", "elpd", "elpd_diff ± dse", "weight", "probability")
+    return Table("Stacks", heads, tuple(rows), note)
 
 
-def _result(
-    coarse: Mapping[Structure, Fit],
-    full: Mapping[Structure, _CrossValidated],
-    options: SearchOptions,
-    stopped: bool,
-) -> Search:
-    """All that was fitted, ranked."""
-    scores, bic = _scores(full), {structure: _bic(fit) for structure, fit in coarse.items()}
-    candidates = []
-    for structure in (*_ranked(full), *sorted((one for one in coarse if one not in full), key=bic.__getitem__)):
-        fit = full[structure].fit if structure in full else coarse[structure]
-        above = bic[structure] - min(bic.values())
-        candidates.append(Candidate(structure, len(fit.vector), above, fit, scores.get(named(structure))))
-    best = candidates[0].name
-    near = tuple(name for name, one in scores.items() if name != best and one.indistinguishable)
-    return Search(tuple(candidates), near, options, stopped)
+def search_sentences(search: Search) -> list[str]:
+    """Which stacks predict best; what is to be said of the best; and caveats."""
+    scores = {one.name: one.model_score for one in search.candidates if one.model_score is not None}
+    others = "It is ahead of every other cross-validated model by more than the error of the difference."
+    if search.indistinguishable:
+        near = [f"{name} ({scores[name].elpd_diff:.2g} ± {scores[name].dse:.2g})" for name in search.indistinguishable]
+        others = (
+            f"It is statistically indistinguishable from {listed(near)}: these score differences are within two "
+            "standard errors. BIC, weight and probability do not overrule this."
+        )
+    elif len(scores) == 1:
+        others = "No other was cross-validated."
+    count, best = len(search.candidates), verdict(search.best.fit)
+    words = [f"Of {count} models, {search.best.name} has the best cross-validated predictive score. {others}"]
+    words += [" ".join(best.sentences), *best.remarks]
+    if unsure := [name for name, score in scores.items() if not score.evidence.reliable]:
+        words.append(f"Probabilities are unreliable for {listed(unsure)}.")
+    if search.stopped:
+        words.append("The time budget ended the search before all models were tried. The same command resumes it.")
+    return words

@@ -9,29 +9,56 @@ import pytest
 from scipy import stats
 
 import fits
+from fits import batch
 from fits._files import locked
-from fits.batch import fit_files as batch
-from fits.batch.fit_files import STORE
+from fits.batch import STORE
 from fits.data.reading import ReadOptions
-from fits.structure_search.search import SearchOptions
-from tests.helpers.coats import TRUE
+from fits.reports.html import FitReport
+from fits.structure_search import SearchOptions
+from tests.helpers.coats import TRUE, make_folder
 from tests.helpers.files import contents
 
-STACKS = ["coat.toml", "bare.toml"]
-FEW = {"starts": 2}
+STACKS, FEW = ["coat.toml", "bare.toml"], {"starts": 2}
+FIT_FILE = batch.fit_file
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests look at reports of single fits; in this process they are not drawn here."""
+    monkeypatch.setattr(FitReport, "write", lambda _, folder: (folder / "report.html").write_text("drawn"))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with scans/, coat.toml and bare.toml, and in out/ the fits of all files by both."""
+    folder = tmp_path_factory.mktemp("batch")
+    make_folder(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(FitReport, "write", lambda _, at: (at / "report.html").write_text("drawn"))
+        fits.fit_files("scans", STACKS, "out", **FEW)
+    return folder
 
 
 @pytest.fixture
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Which fits are made, in this process."""
+def folder(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A current directory with a copy of it, but the fits."""
+    shutil.copytree(whole, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("out"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def counted(whole: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Which fits are made, in this process; each is a copy of the one that is there, and takes no time."""
     made: list[str] = []
-    fit = batch.fit_into
 
-    def counting(directory: Path, *given: object, **options: object) -> object:
+    def copied(directory: Path, *_: object, **__: object) -> FitReport:
         made.append(f"{directory.parent.name} {directory.name}")
-        return fit(directory, *given, **options)
+        shutil.copytree(whole / "out" / directory.parent.name / directory.name, directory, dirs_exist_ok=True)
+        return FitReport(fits.load_fit(directory))
 
-    monkeypatch.setattr(batch, "fit_into", counting)
+    monkeypatch.setattr(batch, "fit_file", copied)
     return made
 
 
@@ -40,9 +67,17 @@ def table() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -> None:
-    told: list[tuple[object, ...]] = []
-    found = fits.fit_files("scans", STACKS, "out", progress=lambda *given: told.append(given), **FEW)
+def test_every_file_is_fitted_by_every_stack(
+    folder: Path, whole: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[tuple[object, ...]] = []
+    monkeypatch.chdir(whole)
+    before = contents(whole)
+    found = fits.fit_files("scans", STACKS, "out", progress=lambda *given: calls.append(given), **FEW)
+    assert not counted  # nothing is done again
+    after = contents(whole)
+    assert after.pop(str(whole / "out" / STORE))
+    assert all(before[name] == content for name, content in after.items())
     assert [(row["file"], row["stack"]) for row in found.rows] == [
         (file, stack) for file in ("broken.csv", "coated.csv", "paint.csv") for stack in ("coat", "bare")
     ]
@@ -50,8 +85,6 @@ def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -
     assert [Path(path).name for path in found.skipped] == ["README.md"]
     assert "twenty" in found.rows[0]["status"]
     assert found.best == {"coated.csv": "coat", "paint.csv": "bare"}
-    assert len(counted) == 4
-    assert [told[0][:3], told[-1][:3]] == [("fits", 2, 6), ("fits", 6, 6)]
     for file, truth in TRUE.items():
         fit = fits.load_fit(Path("out") / file / found.best[file])
         for name, value in truth.items():
@@ -79,44 +112,38 @@ def test_every_file_is_fitted_by_every_stack(folder: Path, counted: list[str]) -
     for word in ("coated.csv/coat/report.html", "paint.csv/bare/report.html", "twenty", "README.md"):
         assert word in page
     for link in {part.split('"')[0] for part in page.split('href="')[1:]}:
-        assert (folder / "out" / link).is_file()
-
-    before = contents(folder)
-    before.pop(str(folder / "out" / STORE))
-    again = fits.fit_files("scans", STACKS, "out", **FEW)
-    assert len(counted) == 4
-    assert repr(again.rows) == repr(found.rows)
-    after = contents(folder)
-    after.pop(str(folder / "out" / STORE))
-    assert after == before
+        assert (whole / "out" / link).is_file()
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["between", "before the row is kept"])
 def test_an_interrupted_batch_resumes(
     folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch, late: bool
 ) -> None:
-    whole = batch.fit_one
+    fit_one, calls = batch.fit_one, []
 
     def interrupted(job: batch.Job, task: batch.Task) -> batch.Row:
         if len(counted) == 2 and not late:
             raise KeyboardInterrupt
-        row = whole(job, task)
+        row = fit_one(job, task)
         if len(counted) == 3:
             raise KeyboardInterrupt
         return row
 
     monkeypatch.setattr(batch, "fit_one", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        fits.fit_files("scans", STACKS, "out", **FEW)
+        fits.fit_files("scans", STACKS, "out", progress=lambda *given: calls.append(given[:3]), **FEW)
     assert [line["status"] for line in table()].count("not done yet") == 2
-    monkeypatch.setattr(batch, "fit_one", whole)
+    assert calls == [("fits", done, 6) for done in (2, 3, 4)]
+    monkeypatch.setattr(batch, "fit_one", fit_one)
     found = fits.fit_files("scans", STACKS, "out", **FEW)
     assert [row["result"] == "failed" for row in found.rows] == [True, True, False, False, False, False]
     assert len(counted) == 4 + late
     assert len(set(counted)) == 4
 
 
-def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: list[str]) -> None:
+def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_again(
+    folder: Path, counted: list[str]
+) -> None:
     fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
     before = contents(folder / "out")
 
@@ -129,47 +156,40 @@ def test_a_result_of_something_else_is_refused_by_name(folder: Path, counted: li
     refused(r"\(read max_polar_angle None, not 60.0\)", read_options=ReadOptions(max_polar_angle=60.0))
     (folder / "bare.toml").write_text((folder / "bare.toml").read_text().replace("start = 0.5", "start = 0.6"))
     refused(r"out/paint.csv/bare: holds the work of another problem \(stack\)")
+    with (
+        locked(folder / "out" / f"{STORE}.lock", "it"),
+        pytest.raises(ValueError, match=f"out/{STORE} is in use by another process"),
+    ):
+        fits.fit_files("scans/paint.csv", STACKS, "out", force=True, **FEW)
     del counted[:]
     assert fits.fit_files("scans/paint.csv", STACKS, "out", force=True, **FEW).complete
     assert counted == ["paint.csv bare"]
+    path = folder / "out" / "paint.csv" / "bare" / "fit.json"
+    path.write_text(path.read_text()[:-100])
+    shutil.rmtree(folder / "out" / "paint.csv" / "coat")
+    assert fits.fit_files("scans/paint.csv", STACKS, "out", **FEW).complete
+    assert counted == ["paint.csv bare", "paint.csv coat", "paint.csv bare"]
     with open("scans/paint.csv", "a") as file:
         file.write("\n")
     before = contents(folder / "out")
     refused(r"\(file [0-9a-f]{8}, not")
 
 
-def test_a_damaged_or_removed_result_is_fitted_again(folder: Path, counted: list[str]) -> None:
-    fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
-    path = folder / "out" / "paint.csv" / "bare" / "fit.json"
-    path.write_text(path.read_text()[:-100])
-    shutil.rmtree(folder / "out" / "paint.csv" / "coat")
-    assert fits.fit_files("scans/paint.csv", STACKS, "out", **FEW).complete
-    assert counted == ["paint.csv coat", "paint.csv bare"] * 2
-    fits.load_fit(path.parent)
-
-
 @pytest.mark.slow
-def test_held_out_data_decide(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from fits.reports.html import predict_held_out
-    from fits.reports.results import load_held_out
-
-    monkeypatch.setattr(
-        "fits.batch.fit_file.write_report", lambda at, name, fit: predict_held_out(fit, None, load_held_out(at))
-    )
-    found = fits.fit_files(
-        ["scans/coated.csv"], STACKS, "out", read_options=ReadOptions(hold_out=("incidence=50",)), **FEW
-    )
+def test_held_out_data_decide(folder: Path) -> None:
+    reading = ReadOptions(hold_out=("incidence=50",))
+    found = fits.fit_files(["scans/coated.csv"], STACKS, "out", read_options=reading, **FEW)
     assert found.best == {"coated.csv": "coat"}
     coat, bare = found.rows
     assert coat["criterion"] == bare["criterion"] == "-2 elpd"
     assert coat["loss"] < bare["loss"]
     fit = fits.load_fit("out/coated.csv/coat")
-    seen = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
-    assert coat["loss"] == pytest.approx(-2.0 * seen.elpd * seen.count, abs=2e-3 * seen.count)
+    scores = fits.predict(fit, fits.read("out/coated.csv/coat/held_out.csv")).scores
+    assert coat["loss"] == pytest.approx(-2.0 * scores.elpd * scores.count, abs=2e-3 * scores.count)
 
 
 def test_the_best_of_a_search_is_a_result_like_others(
-    folder: Path, coat_fit: fits.Fit, monkeypatch: pytest.MonkeyPatch
+    folder: Path, coat_fit: fits.Fit, counted: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     searched: list[Path] = []
 
@@ -195,26 +215,31 @@ def test_the_best_of_a_search_is_a_result_like_others(
         fits.fit_files("scans/paint.csv", [], "out", search=True)
 
 
-def test_processes_give_what_threads_give(folder: Path) -> None:
-    """A worker knows nothing of the patches here: reports are drawn."""
-    alone = fits.fit_files(["scans/paint.csv"], ["bare.toml"], "alone", reports=False, **FEW)
-    assert not list((folder / "alone").glob("*/*/report.html"))
-    assert "href=" not in Path("alone/report.html").read_text()
-    found = fits.fit_files(["scans/paint.csv", "scans/broken.csv"], ["bare.toml"], "out", processes=2, **FEW)
-    assert [row["result"] == "failed" for row in found.rows] == [False, True]
-    assert found.rows[0]["base.albedo"] == pytest.approx(alone.rows[0]["base.albedo"], rel=1e-6)
+def test_processes_give_what_threads_give(folder: Path, whole: Path) -> None:
+    """A worker knows nothing of the patches here: reports are drawn, where they are wanted."""
+    for reports, out in ((True, "out"), (False, "plain")):
+        files = ["scans/paint.csv", "scans/broken.csv"][: 1 + reports]
+        found = fits.fit_files(files, ["bare.toml"], out, processes=1 + reports, reports=reports, **FEW)
+        albedo = fits.load_fit(whole / "out" / "paint.csv" / "bare").values["base.albedo"]
+        assert found.rows[0]["base.albedo"] == pytest.approx(albedo, rel=1e-6)
+        assert [row["result"] == "failed" for row in found.rows] == [False, True][: 1 + reports]
+        assert ("href=" in Path(out, "report.html").read_text()) == reports
     assert "data:image/png" in Path("out/paint.csv/bare/report.html").read_text()
+    assert not list(folder.glob("plain/*/*/report.html"))
 
 
-def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fit = batch.fit_into
+def test_what_goes_wrong_in_one_fit_ends_none_of_the_others(
+    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copied = batch.fit_file
 
     def broken(directory: Path, *given: object, **options: object) -> object:
         if directory.parent.name == "coated.csv" and directory.name == "coat":
             raise RuntimeError("no memory\nis left")
-        return fit(directory, *given, **options)
+        by = FIT_FILE if directory.parent.name == "paint.csv" and directory.name == "bare" else copied
+        return by(directory, *given, **options)
 
-    monkeypatch.setattr(batch, "fit_into", broken)
+    monkeypatch.setattr(batch, "fit_file", broken)
     fits.fit_files("scans/coated.csv", ["bare.toml"], "out", **FEW)
     precious = folder / "out" / "paint.csv" / "bare" / "precious"
     precious.parent.mkdir(parents=True)
@@ -260,13 +285,6 @@ def test_bad_input_is_named_and_writes_nothing(
     assert not (folder / "out").exists()
 
 
-def test_a_batch_that_another_process_writes_is_left_alone(folder: Path) -> None:
-    (folder / "out").mkdir()
-    lock = folder / "out" / f"{STORE}.lock"
-    with locked(lock, "it"), pytest.raises(ValueError, match=f"out/{STORE} is in use by another process"):
-        fits.fit_files("scans", ["bare.toml"], "out", **FEW)
-
-
 # ---- which stack is best of a file ----
 
 
@@ -275,19 +293,19 @@ def row(stack: str, loss: float, file: str = "a.csv", **more: object) -> batch.R
     return {"file": file, "stack": stack, "loss": loss} | usual | more
 
 
+FAILED = {"file": "a.csv", "stack": "two", "result": "failed", "status": "unreadable"}
+
+
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
         # the lowest criterion is best, and what chance explains as good
         ([row("one", 10.0), row("two", 11.9), row("three", 15.0)], ["best", "as good", "+5.0"]),
         # scatter that the best leaves counts as noise
-        (
-            [row("one", 10.0, reduced_chi_square=4.0), row("two", 17.0), row("three", 90.0)],
-            ["best", "as good", "+20.0"],
-        ),
+        ([row("1", 10.0, reduced_chi_square=4.0), row("2", 17.0), row("3", 90.0)], ["best", "as good", "+20.0"]),
         # of held-out data it does not
         (
-            [row(name, loss, criterion="-2 elpd", reduced_chi_square=4.0) for name, loss in (("a", 9.0), ("b", 1.0))],
+            [row(name, loss, criterion="-2 elpd", reduced_chi_square=4.0) for name, loss in ("a9", "b1")],
             ["+8.0", "best"],
         ),
         # what did not converge is not the best of what did
@@ -296,14 +314,15 @@ def row(stack: str, loss: float, file: str = "a.csv", **more: object) -> batch.R
         ([row("one", 1.0, criterion="cube_root"), row("two", 1.5, criterion="cube_root")], ["best", "+0.5"]),
         # nothing is said of what cannot be compared
         ([row("one", 10.0)], [""]),
-        ([row("one", 10.0), {"file": "a.csv", "stack": "two", "result": "failed", "status": "unreadable"}], ["", ""]),
+        ([row("one", 10.0), FAILED], ["", ""]),
         ([row("one", 10.0), row("two", 90.0, criterion="cube_root")], ["", ""]),
     ],
 )
 def test_stacks_of_a_file_are_ranked(rows: list[batch.Row], words: list[str]) -> None:
+    rows = [one | ({"loss": float(one["loss"])} if "loss" in one else {}) for one in rows]
     others = [row("one", 9.0, "b.csv"), row("two", 1.0, "b.csv"), row("one", 1.0, "c")]
     ranked = batch.ranked([*rows, *others])
-    assert [row["standing"] for row in ranked] == [*words, "+8.0", "best", ""]
+    assert [one["standing"] for one in ranked] == [*words, "+8.0", "best", ""]
     best = fits.FittedFiles(Path(), ranked).best
     assert (best["b.csv"], best["c"]) == ("two", "one")
     assert ("a.csv" in best) == ("best" in words or len(rows) - sum(one["result"] == "failed" for one in rows) == 1)
@@ -323,9 +342,7 @@ def test_table_page_and_sentences(tmp_path: Path) -> None:
         assert word in text
     assert "<0>" not in text
     assert batch.statements(found) == [
-        "5 files by 1 stack: 4 of 5 fits are there, 3 of them converged.",
-        "No result of b.csv.",
-        "Not converged: c.csv by coat.",
+        "4 of 5 fits are there, 3 of them converged.",
         "Not taken for measurements: scans/README.md.",
     ]
     assert len(batch.overview(some * 20, most=10).rows) == 11

@@ -18,36 +18,89 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-import numpy as np
-
 from fits._files import named, read_json, require_there, text_checksum, write_text
-from fits.batch.fit_file import fit_into, require_score
 from fits.data.formats import sniff
+from fits.data.formats.csv import write_csv
+from fits.data.measurements import Measurements
 from fits.data.reading import ReadOptions
 from fits.data.totals import Totals
 from fits.engines import Failure, run
 from fits.engines.failures import one_line
+from fits.optimise.fit import discrepancy_checkpoint
+from fits.optimise.fit import fit as run_fit
+from fits.optimise.options import options_from
 from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import make_room
+from fits.problem.problem import Problem
 from fits.problem.stack_file import ProblemFile, read_problem
 from fits.progress import Progress, silent
-from fits.reports import tables
-from fits.reports.html import write_report
+from fits.reports import results, tables
+from fits.reports.html import FitReport
 from fits.reports.pages import document, section, sentences
-from fits.reports.results import FIT, REPORT, save_fit
 from fits.reports.verdicts import listed
 from fits.store import Store, another, differences, fingerprint, holds_other_files
-from fits.structure_search.report import write_report as write_search
-from fits.structure_search.search import search as run_search
+from fits.structure_search import search as run_search
+from fits.structure_search import write_report as write_search
 
-TABLE, PAGE, STORE = "table.csv", "report.html", "batch.store"
-SEARCH, STACKS = "search", "search-stacks"
-"""Directories of a search below that of a file."""
-NOT_YET = "not done yet"
-SHOWN = 40
-"""Rows on a terminal."""
+TABLE, PAGE, STORE, SEARCH, STACKS = "table.csv", "report.html", "batch.store", "search", "search-stacks"
 
 Row = dict[str, Any]
+
+
+# ---- one file by one stack ----
+
+
+def require_score(problem: ProblemFile, held_out: bool) -> None:
+    """ValueError if data are held out of an objective that has no predictive score."""
+    if held_out and problem.objective != "likelihood":
+        raise ValueError(f"--hold-out needs the objective 'likelihood': {problem.objective!r} has no predictive score")
+
+
+def fit_file(
+    directory: str | Path,
+    problem: ProblemFile,
+    data: Measurements,
+    held_out: Measurements | None = None,
+    *,
+    starts: int = 32,
+    seed: int = 0,
+    force: bool = False,
+    report: bool = True,
+    progress: Progress = silent,
+) -> FitReport:
+    """Fit what a stack file says and write the result directory, whole or not at all: what `layerjax fit` does.
+
+    Args:
+        directory, force: as of `save_fit`.
+        problem: the stack file.
+        data, held_out: what is fitted, and what its prediction is scored by.
+        starts, seed, progress: see `fit`; starts are kept beside the directory until it is there.
+        report: write it and its pictures, which take longer than a fit of a transport in closed form.
+
+    Raises:
+        ValueError: as `fit` and `save_fit`; data are held out of an objective that has no predictive score.
+    """
+    require_score(problem, held_out is not None)
+    target, stage = Path(directory).resolve(), "pictures and report"
+    checkpoint = target.with_name(f".{target.name}.starts")
+    with results.writing(directory, force) as folder:
+        model = (problem.transport, problem.noise, problem.scale, problem.objective, problem.instrument)
+        options, given = options_from(problem.options), Problem(problem.stack, data, *model)
+        fit = run_fit(given, starts=starts, seed=seed, options=options, progress=progress, checkpoint=checkpoint)
+        whole = FitReport(fit, name=target.name, held_out=held_out)
+        progress(stage, 0, 1)
+        results.write_fit(fit, folder, problem.text)
+        if held_out is not None:
+            write_csv(held_out, folder / results.HELD_OUT)
+        if report:
+            whole.write(folder)
+        progress(stage, 1, 1)
+    for path in (checkpoint, discrepancy_checkpoint(checkpoint)):
+        path.unlink(missing_ok=True)
+    return whole
+
+
+# ---- all files by all stacks ----
 
 
 @dataclass(frozen=True)
@@ -124,9 +177,9 @@ def fit_files(
     """
     # what is fitted by what
     read_options, out, progress = read_options or ReadOptions(), Path(out), progress or silent
-    found, skipped = measurement_files(_several(files), read_options.format)
-    named_stacks = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
-    given = {name: read_problem(path) for name, path in named_stacks.items()}
+    paths, skipped = _measurement_files(_several(files), read_options.format)
+    stack_files = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
+    given = {name: read_problem(path) for name, path in stack_files.items()}
     if not given and search is False:
         raise ValueError("neither a stack nor a search is given; there must be one of them")
     for problem in given.values():
@@ -139,11 +192,10 @@ def fit_files(
         raise ValueError(f"{out}: is a file, must be a directory")
     if holds_other_files(out, STORE):
         raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
-    # what is done, and what is left: stack by stack, whose fits share programs
+    # what is done, and what is left
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
-    paths = [path if client is None else path.absolute() for path in found.values()]
-    rows, tasks = _planned(job, paths, done)
+    rows, tasks = _planned(job, [path if client is None else path.absolute() for path in paths.values()], done)
     if not tasks and all(row["result"] == "failed" for row in rows.values()):
         reasons = list(dict.fromkeys(row["status"] for row in rows.values()))
         raise ValueError(f"no file can be fitted: {'; '.join(reasons[:3])}")
@@ -170,16 +222,24 @@ def fit_files(
     return result
 
 
-# ---- what is fitted by what ----
+def _several(items: str | Path | Sequence[str | Path]) -> list[str | Path]:
+    return [items] if isinstance(items, str | Path) else list(items)
 
 
-def measurement_files(places: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
+def _measurement_files(places: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:
     """Files by name, those of folders among them; and what folders hold that are no measurements.
 
     Raises:
         FileNotFoundError: no such file or folder.
         ValueError: a folder without measurements, or a name that is there twice.
     """
+
+    def is_known(path: Path) -> bool:
+        try:
+            return bool(format or sniff(path))
+        except (ValueError, OSError):
+            return False
+
     files: list[Path] = []
     skipped: list[str] = []
     for place in map(Path, places):
@@ -188,7 +248,7 @@ def measurement_files(places: Sequence[str | Path], format: str | None) -> tuple
             files.append(place)
             continue
         every = sorted(one for one in place.iterdir() if one.is_file() and not one.name.startswith("."))
-        some = [one for one in every if format or _has_known_content(one)]
+        some = [one for one in every if is_known(one)]
         if not some:
             raise ValueError(f"{place}: holds no measurement file")
         files += some
@@ -196,14 +256,6 @@ def measurement_files(places: Sequence[str | Path], format: str | None) -> tuple
     if not files:
         raise ValueError("no file is given; there must be at least one")
     return _by_name([(path, path.name) for path in files], (TABLE, PAGE, STORE)), tuple(skipped)
-
-
-def _has_known_content(path: Path) -> bool:
-    try:
-        sniff(path)
-    except (ValueError, OSError):
-        return False
-    return True
 
 
 def _by_name(names: Sequence[tuple[Path, str]], taken: Sequence[str]) -> dict[str, Path]:
@@ -218,34 +270,8 @@ def _by_name(names: Sequence[tuple[Path, str]], taken: Sequence[str]) -> dict[st
     return paths
 
 
-@dataclass(frozen=True)
-class Job:
-    """What all tasks share: where results go, stacks by name or how they are searched, and how files are read."""
-
-    out: Path
-    stacks: Mapping[str, ProblemFile]
-    searching: Mapping[str, Any] | None
-    read_options: ReadOptions
-    fitting: Mapping[str, Any]
-    reports: bool
-    force: bool
-
-    @property
-    def names(self) -> list[str]:
-        """Names of stacks, and of the search."""
-        return [*self.stacks, *([] if self.searching is None else [SEARCH])]
-
-    def fingerprint(self, task: "Task") -> dict[str, str]:
-        """Key of a result."""
-        how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
-        how_read = {f"read {name}": value for name, value in vars(self.read_options).items()}
-        at = self.read_options.geometry
-        how_read["read geometry"] = None if at is None else [at.wi, at.wo]
-        return fingerprint(file=task.content, **how_read, **(how or {}))
-
-
 class Task(NamedTuple):
-    """A file, by its path and what tells its content from others, and the name of a stack."""
+    """A file, by its path and the checksum of its content, and the name of a stack."""
 
     path: Path
     content: str
@@ -261,92 +287,93 @@ class Task(NamedTuple):
         return {"file": self.path.name, "stack": self.stack, "result": "failed", "status": why}
 
 
+@dataclass(frozen=True)
+class Job:
+    """What all tasks have in common: where results go, stacks or how they are searched, and how files are read."""
+
+    out: Path
+    stacks: Mapping[str, ProblemFile]
+    searching: Mapping[str, Any] | None
+    read_options: ReadOptions
+    fitting: Mapping[str, Any]
+    reports: bool
+    force: bool
+
+    def fingerprint(self, task: Task) -> dict[str, str]:
+        """What a result is made of."""
+        how = self.searching if task.stack == SEARCH else {"stack": self.stacks[task.stack].text, **self.fitting}
+        at = self.read_options.geometry
+        how_read = {f"read {name}": value for name, value in vars(self.read_options).items()}
+        how_read["read geometry"] = None if at is None else [at.wi, at.wo]
+        return fingerprint(file=task.content, **how_read, **(how or {}))
+
+
 def _planned(job: Job, files: list[Path], done: Store | None) -> tuple[dict[str, Row], list[Task]]:
-    """A row for each file and stack, in order, and the tasks that are left; done: what an earlier run has kept."""
+    """A row for each file and stack, in order, and the tasks that are left, stack by stack: fits share programs."""
     rows: dict[str, Row] = {}
     tasks: list[Task] = []
+    names = [*job.stacks, *([] if job.searching is None else [SEARCH])]
     for path in files:
-        why, content = NOT_YET, ""
+        why, content = "not done yet", ""
         try:
             content = text_checksum(path)
         except OSError as error:
             why = one_line(error)
-        every = [Task(path, content, stack) for stack in job.names]
-        known = {task.key: _done_before(job, task, done) for task in every if content and done is not None}
-        left = [task for task in every if known.get(task.key) is None]
+        every = [Task(path, content, name) for name in names]
+        known = {task.key: row for task in every if content and done and (row := _kept_row(job, task, done))}
+        left = [task for task in every if content and task.key not in known]
         try:
-            if left and content:
+            if left:
                 job.read_options.split(path)  # before any is fitted
                 tasks += left
         except (ValueError, OSError) as error:
             why = one_line(error)
         rows |= {task.key: known.get(task.key) or task.failed(why) for task in every}
-    return rows, sorted(tasks, key=lambda task: job.names.index(task.stack))
+    return rows, sorted(tasks, key=lambda task: names.index(task.stack))
 
 
-def _done_before(job: Job, task: Task, done: Store) -> Row | None:
+def _kept_row(job: Job, task: Task, done: Store) -> Row | None:
     """The row of a result that is there; None: it is to be fitted, or again where it is damaged.
 
     Raises:
         ValueError: a result of another file, stack or settings is in its place.
     """
-    kept = done.get(task.key)
-    if kept is None:
+    record = done.get(task.key)
+    if record is None:
         return None
-    words = differences(kept["of"], job.fingerprint(task))
+    words = differences(record["of"], job.fingerprint(task))
     if words and not job.force:
         raise ValueError(f"{another(job.out / task.key, words)}; --force, or force=True, fits it again")
     try:
-        read_json(job.out / task.key / FIT)
+        read_json(job.out / task.key / results.FIT)
     except (ValueError, OSError):
         return None
-    return None if words else kept["row"]
-
-
-def _several(items: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    return [items] if isinstance(items, str | Path) else list(items)
-
-
-# ---- a worker's task ----
+    return None if words else record["row"]
 
 
 def fit_one(job: Job, task: Task) -> Row:
-    """Fit one file by one stack and write the result.
+    """Fit one file by one stack and write the result, in whatever process; its row of the table.
 
     Raises:
         ValueError, OSError: it cannot be fitted. What is wrong with one of many ends none of the others.
     """
     make_room()
+    began, directory = time.monotonic(), job.out / task.key
     try:
-        return _fitted(job, task)
+        data, held_out = job.read_options.split(task.path)
+        with named(directory.parent):
+            directory.parent.mkdir(exist_ok=True)
+        structure = ""
+        if task.stack == SEARCH:
+            structure, whole = _searched(job, task, data, directory)
+        else:
+            options = {"force": True, "report": job.reports, **job.fitting}
+            whole = fit_file(directory, job.stacks[task.stack], data, held_out, **options)
     except (ValueError, OSError):
         raise
     except Exception as error:
         raise ValueError(f"{type(error).__name__}: {error}") from error
-
-
-def _fitted(job: Job, task: Task) -> Row:
-    began, directory, structure = time.monotonic(), job.out / task.key, ""
-    data, held_out = job.read_options.split(task.path)
-    with named(directory.parent):
-        directory.parent.mkdir(exist_ok=True)
-    if task.stack == SEARCH:
-        if isinstance(data, Totals):
-            raise ValueError(f"{task.path}: holds totals; a search takes values along directions")
-        stacks = directory.with_name(STACKS)
-        if job.force and directory.exists() and stacks.exists():  # of another search
-            shutil.rmtree(stacks)
-        found = run_search(data, **(job.searching or {}), directory=stacks)
-        write_search(found, stacks)
-        structure = found.best.name
-        fit, predicted = found.best.fit, None
-        save_fit(fit, directory, force=True)
-        if job.reports:
-            write_report(directory, SEARCH, fit)
-    else:
-        given = job.stacks[task.stack]
-        fit, predicted = fit_into(directory, given, data, held_out, force=True, report=job.reports, **job.fitting)
-    without = fit.without_discrepancy
+    fit, without = whole.fit, whole.fit.without_discrepancy
     row = task.failed(fit.status) | {
         "result": "converged" if fit.converged else "not converged",
         "structure": structure,
@@ -355,12 +382,29 @@ def _fitted(job: Job, task: Task) -> Row:
         "reduced_chi_square": fit.reduced_chi_square,
         "without discrepancy": without.chi_square / max(without.degrees_of_freedom, 1) if without else math.nan,
     }
-    if predicted is not None and (scores := predicted.prediction.scores) is not None:
+    if whole.predicted is not None:
+        scores = whole.predicted.scores
         row |= {"criterion": "-2 elpd", "loss": -2.0 * scores.elpd * scores.count}
     for name, value in fit.values.items():
         row |= {name: value, f"{name} error": fit.standard_errors[name]}
     row |= {"at_bound": " ".join(fit.at_bound), "measurements": int(fit.problem.data.mask.sum())}
     return row | {"seconds": round(time.monotonic() - began, 2)}
+
+
+def _searched(job: Job, task: Task, data: Measurements, directory: Path) -> tuple[str, FitReport]:
+    """The structure that a search found, and its fit as a result like others."""
+    if isinstance(data, Totals):
+        raise ValueError(f"{task.path}: holds totals; a search takes values along directions")
+    stacks = directory.with_name(STACKS)
+    if job.force and directory.exists() and stacks.exists():  # of another search
+        shutil.rmtree(stacks)
+    found = run_search(data, **(job.searching or {}), directory=stacks)
+    write_search(found, stacks)
+    whole = FitReport(found.best.fit, name=SEARCH)
+    results.save_fit(whole.fit, directory, force=True)
+    if job.reports:
+        whole.write(directory)
+    return found.best.name, whole
 
 
 # ---- what became of them ----
@@ -379,13 +423,19 @@ def ranked(rows: Sequence[Row]) -> tuple[Row, ...]:
         if len(own) < 2 or len({row["criterion"] for row in own}) > 1:
             continue
         best = min(own, key=lambda row: (row["result"] != "converged", row["loss"]))
-        likelihood = best["criterion"] in ("AIC", "-2 elpd")
-        excess = max(1.0, np.nan_to_num(best["reduced_chi_square"])) if best["criterion"] == "AIC" else 1.0
+        likelihood, ratio = best["criterion"] in ("AIC", "-2 elpd"), best["reduced_chi_square"]
+        excess = ratio if best["criterion"] == "AIC" and ratio > 1.0 else 1.0
         for row in own:
             difference = (row["loss"] - best["loss"]) / excess
             close = likelihood and row["result"] == "converged" and difference < ComparisonOptions().slight_difference
             standing[id(row)] = "best" if row is best else "as good" if close else f"{difference:+.1f}"
     return tuple(row | {"standing": standing.get(id(row), "")} for row in rows)
+
+
+def _cell(value: Any, digits: int) -> str:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.{digits}g}"
+    return str(value)
 
 
 def table_csv(rows: Sequence[Row]) -> str:
@@ -400,12 +450,6 @@ def table_csv(rows: Sequence[Row]) -> str:
     return out.getvalue()
 
 
-def _cell(value: Any, digits: int) -> str:
-    if isinstance(value, float):
-        return "" if math.isnan(value) else f"{value:.{digits}g}"
-    return str(value)
-
-
 def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
     """A row each, without the parameters."""
     columns = ["file", "stack", "result", "standing", "reduced_chi_square", "criterion", "loss", "seconds", "structure"]
@@ -416,34 +460,24 @@ def overview(rows: Sequence[Row], most: int | None = None) -> tables.Table:
         "Standing: among the stacks of a file, by -2 log predictive density of held-out data, or else AIC: as good as "
         "the best, or the difference; where the best misses the data, the scatter that it leaves counts as noise."
     )
-    return tables.Table(
-        "Fits", tuple(columns), tuple(shown if most is None else tables.shortened(shown, most)), note, keys=2
-    )
+    return tables.Table("Fits", tuple(columns), tables.shortened(shown, most or len(shown)), note, keys=2)
 
 
 def statements(result: FittedFiles) -> list[str]:
-    """What became of them, in sentences."""
-    rows = result.rows
-    files, stacks = ({row[name]: None for row in rows} for name in ("file", "stack"))
-    results = [row["result"] for row in rows]
-    best = [row["stack"] for row in rows if row["standing"] == "best"]
-    said = {
-        "No result of": list(dict.fromkeys(row["file"] for row in rows if row["result"] == "failed")),
-        "Not converged:": [f"{row['file']} by {row['stack']}" for row in rows if row["result"] == "not converged"],
-        "Best of a file:": [f"{name} {_count(best.count(name), 'time')}" for name in stacks if len(stacks) > 1],
-        "Not taken for measurements:": list(result.skipped),
-    }
-    return [
-        f"{_count(len(files), 'file')} by {_count(len(stacks), 'stack')}: {len(rows) - results.count('failed')} of "
-        f"{len(rows)} fits are there, {results.count('converged')} of them converged.",
-        *(f"{word} {_few(names)}." for word, names in said.items() if names),
-    ]
+    """What became of them, in sentences; the table says more."""
+    counted = [row["result"] for row in result.rows]
+    there, converged = len(counted) - counted.count("failed"), counted.count("converged")
+    words = [f"{there} of {len(counted)} fits are there, {converged} of them converged."]
+    if result.skipped:
+        more = [f"{len(result.skipped) - 5} more"] if len(result.skipped) > 5 else []
+        words.append(f"Not taken for measurements: {listed([*result.skipped[:5], *more])}.")
+    return words
 
 
 def page(result: FittedFiles) -> str:
     """The table with a link to each report, as one HTML file that stands beside the results."""
-    title = f"Fits of {_count(len({row['file'] for row in result.rows}), 'file')}"
-    places = [f"{row['file']}/{row['stack']}/{REPORT}" for row in result.rows if row["result"] != "failed"]
+    title = f"Fits of {len({row['file'] for row in result.rows})} files"
+    places = [f"{row['file']}/{row['stack']}/{results.REPORT}" for row in result.rows if row["result"] != "failed"]
     links = [
         f'<li><a href="{quote(place)}">{html.escape(place)}</a></li>'
         for place in places
@@ -452,12 +486,3 @@ def page(result: FittedFiles) -> str:
     reports = [section("Reports", f"<ul>{''.join(links)}</ul>")] if links else []
     body = [f"<h1>{html.escape(title)}</h1>", sentences(statements(result))]
     return document(title, [*body, section("All fits", overview(result.rows)), *reports])
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
-def _few(words: list[str], most: int = 5) -> str:
-    """The first of them, and how many more there are."""
-    return listed([*words[:most], *([f"{len(words) - most} more"] if len(words) > most else [])])

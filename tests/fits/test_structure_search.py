@@ -1,0 +1,247 @@
+"""The search for the stack behind data, by transports that are known and cheap, and the libraries that it takes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fits
+import layerjax as lj
+from fits import structure_search
+from fits._files import locked
+from fits.optimise.result import Fit
+from fits.problem.compilation import cores
+from fits.problem.noise import Noise
+from fits.problem.parameters import Free, split
+from fits.store import Store
+from fits.structure_search import STORE, Library, SearchOptions, default_library, read_library, search
+from tests.helpers.files import contents
+
+COAT, BASE = lj.Medium(Free(1.0, 0.05, 5.0), 0.8), lj.Stack([], lj.Lambertian(Free(0.5, 0.0, 1.0)))
+METAL = lj.Stack([], lj.Conductor(Free(1.5, 0.1, 5.0), Free(2.0, 0.1, 8.0), Free(0.3, 0.05, 1.0)))
+LIBRARY = Library({"haze": COAT}, {"diffuse": BASE, "metal": METAL})
+TRUTH = lj.Stack([lj.Medium(0.6, 0.8)], lj.Lambertian(0.4))
+GIVEN = {"transport": lj.SingleScattering(), "noise": Noise(relative=0.01, floor=1e-6, discrepancy=False)}
+BY_RULE = GIVEN | {"noise": Noise(relative=0.01, floor=1e-6)}
+OPTIONS, SHORT = SearchOptions(layers=1, starts=2), SearchOptions(layers=0, starts=1)
+
+
+@pytest.fixture(scope="module")
+def data() -> fits.Measurements:
+    geometry = fits.slices([10.0, 40.0, 70.0], np.arange(-75.0, 76.0, 6.0))
+    return fits.simulate(TRUTH, geometry, lj.SingleScattering(), 0.01, 1e-6, seed=1)
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("search") / "stacks"
+
+
+@pytest.fixture(scope="module")
+def found(data: fits.Measurements, directory: Path) -> fits.Search:
+    return search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
+
+
+def test_the_stack_behind_the_data_is_found(found: fits.Search, directory: Path) -> None:
+    assert found.best.name == "haze / diffuse"
+    assert found.indistinguishable == ()
+    assert found.options == OPTIONS
+    assert found.ranking == tuple(one.name for one in found.candidates)
+    assert set(found.ranking) == {"diffuse", "metal", "haze / diffuse", "haze / metal"}
+    assert found.probabilities["haze / diffuse"] == found.best.model_score.model_probability > 0.999
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert found.best.bic == 0.0
+    values, errors = found.best.fit.values, found.best.fit.standard_errors
+    for name, truth in (("layers[0].thickness", 0.6), ("base.albedo", 0.4)):
+        assert abs(values[name] - truth) < 4.0 * errors[name]
+    assert fits.load_fit(directory / "haze+diffuse+full").values == values
+
+
+@pytest.mark.slow
+def test_others_get_a_discrepancy_term(data: fits.Measurements, found: fits.Search) -> None:
+    ruled = search(data, LIBRARY, options=OPTIONS, **BY_RULE)
+    noise = {one.name: one.fit.problem.noise.discrepancy for one in ruled.candidates}
+    assert not noise["haze / diffuse"]
+    assert all(noise[name] for name in ("diffuse", "metal", "haze / metal"))
+    assert ruled.best.name == found.best.name
+
+
+def test_a_killed_search_resumes_and_finds_the_same(
+    data: fits.Measurements, directory: Path, found: fits.Search, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed in the cross-validation of one of four structures: the next run makes that one again, and no other."""
+    whole = Store.read(directory / STORE)
+    with Store.open(directory / STORE, whole.fingerprint) as store:
+        store.put("haze / diffuse", None)
+    made: list[str] = []
+    out_of_sample = structure_search.out_of_sample
+
+    def interrupted(fit: Fit) -> object:
+        made.append("one")
+        if len(made) == 1:
+            raise KeyboardInterrupt
+        return out_of_sample(fit)
+
+    monkeypatch.setattr(structure_search, "out_of_sample", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
+    again = search(data, LIBRARY, options=OPTIONS, directory=directory, **GIVEN)
+    assert len(made) == 2
+    assert again.ranking == found.ranking
+    for one, other in zip(again.candidates, found.candidates, strict=True):
+        np.testing.assert_array_equal(one.fit.vector, other.fit.vector)
+        assert one.model_score == other.model_score
+    assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
+
+
+@pytest.mark.parametrize("correlated", [0.2, 1.0])
+def test_the_options_of_its_fits_decide_on_a_discrepancy(data: fits.Measurements, correlated: float) -> None:
+    """Residuals of a stack without the haze are correlated by more than 0.2, which is the default, and below 1."""
+    options = replace(SHORT, fit=fits.FitOptions(autocorrelation=correlated))
+    one = search(data, Library({"haze": COAT}, {"diffuse": BASE}), options=options, **BY_RULE)
+    assert bool(one.best.fit.problem.noise.discrepancy) == (correlated < 1.0)
+
+
+def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data: fits.Measurements, tmp_path: Path) -> None:
+    many = Library({"haze": COAT}, {f"diffuse {k}": BASE for k in range(2 * cores())})
+    given = GIVEN | {"directory": tmp_path / "it"}
+    short = search(data, many, options=replace(SHORT, budget=0.0), **given)
+    assert short.stopped
+    assert 0 < len(short.candidates) < len(many.bases)
+    assert short.best.model_score is not None
+    assert "The time budget ended the search" in " ".join(structure_search.search_sentences(short))
+    longer = search(data, many, options=replace(SHORT, budget=60.0), **given)
+    assert not longer.stopped
+    assert len(longer.candidates) == len(many.bases)
+
+
+def test_every_structure_has_the_instrument_and_another_search_is_refused(
+    data: fits.Measurements, tmp_path: Path
+) -> None:
+    instrument = fits.Instrument(detector_aperture=2.0, gain_sd=0.02)
+    given = {"data": data, "library": LIBRARY, **GIVEN, "options": SHORT, "directory": tmp_path / "it"}
+    given["instrument"] = instrument
+    for one in search(**given).candidates:
+        assert replace(one.fit.problem.instrument, rings=None) == instrument
+        assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "precious").touch()
+    before, store = contents(tmp_path), tmp_path / "it" / STORE
+
+    def refused(message: str, **changes: object) -> None:
+        with pytest.raises(ValueError, match=message):
+            search(**given | changes)
+
+    another = r"holds the work of another problem \("
+    refused(f"{another}instrument", instrument=None)
+    refused(f"{another}seed 0, not 1", seed=1)
+    refused(f"{another}starts 1, not 3", options=replace(SHORT, starts=3))
+    refused(f"{another}fit", options=replace(SHORT, fit=fits.FitOptions(same_cost=1.0)))
+    refused(f"{another}data", data=data.drop(incidence=10))
+    refused("is not empty, and holds no search", directory=tmp_path / "other")
+    with locked(store.with_name(f"{STORE}.lock"), "it"):
+        refused("in use by another process")
+    store.write_bytes(before[str(store)][:6000])
+    refused(rf"{STORE}: damaged")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"layers": 9}, r"layers is 9; it must be a whole number in \[0, 6\]"),
+        ({"starts": 0}, r"starts is 0; it must be a whole number in \[1, inf\]"),
+        ({"beam": 0.5}, "beam is 0.5; it must be a whole number"),
+        ({"bic_gain": float("nan")}, "bic_gain is nan; it must be a finite number of at least 0"),
+        ({"budget": -1.0}, "budget is -1.0; it must be a finite number of at least 0"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SearchOptions(**options)
+
+
+def test_it_is_reported_with_one_verdict(found: fits.Search, tmp_path: Path) -> None:
+    """BIC, weight and probability had said one thing, and the score another."""
+    table = structure_search.search_table(found)
+    assert table.rows[0][0] == "haze / diffuse"
+    assert all(len(row) == len(table.columns) for row in table.rows)
+    words = " ".join(structure_search.search_sentences(found))
+    assert "Of 4 models, haze / diffuse has the best cross-validated predictive score." in words
+    assert "It is ahead of every other cross-validated model by more than the error of the difference." in words
+    assert "indistinguishable" not in words
+    close = {one: replace(one, model_score=replace(one.model_score, clear_diff=-1.0)) for one in found.candidates[:2]}
+    near = replace(found, candidates=tuple(close.get(one, one) for one in found.candidates))
+    assert near.indistinguishable == (found.candidates[1].name,)
+    near = " ".join(structure_search.search_sentences(near))
+    assert f"It is statistically indistinguishable from {found.candidates[1].name} (" in near
+    assert "BIC, weight and probability do not overrule this" in near
+    assert "It is ahead" not in near
+    structure_search.write_report(found, tmp_path)
+    page = (tmp_path / structure_search.PAGE).read_text()
+    assert "haze / metal" in page
+    assert "<h1>Stacks behind" in page
+
+
+# ---- libraries ----
+
+
+def test_stacks_are_put_together_from_the_top() -> None:
+    library = default_library()
+    stack = library.stack(("haze", "interface", "pigment"))
+    assert [type(layer).__name__ for layer in stack.layers] == ["Medium", "Interface", "Medium"]
+    assert stack.base is None
+    assert library.stack(("metal",)).base is library.bases["metal"].base
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_every_part_of_the_default_is_free_and_has_as_many_colours(channels: int) -> None:
+    library = default_library(channels)
+    for base in library.bases:
+        assert all(split(library.stack((layer, base)))[1] for layer in library.layers)
+    names = split(library.stack(("particles", "diffuse")))[1]
+    assert sum("albedo" in name for name in names) == 2 * channels
+
+
+INTERFACE = '[layers.coat]\nkind = "Interface"\nior = { start = 1.5, low = 1.1, high = 2.0 }\nalpha = 0.3\n'
+DIFFUSE = '[bases.diffuse]\nkind = "Lambertian"\nalbedo = { start = 0.2, low = 0.0, high = 1.0 }\n'
+
+
+def test_a_file_says_the_same(tmp_path: Path) -> None:
+    deep = '[[bases.deep.layers]]\nkind = "Medium"\nthickness = 50.0\nalbedo = 0.5\n'
+    (tmp_path / "library.toml").write_text(INTERFACE + DIFFUSE + deep)
+    library = read_library(tmp_path / "library.toml")
+    assert (set(library.layers), set(library.bases)) == ({"coat"}, {"diffuse", "deep"})
+    assert library.stack(("coat", "diffuse")).layers[0].ior == Free(1.5, 1.1, 2.0)
+    assert library.stack(("coat", "deep")).base is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (DIFFUSE, "it has no layer"),
+        (INTERFACE, "it has no base"),
+        (INTERFACE.replace("Interface", "Lambertian"), "layers.coat: layers.0..kind is 'Lambertian'"),
+        (INTERFACE.replace("alpha", "alhpa"), "alhpa"),
+        ('[bases.flat]\nkind = "Lambertian"\n' + INTERFACE, "bases.flat"),
+        ("[stack]\n", "stack"),
+    ],
+)
+def test_bad_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "library.toml").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_library(tmp_path / "library.toml")
+    assert str(caught.value).startswith(str(tmp_path / "library.toml"))
+
+
+@pytest.mark.parametrize(
+    ("layers", "bases", "message"),
+    [
+        (("a",), ("a",), "'a' and 'a' are one name as files"),
+        (("a/b",), ("c",), "'a/b' is no name"),
+        (("a",), ("b c", "B-c"), "'b c' and 'B-c' are one name as files"),
+    ],
+)
+def test_bad_names_are_refused(layers: tuple[str, ...], bases: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Library(dict.fromkeys(layers, COAT), dict.fromkeys(bases, BASE))
