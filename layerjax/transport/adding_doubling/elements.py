@@ -1,4 +1,4 @@
-"""Differentiation by elements: what a layer is build_element of is differentiated by the layer's own few numbers.
+"""Differentiation by elements: what a layer is made of is differentiated by the layer's own few numbers.
 
 An element (the operators of an interface, the kernel of a medium) is dear to compute and depends on a handful of
 scalars, while the assembly of elements to a stack is cheap and linear in each. Derivatives of an element by each of
