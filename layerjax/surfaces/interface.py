@@ -58,7 +58,7 @@ def refraction_lobe(
     # (wi.v, wo.v) as sums that keep their digits where wo is near -wi
     towards_i, towards_o = 0.5 * ior * squared - step, 0.5 * squared + step
     exists = (towards_i * towards_o < 0) & (towards_i * v[2] > 0)
-    exists = exists & ~is_straight(ior)
+    exists = exists & ~is_index_matched(ior)
     a = jnp.where(exists, jnp.abs(towards_i), 1.0)
     b = jnp.where(exists, jnp.abs(towards_o), 1.0)
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
@@ -74,8 +74,8 @@ def refraction_lobe(
     return jnp.where(exists, lobe, 0.0), transmitted
 
 
-def is_straight(ior: Array) -> Array:
-    """Whether the indices are so nearly equal that light passes straight, and the BTDF is a delta."""
+def is_index_matched(ior: Array) -> Array:
+    """Whether the indices are so nearly equal that light passes unrefracted, and the BTDF is a delta."""
     return jnp.abs(ior - 1.0) <= 64.0 * jnp.finfo(jnp.result_type(ior)).eps
 
 

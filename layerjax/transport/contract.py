@@ -24,7 +24,7 @@ from layerjax.surfaces import Conductor
 from layerjax.transport.known_directions import Known
 
 Side = Literal["all", "reflection", "transmission"]
-"""Which pairs are asked for: any; both directions above; one above and one below. Others give 0."""
+"""Requested pairs: any; both directions above; one above and one below. Others give 0."""
 
 Uniforms = tuple[Array, Array, Array]
 
@@ -69,7 +69,7 @@ class Transport(eqx.Module):
         """All the work that no direction is needed for, of a simplified stack."""
 
     def chosen_for(self, stack: Stack, known: Known) -> "Transport":
-        """The same transport with all that it leaves open chosen for the (simplified) stack and known directions."""
+        """The same transport with all that it does not state chosen for the (simplified) stack and known directions."""
         return self
 
     def prepare_for(self, stack: Stack, known: Known) -> Any:
@@ -100,7 +100,7 @@ class Transport(eqx.Module):
 
     @abc.abstractmethod
     def compared(self) -> "Sequence[Transport] | None":
-        """Transports that errors are told by; None, if `measured` knows them. If there is neither, a ValueError."""
+        """Transports for an error estimate; None, if `measured` knows them. If there is neither, a ValueError."""
 
     @abc.abstractmethod
     def measured(

@@ -2,7 +2,7 @@
 
 In goes any stack; out come BSDF values to the accuracy of the grid, without noise and with derivatives. `media` and
 `interfaces` put layers on the `grid`, where `sampling` keeps their energy; `operators` and `inverse` join two of them,
-`solve` a whole stack, and `tables` are read at the directions asked for. `proposals` are directions to draw, and
+`solve` a whole stack, and `tables` are read at the requested directions. `proposals` are directions to draw, and
 `transport` is what users call.
 """
 

@@ -2,8 +2,8 @@
 
 The energy that a face reflects or loses to masking changes within a cosine of the order of alpha, which polynomials
 between nodes do not follow: they would carry the error over to all other directions. Both are integrated over the
-facets instead. The nodes give what becomes of the light that goes on, and of the light that masking takes, as shares of
-these, which vary slowly; shares add up to 1 where nothing is lost, and so does the albedo, however coarse the nodes.
+facets instead. The nodes give what becomes of the light that continues, and of the light that masking takes, as shares
+of these, which vary slowly; shares add up to 1 where nothing is lost, and so does the albedo, however coarse the nodes.
 """
 
 from typing import NamedTuple
@@ -16,9 +16,9 @@ from layerjax.channels import Channels, each, select, times, total
 from layerjax.directions import Vector, flip
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Interface, Stack
-from layerjax.transport.adding_doubling.asked import asked_region
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
+from layerjax.transport.adding_doubling.requested import requested_region
 from layerjax.transport.first_order import FirstOrder, ReflectingInterface
 from layerjax.transport.single_scattering import Media, SingleScattering
 
@@ -101,7 +101,7 @@ def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
     if media.media or not isinstance(face, ReflectingInterface):
         return jnp.zeros_like(w[2])
     above = w[2] > horizon(w[2].dtype)
-    region = asked_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
+    region = requested_region(jnp.where(above, w[2], 0.5).ravel(), jnp.ones_like(face.ior))
     _, passed = refracted_rays(region, face.ior, Normals(face.alpha, face.distribution), (nodes, max(2, nodes // 2)))
     refracted = jnp.sum(passed, axis=-1).reshape(w[2].shape)
     return jnp.where(above, at_least(1.0 - reflected - refracted, 0.0), 0.0)

@@ -25,7 +25,7 @@ ENERGY_POINTS = (12, 8)
 
 LEAST_FACETS, LEAST_OF_SEVERAL = 16, 24
 """Points of the dense quadrature of visible normals in either direction, at least (`refracted_densely`): of a single
-interface, and where there are several, between which light goes on."""
+interface, and where there are several, between which light continues."""
 
 CRITICAL = 7.5
 """Times the distance between facets: half the width over which the critical angle of refraction is rounded off."""
@@ -138,8 +138,8 @@ def _ggx_normals(grid: Grid, region: Region, width: Array, modes: int) -> tuple[
     """GGX normals visible from every node, (nodes, points), their weights, and the nodes' wi.
 
     A spherical cap, stretched: the cap of Dupuy & Benyoub 2023, by quadrature from its pole to its rim and over half a
-    turn (the other half is its mirror image). Denser than what it is put on: light that goes straight through
-    two interfaces meets the points of both, and the nodes and modes between must not tell them apart. Tails are sparse
+    turn (the other half is its mirror image). Denser than what it is put on: light that passes
+    two interfaces meets the points of both, and the nodes and modes between must not distinguish them. Tails are sparse
     from pole to rim.
     """
     polar_facets, azimuth_facets = polar_count(grid), azimuth_count(grid, modes)

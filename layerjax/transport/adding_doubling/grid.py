@@ -38,7 +38,7 @@ UNROLLED = 8
 """Polynomials of up to so many degrees are written out, of more a loop."""
 
 NEAR = 0.3
-"""Of a panel, what may be around its edge at most."""
+"""Largest share of a panel around its edge."""
 
 ROUNDED_ROOT = (367 / 928, 151 / 232, 23 / 464, -31 / 232, 35 / 928)
 """Coefficients of r^0 ... r^4 of what stands for the root of r on (-1, 1): with its value and two derivatives at 1,

@@ -34,7 +34,7 @@ from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scaled_to_energy
 
 Behind = Literal["diffuse", "narrow", "faces"]
-"""Of an interface: what turns light into all directions, so that none passes straight; what does not; or other faces
+"""Of an interface: what turns light into all directions, so that none is ballistic; what does not; or other faces
 alone, which keep light between them."""
 
 STRONG = 5.0
@@ -84,7 +84,7 @@ def interface_layer(
     microfacets: Microfacets,
     *,
     enters: bool = True,
-    asked: Region | None = None,
+    requested: Region | None = None,
     behind: Behind,
 ) -> Layer:
     """Rough dielectric interface between two regions, as Fourier modes (Walter 2007).
@@ -96,16 +96,18 @@ def interface_layer(
         enters: whether light from above counts as entering.
         asked: directions outside that stand in the place of the outer nodes. The operators are then those of light
             that comes from them, and per projected solid angle over 2 pi for light that leaves along them; what the
-            interface reflects outside is left out.
+            interface reflects outside is omitted.
         behind: what light that enters meets next.
     """
     near, far = (above, below) if enters else (below, above)
-    if asked is None:
+    if requested is None:
         operators = _operators(grid, near, far, normals, modes, microfacets, behind)
     elif microfacets == "single":
-        operators = _followed(grid, asked, far, normals, modes, behind)
-    else:  # what masking loses is given back in proportion to sums over all directions outside
-        operators = _operators(grid, joined(asked, near), far, normals, modes, microfacets, behind, asked.weight.size)
+        operators = _followed(grid, requested, far, normals, modes, behind)
+    else:  # what masking loses is returned in proportion to sums over all directions outside
+        operators = _operators(
+            grid, joined(requested, near), far, normals, modes, microfacets, behind, requested.weight.size
+        )
     outer, into, out, inner = (_channelled(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
 
@@ -122,26 +124,26 @@ def _operators(
     modes: int,
     microfacets: Microfacets,
     behind: Behind,
-    asked: int = 0,
+    requested: int = 0,
 ) -> list[Parts]:
     """Reflection outside, light that enters, light that leaves, reflection inside: of the first `asked`, or of all.
 
-    What is given back after it was lost to masking has met several facets: it is no path of one event.
+    What is returned after it was lost to masking has met several facets: it is no path of one event.
     """
     outside, down, lost_outside = facet_energies(near, far, normals)
     inside, up, lost_inside = facet_energies(far, near, normals)
-    unresolved = _unresolved(grid, normals)
+    unresolved_share = _unresolved_share(grid, normals)
     through = _deposit(
         grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
     )
     through = _balanced(through, near, far, *_agreed(near, far, (down, up), (outside, inside)))
-    leaving = jnp.where(np.arange(near.weight.size) < asked, 1.0, near.weight)
+    leaving = jnp.where(np.arange(near.weight.size) < requested, 1.0, near.weight)
     outer = None
-    if not asked:
+    if not requested:
         rest = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
-        outer = _reflection(near, outside, rest, unresolved, far.ior / near.ior, normals, modes)
+        outer = _reflection(near, outside, rest, unresolved_share, far.ior / near.ior, normals, modes)
     rest = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
-    inner = _reflection(far, inside, rest, unresolved, near.ior / far.ior, normals, modes, _kept(grid, behind))
+    inner = _reflection(far, inside, rest, unresolved_share, near.ior / far.ior, normals, modes, _kept(grid, behind))
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
     given: list[Array | None] = [None] * 4
     if microfacets == "multiple":
@@ -152,33 +154,35 @@ def _operators(
         gains = _given_back((lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight))
         given = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
     found = list(map(Parts, once, given))
-    return [_of_asked(parts, place, asked) for place, parts in enumerate(found)] if asked else found
+    return [_of_requested(parts, place, requested) for place, parts in enumerate(found)] if requested else found
 
 
-def _of_asked(parts: Parts, place: int, asked: int) -> Parts:
+def _of_requested(parts: Parts, place: int, requested: int) -> Parts:
     """Of the first `asked` directions outside alone: outer reflection, light that enters, that leaves, inner one."""
-    rows, columns = (asked if place in (0, 2) else None), (asked if place in (0, 1) else None)
+    rows, columns = (requested if place in (0, 2) else None), (requested if place in (0, 1) else None)
     return Parts(*(None if part is None else part[:, :rows, :columns] for part in (parts.first, parts.rest)))
 
 
-def _followed(grid: Grid, asked: Region, inner: Region, normals: Normals, modes: int, behind: Behind) -> list[Parts]:
+def _followed(
+    grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, behind: Behind
+) -> list[Parts]:
     """The four operators (see `_operators`) for directions asked for, where what masking loses is lost: no sum over
     directions outside is needed."""
-    ratio = inner.ior / asked.ior
+    ratio = inner.ior / requested.ior
     if behind == "diffuse":  # only smooth functions are summed over what is let in
         least = LEAST_POINTS[normals.distribution]
         points = max(least[0], grid.nodes), max(least[1], modes // 2)
-        rays = refracted_rays(asked, ratio, normals, points)
+        rays = refracted_rays(requested, ratio, normals, points)
     else:
-        rays = refracted_densely(grid, asked, inner, normals, modes)
-    through = _deposit(grid, *rays, inner, asked, modes, _blur(grid, asked, inner, normals))
+        rays = refracted_densely(grid, requested, inner, normals, modes)
+    through = _deposit(grid, *rays, inner, requested, modes, _blur(grid, requested, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
-    back = _adjoint(through, jnp.ones_like(asked.weight), inner)
+    back = _adjoint(through, jnp.ones_like(requested.weight), inner)
     face = _face(inner, inside, 1.0 / ratio, normals, modes, _kept(grid, behind))
     return [Parts(operator) for operator in (None, through, back, face)]
 
 
-def _unresolved(grid: Grid, normals: Normals) -> Array:
+def _unresolved_share(grid: Grid, normals: Normals) -> Array:
     return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
 
 
@@ -188,7 +192,7 @@ def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
     again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    apart = facet_spacing(grid, normals) * (1.0 - _unresolved(grid, normals))
+    apart = facet_spacing(grid, normals) * (1.0 - _unresolved_share(grid, normals))
     if grid.interfaces == 1:
         return BLUR * apart * jnp.ones_like(grid.edges)
     steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
@@ -307,7 +311,7 @@ def _reflection(
     region: Region,
     level: Array,
     rest: Array,
-    unresolved: Array,
+    unresolved_share: Array,
     ior: Array,
     normals: Normals,
     modes: int,
@@ -319,13 +323,13 @@ def _reflection(
     it is, and may change by a larger share the stronger it is.
     """
     most = _most(level)
-    resolved = (1.0 - unresolved) * at_most(at_least(rest, -most), most)
+    resolved = (1.0 - unresolved_share) * at_most(at_least(rest, -most), most)
     lobe = _face(region, level + resolved, ior, normals, modes, kept)
-    return lobe + unresolved * jnp.diag(at_least(rest, -level))
+    return lobe + unresolved_share * jnp.diag(at_least(rest, -level))
 
 
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
-    """Of the energy lost to masking what ends on its own side, by the walk on the microsurface (Heitz et al. 2016)."""
+    """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
     level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, "multiple")
     gain = at_least(level - once, 0.0)
@@ -335,9 +339,9 @@ def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: 
 def _given_back(
     lost: tuple[Array, Array], turned: Sequence[Array], weights: tuple[Array, Array], leaving: tuple[Array, Array]
 ) -> list[Array]:
-    """What the four operators gain when energy lost to masking is given back (after Kulla & Conty 2017), both sides.
+    """What the four operators gain when energy lost to masking is returned (after Kulla & Conty 2017), both sides.
 
-    What ends on its own side, r, comes back diffusely as r r' / <r>, and what crosses, t, as t t' / <t>: reciprocal,
+    What is reflected, r, comes back diffusely as r r' / <r>, and what crosses, t, as t t' / <t>: reciprocal,
     and all that is lost returns. As much must cross one way as the other; where the two differ, the smaller decides.
     """
     crossing = [l - r for l, r in zip(lost, turned, strict=True)]
@@ -352,7 +356,7 @@ def _given_back(
 
 
 def _staying(lost: Array, crossing: Array, weight: Array, leaving: Array) -> Array:
-    """What comes back on its own side. Where nothing does, at equal indices, it comes back like all that is lost:
+    """What is reflected. Where nothing is, at equal indices, it comes back like all that is lost:
     the product has no derivative there, and energy needs one."""
     staying = lost - crossing
     mean, whole = jnp.sum(weight * staying), jnp.sum(weight * lost)

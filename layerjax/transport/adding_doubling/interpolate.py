@@ -34,7 +34,7 @@ class Axis(NamedTuple):
     period: int | None = None
 
     def offset(self, k: int | Array) -> Array:
-        """Of the k-th entry in the flat table."""
+        """Place of the k-th entry in the flat table."""
         entry = self.first + k
         return self.stride * (entry if self.period is None else entry % self.period)
 

@@ -23,7 +23,7 @@ from layerjax.stack import Medium, is_known
 from layerjax.transport.adding_doubling.grid import Region
 from layerjax.transport.adding_doubling.moments import Terms, kernel_of_moments, truncated
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts, double, matmul, turned
-from layerjax.transport.adding_doubling.sampling import balance, modes_at_nodes, straight_on
+from layerjax.transport.adding_doubling.sampling import balance, ballistic_share, modes_at_nodes
 from layerjax.transport.adding_doubling.slab import slab
 
 Pair = tuple[Array, Array]
@@ -46,7 +46,7 @@ class Kernel(eqx.Module):
     `schlick`: the same times (1 - |wi . h|)^5, if the medium has a Fresnel term. `solid` is the weight of dmu dphi over
     2 pi, `turn` takes azimuths by half a turn (modes: nothing).
 
-    onward: share of a collision that goes straight on, in neither, (nodes,); the same of `schlick`.
+    onward: share of a collision that is ballistic, in neither, (nodes,); the same of `schlick`.
     """
 
     plain: Pair
@@ -90,14 +90,14 @@ def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes
 def _by_moments(
     phase: PhaseFunction, with_schlick: bool, region: Region, modes: int, carried: Terms, area: Array
 ) -> Kernel:
-    """What quadrature misses, where there is more than one panel, goes straight on as well."""
+    """What quadrature misses, where there is more than one panel, counts as ballistic as well."""
     weight = 2.0 * jnp.pi * region.solid
     turned_round = jnp.asarray((-1.0) ** np.arange(modes), weight.dtype)[:, None, None]
 
     def found(is_schlick: bool) -> tuple[Pair, Array]:
         chi, onward, back = truncated(phase, is_schlick, carried, weight.dtype)
         reflect, transmit = kernel_of_moments(chi, region.cosine, region.sine, modes)
-        return (reflect + turned_round * straight_on(back * jnp.ones_like(weight), weight), transmit), onward
+        return (reflect + turned_round * ballistic_share(back * jnp.ones_like(weight), weight), transmit), onward
 
     plain, onward = found(False)
     missing = area - onward - weight @ (plain[0][0] + plain[1][0])
@@ -135,12 +135,12 @@ def _both_sides(phase: PhaseFunction, with_schlick: bool, wi: Vector, wo: Vector
 
 
 def _balanced(kernel: Kernel) -> Kernel:
-    """The kernel scaled so that a collision scatters exactly sigma; what is left goes straight on."""
+    """The kernel scaled so that a collision scatters exactly sigma; what is left is ballistic."""
     weight = 2.0 * jnp.pi * kernel.solid
     reflect, transmit = kernel.plain[0][0], kernel.plain[1][0]
     area = kernel.area * jnp.ones_like(weight)
     scale, missing = balance([(reflect, kernel.turn_row), (transmit, lambda d: d)], weight, area)
-    forward = straight_on(missing, weight)
+    forward = ballistic_share(missing, weight)
     back, through = kernel.turn_row(scale)[:, None] * scale, scale[:, None] * scale
 
     def balanced(pair: Pair) -> Pair:
@@ -164,7 +164,7 @@ def medium_layer(medium: Medium, kernel: Kernel, doubled: bool | None = None) ->
 
 
 def _less_onward(medium: Medium, kernel: Kernel) -> Kernel:
-    """The kernel with an extinction, (channels or 1, 1, nodes), that what goes straight on has no part in."""
+    """The kernel with an extinction, (channels or 1, 1, nodes), without the ballistic part."""
     if kernel.onward is None or is_known(medium.albedo, 0.0):
         return kernel
     onward, fifth = kernel.onward

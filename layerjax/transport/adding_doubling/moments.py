@@ -5,11 +5,11 @@ of the cosines of travel,
 
     K_m(mu_o, mu_i) = 1 / (2 pi) sum_(l >= m) chi_l Y_l^m(mu_o) Y_l^m(mu_i),
 
-a sign (-1)^(l + m) telling reflection from transmission. Sums over nodes are exact to twice their number a hemisphere,
-so that collisions scatter what they should. What a forward peak has beyond the moments of l < L, it has as narrow as
-the grid is fine: a share chi_L of it goes straight on (delta-M, Wiscombe 1977). In other words the moments are chi_l -
-chi_L, and the extinction is less by albedo times chi_L. Light scattered once is known in closed form, with the whole
-phase function in a medium of that extinction (TMS, Nakajima & Tanaka 1988).
+a sign (-1)^(l + m) separates reflection from transmission. Sums over nodes are exact to twice their number a
+hemisphere, so that collisions scatter what they should. What a forward peak has beyond the moments of l < L, it has as
+narrow as the grid is fine: a share chi_L of it is ballistic (delta-M, Wiscombe 1977). In other words the moments are
+chi_l - chi_L, and the extinction is less by albedo times chi_L. Light scattered once is known in closed form, with the
+whole phase function in a medium of that extinction (TMS, Nakajima & Tanaka 1988).
 """
 
 from typing import Any, NamedTuple
@@ -63,7 +63,7 @@ def scaled(stack: Stack, nodes: int) -> Stack | None:
 
 
 def _has_peak(layer: Interface | Medium, carried: Terms) -> bool:
-    """Whether some of what it scatters may go straight on, as far as is known while tracing."""
+    """Whether some of what it scatters may be ballistic, as far as is known while tracing."""
     if not isinstance(layer, Medium) or is_known(layer.albedo, 0.0):
         return False
     chi = layer.phase.moments(carried.forward + 1)
@@ -128,10 +128,10 @@ def _legendre_functions(cosine: Array, sine: Array, modes: int, count: int) -> A
 
 
 def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any) -> tuple[Array, Array, Array]:
-    """Moments that a grid carries, and the shares of a collision that go straight on and straight back.
+    """Moments that a grid carries, and the shares of a collision that count as ballistic and as retroreflected.
 
     A backward peak is cut off, and smoothly, so that slabs do not gain energy (see `slab`): what it has beyond counts
-    from the second collision on, and less with each. One that is far narrower than nodes are apart goes straight back.
+    from the second collision on, and less with each. One that is far narrower than nodes are apart is retroreflected.
 
     Args:
         phase: one that has moments.
@@ -148,7 +148,9 @@ def truncated(phase: PhaseFunction, is_schlick: bool, carried: Terms, dtype: Any
     before, last = chi[carried.forward - 1], chi[carried.forward]
     points_back = before * last < 0.0
     onward = at_least(jnp.minimum(before, last), 0.0)
-    back = jnp.where(points_back & (not is_schlick), jnp.abs(chi[-1]), 0.0)  # that factor is 0 straight back
+    back = jnp.where(
+        points_back & (not is_schlick), jnp.abs(chi[-1]), 0.0
+    )  # that factor is 0 in the backward direction
     degree = np.arange(carried.most)
     beyond = np.clip((degree - carried.backward) / (carried.backward // 2), 0.0, 1.0)
     kept = jnp.where(points_back, jnp.asarray(np.cos(0.5 * np.pi * beyond) ** 2, dtype), degree < carried.forward)

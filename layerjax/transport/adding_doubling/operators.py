@@ -92,7 +92,7 @@ def double(
 
 
 def _between(back: Parts, base: Parts, transmit: Parts, direct: Operator) -> tuple[Operator, Operator]:
-    """Diffuse flux that falls on the far layer, and the part of it that was turned back at least once."""
+    """Diffuse flux that falls on the far layer, and the part of it that was reflected at least once."""
     loop = matmul(back.total, base.total)
     if loop is None:
         return transmit.total, None

@@ -31,7 +31,7 @@ MOST_NUMBERS, MOST_OF_ORDINATES = 6e6, 1.2e6
 """In an operator of what is chosen without a tolerance, at most: more takes minutes and gigabytes."""
 
 SHORT = 1.25
-"""By this much less than what is expected to be needed is told to the user."""
+"""A resolution by so much less than the expected one gives a warning."""
 
 FOLLOWED, READ = LADDER[0], LADDER[2]
 """At least: where light is followed along known directions, and where values are read off tables."""
@@ -45,7 +45,7 @@ alpha 0.3, 12 nodes and 32 modes, 9e-4; index 1.5, alpha 0.3, 8 and 16, 7e-4, an
 """
 
 ASSUMED_WIDTH, ASSUMED_INDEX = 0.05, 1.5
-"""Of lobes, and around them, where nothing is known while tracing."""
+"""Width of lobes, and the index around them, where nothing is known while tracing."""
 
 NODES_AS_UNDER = 1.5
 """Media that stand bare need no more nodes than under this index, but the modes of light of any inclination.
@@ -65,7 +65,7 @@ FORWARD_WITHIN, BACKWARD_WITHIN, BLUR = 2.5, 6.3, 1.75
 carried, and of a backward one; and that by which facets widen either, over how far they deflect what passes.
 
 Light scattered once is not known in closed form there. Measured over paint, the worst of all directions, which is
-straight back. Index 1.5, alpha 0.05: g 0.8, 12 nodes, 5e-4; g 0.9, 16, 2e-3, 24, 4e-4; g -0.5, 8, 2e-3, 12, 9e-5;
+backwards. Index 1.5, alpha 0.05: g 0.8, 12 nodes, 5e-4; g 0.9, 16, 2e-3, 24, 4e-4; g -0.5, 8, 2e-3, 12, 9e-5;
 g -0.9, 48, 4e-3. Alpha 0.3: g 0.9, 8, 5e-3, 12, 7e-4; g 0.95, 12, 2e-3, 16, 3e-4; g -0.9, 24, 3e-3, 32, 3e-4.
 """
 
@@ -119,7 +119,7 @@ def chosen(stack: Stack, followed: bool) -> Resolution:
 
     Args:
         stack: a simplified stack; where it is traced, `ASSUMED_WIDTH` and `ASSUMED_INDEX` are taken.
-        followed: whether light is followed along the directions asked for, so that nothing is read off tables.
+        followed: whether light is followed along the requested directions, so that nothing is read off tables.
     """
     needed, panels = _needed(stack, followed), _panels(stack)
     last = len(LADDER) - 1
@@ -171,7 +171,7 @@ def _needed(stack: Stack, followed: bool, assumed: float = ASSUMED_WIDTH) -> Nee
 
 
 def _panels(stack: Stack) -> int:
-    """Of the grid, at most."""
+    """Panels of the grid, at most."""
     return 1 + sum(isinstance(layer, Interface) for layer in stack.layers)
 
 

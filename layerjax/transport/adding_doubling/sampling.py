@@ -27,7 +27,7 @@ UNROLLED = 8
 """Up to so many modes in a row, more in a loop."""
 
 BALANCING = 5
-"""Rounds of `balance`; what is left after them goes straight on."""
+"""Rounds of `balance`; what is left after them is ballistic."""
 
 
 def azimuths(modes: int) -> int:
@@ -98,7 +98,7 @@ def balance(
     return scale, jnp.where(exists, energy - scattered(scale), 0.0)
 
 
-def straight_on(missing: Array, weight: Array) -> Array:
+def ballistic_share(missing: Array, weight: Array) -> Array:
     """The kernel that sends this energy on at the same angles: a delta, the same in all modes."""
     return jnp.diag(safe_div(missing, weight))
 
@@ -107,7 +107,7 @@ def scaled_to_energy(region: Region, kernel: Array, energy: Array) -> Array:
     """Flux operator of a face from its BRDF at the nodes and its albedo, which decides."""
     weight = projected_weight(region)
     scale, missing = balance([(kernel[0], lambda d: d)], weight, jnp.where(region.weight > 0, energy, 0.0))
-    return weight[:, None] * (scale[:, None] * kernel * scale + straight_on(missing, weight))
+    return weight[:, None] * (scale[:, None] * kernel * scale + ballistic_share(missing, weight))
 
 
 def projected_weight(region: Region) -> Array:

@@ -19,7 +19,7 @@ from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
-from layerjax.transport.adding_doubling.asked import asked_region
+from layerjax.transport.adding_doubling.ballistic import without_ballistic
 from layerjax.transport.adding_doubling.bases import base_layer
 from layerjax.transport.adding_doubling.elements import Make, Scalars, build_element, element
 from layerjax.transport.adding_doubling.energies import Face, outer_faces
@@ -29,8 +29,8 @@ from layerjax.transport.adding_doubling.interfaces import Behind, interface_laye
 from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
+from layerjax.transport.adding_doubling.requested import requested_region
 from layerjax.transport.adding_doubling.resolution import Resolution, is_tilted
-from layerjax.transport.adding_doubling.straight import without_straight
 from layerjax.transport.known_directions import Known, KnownDirections
 
 MANY = 3
@@ -56,22 +56,22 @@ def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) ->
 
 
 def solve(
-    stack: Stack, plan: Plan, asked: KnownDirections | None = None
+    stack: Stack, plan: Plan, requested: KnownDirections | None = None
 ) -> tuple[Grid, Layer, Layer, tuple[Face | None, Face | None]]:
-    """The grid, the whole stack as one layer, that less what is known in closed form, see `straight`, and its outer
+    """The grid, the whole stack as one layer, that less what is known in closed form, see `ballistic`, and its outer
     faces, see `outer_faces`.
 
     asked: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
     light passes it, ends) with an interface.
     """
-    return assemble(stack, plan, make_elements(stack, plan, asked))
+    return assemble(stack, plan, make_elements(stack, plan, requested))
 
 
-def make_elements(stack: Stack, plan: Plan, asked: KnownDirections | None, make: Make = build_element) -> list[Any]:
+def make_elements(stack: Stack, plan: Plan, requested: KnownDirections | None, make: Make = build_element) -> list[Any]:
     """An element for every layer, and for a base: the `Layer` of what is a surface, the `Kernel` of a medium."""
     dtype = _dtype(stack)
     indices = _indices(stack, dtype)
-    faces = iter(_interfaces(stack, plan, indices, asked, make))
+    faces = iter(_interfaces(stack, plan, indices, requested, make))
     found: list[Any] = []
     region = 0
     for layer in stack.layers:
@@ -105,7 +105,7 @@ def assemble(
             whole, is_expanded = expanded(whole, plan.azimuths), True
         whole = add(expanded(found, plan.azimuths) if is_expanded and not tilted else found, whole)
     layers = [found for found, _ in solved]
-    return grid, whole, without_straight(stack, layers, whole), outer_faces(stack, layers)
+    return grid, whole, without_ballistic(stack, layers, whole), outer_faces(stack, layers)
 
 
 def can_be_split(stack: Stack) -> bool:
@@ -140,7 +140,9 @@ def _dtype(stack: Stack) -> Any:
     return jnp.result_type(*(leaf for leaf in jax.tree.leaves(stack) if eqx.is_array(leaf)), jnp.float32)
 
 
-def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirections | None, make: Make) -> list[Layer]:
+def _interfaces(
+    stack: Stack, plan: Plan, indices: Scalars, requested: KnownDirections | None, make: Make
+) -> list[Layer]:
     """Every interface of a stack as a layer. Many of a kind share one program, which is compiled once."""
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
     behind: Behind = "narrow" if stack.base is None or isinstance(stack.base, Conductor) else "diffuse"
@@ -151,9 +153,9 @@ def _interfaces(stack: Stack, plan: Plan, indices: Scalars, asked: KnownDirectio
     alike: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
     for region, layer in enumerate(interfaces):
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
-        if asked is not None and (layer is stack.layers[0] or leaves):
+        if requested is not None and (layer is stack.layers[0] or leaves):
             options = plan, layer.distribution, not leaves, behind, dtype, region
-            along = asked.below if leaves else asked.above
+            along = requested.below if leaves else requested.above
             found[region] = make(_interface, options, (indices, layer.alpha), along, dtype)
         else:
             alike[layer.distribution, not leaves].append(region)
@@ -181,15 +183,15 @@ def _interface(
     dtype: Any,
     region: int | Array,
     numbers: Any,
-    asked: Array | None,
+    requested: Array | None,
 ) -> Layer:
     indices, alpha = numbers
     grid = make_grid(indices, plan.ranks, plan.nodes, dtype)
     above, below = (_region(grid, place) for place in (region, region + 1))
-    outside = None if asked is None else asked_region(asked, (above if enters else below).ior)
+    outside = None if requested is None else requested_region(requested, (above if enters else below).ior)
     normals = Normals(jnp.asarray(alpha, dtype), distribution)
     return interface_layer(
-        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, asked=outside, behind=behind
+        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, requested=outside, behind=behind
     )
 
 
@@ -201,7 +203,7 @@ def _numbered_interface(
 
 
 def _region(grid: Grid, place: int | Array) -> Region:
-    """Of the grid, by a place that may be traced."""
+    """Region of the grid, by a place that may be traced."""
     if isinstance(place, int):
         return grid.regions[place]
     return jax.tree.map(lambda *parts: jnp.stack(parts)[place], *grid.regions)
@@ -225,7 +227,7 @@ def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
 def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:
     """The stack with directions that can stand in the place of the grid's outer ones, if there are such.
 
-    What ends with a medium is closed where nothing is asked for below: light that leaves it there does not come back.
+    What ends with a medium is closed where nothing is requested below: light that leaves it there does not come back.
     """
     if any(map(is_tilted, stack.layers)) or not stack.layers or not isinstance(stack.layers[0], Interface):
         return None

@@ -34,7 +34,7 @@ MODE_DENSITY = 3
 class Tables(eqx.Module):
     """The rest of the BSDF, and the energies of all of it.
 
-    values: for each channel an array over (quadrant and direction out, direction in, azimuth), the azimuth left out
+    values: for each channel an array over (quadrant and direction out, direction in, azimuth), without the azimuth
     with ordinates and with one mode; quadrants: above to above, and with a stack that transmits below to below, and
     above to below. `steps`: of the azimuth from 0 to pi, with one more point beyond either end.
 

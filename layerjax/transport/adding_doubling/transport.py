@@ -3,7 +3,7 @@
 The stack is put on a grid of directions: media are solved by eigenvectors, or in single precision doubled up from a
 slab thin enough to scatter at most twice (van de Hulst 1980, Ch. 4), interfaces and bases are added (Grant & Hunt
 1969). Around the normal everything is a Fourier series in azimuth unless a medium has an axis of its own; then azimuths
-are ordinates too. Paths with one event are evaluated in closed form at the very directions asked for; only the smooth
+are ordinates too. Paths with one event are evaluated in closed form at the very directions requested; only the smooth
 rest is read off tables, or, where directions are known and the stack lets them, followed along just these.
 """
 
@@ -30,7 +30,7 @@ from layerjax.directions import Vector, direction, split
 from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
-from layerjax.transport.adding_doubling.asked import Between, between, read_between
+from layerjax.transport.adding_doubling.ballistic import Ballistic, ballistic_paths, evaluate_ballistic
 from layerjax.transport.adding_doubling.elements import (
     LinearElement,
     compile_element,
@@ -41,6 +41,7 @@ from layerjax.transport.adding_doubling.elements import (
 from layerjax.transport.adding_doubling.energies import directional_albedo, none_negative
 from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
+from layerjax.transport.adding_doubling.requested import RequestedValues, read_requested, requested_values
 from layerjax.transport.adding_doubling.resolution import (
     ORDINATES_LADDER,
     Resolution,
@@ -61,7 +62,6 @@ from layerjax.transport.adding_doubling.solve import (
     ranks,
     without_base,
 )
-from layerjax.transport.adding_doubling.straight import Straight, evaluate_straight, straight
 from layerjax.transport.adding_doubling.tables import Tables, make_tables, read_energies, read_rest
 from layerjax.transport.contract import DeterministicTransport, Side, refuse_vmf
 from layerjax.transport.first_order import (
@@ -93,14 +93,14 @@ class ResolutionWarning(UserWarning):
 class Solved(eqx.Module):
     """A solved stack: what is evaluated in closed form, and the rest: tables, or values between known directions.
 
-    Both are None if there is no rest. straight: what passes two interfaces, left out of either. scaled: what the rest
-    leaves out in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
+    Both are None if there is no rest. ballistic: what passes two interfaces, in neither. scaled: what the rest
+    lacks in the place of `first`, in media as the grid has them (see `moments`); None: `first` itself.
     """
 
     first: FirstOrder
     tables: Tables | None
-    between: Between | None = None
-    straight: Straight | None = None
+    between: RequestedValues | None = None
+    ballistic: Ballistic | None = None
     scaled: FirstOrder | None = None
 
 
@@ -114,7 +114,7 @@ class AddingDoubling(DeterministicTransport):
     beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the
     same error or less.
 
-    Of a forward peak of Henyey-Greenstein the grid carries what it resolves; the rest of it goes straight on (delta-M,
+    Of a forward peak of Henyey-Greenstein the grid carries what it resolves; the rest counts as ballistic (delta-M,
     Wiscombe 1977), and light scattered once is corrected for that (TMS, Nakajima & Tanaka 1988). Seen through a bare
     slab of thickness 2 the largest error of all directions, which is along the beam, was 4e-4 at 24 nodes for g 0.8 and
     8e-4 at 48 for g 0.9; at 17 degrees from the beam 6e-3 at 48 and 3e-4 at 96 for g 0.97, and 2e-2 at 96 for g 0.99.
@@ -140,7 +140,7 @@ class AddingDoubling(DeterministicTransport):
             (``"multiple"``). An event is a collision, a reflection or refraction at an interface, or a reflection at
             the base.
         microfacets: ``"single"``, Walter 2007: light that a facet sends into another is lost; or ``"multiple"``: it is
-            given back diffusely, so that interfaces conserve energy (after Kulla & Conty 2017): lossless stacks return
+            returned diffusely, so that interfaces conserve energy (after Kulla & Conty 2017): lossless stacks return
             what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within 1 % of an index
             of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface at grazing, below
             a cosine of 0.05, may lose or gain a quarter.
@@ -208,7 +208,7 @@ class AddingDoubling(DeterministicTransport):
             return Solved(first, None)
         plan = self._plan(stack, None)
         carried, once = _as_carried(stack, plan)
-        return Solved(first, self._solve(stack, first, once, plan), None, straight(carried), once)
+        return Solved(first, self._solve(stack, first, once, plan), None, ballistic_paths(carried), once)
 
     def for_tracing(self, stack: Stack, known: Known) -> "AddingDoubling":
         found = followed(stack, known) if self.orders != "first" else None
@@ -231,7 +231,7 @@ class AddingDoubling(DeterministicTransport):
         plan = self._plan(closed, directions)
         rest = self._solve_between(closed, directions, plan)
         carried, once = _as_carried(closed, plan)
-        return Solved(first_order(closed), None, rest, straight(carried), once)
+        return Solved(first_order(closed), None, rest, ballistic_paths(carried), once)
 
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
@@ -270,16 +270,16 @@ class AddingDoubling(DeterministicTransport):
         return tuple(map(not_negative, self._sum(state, rest, wi, wo, side)))
 
     def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
-        """What is read off: ringing may take it below 0, and where media are scaled what it leaves out may, too."""
+        """What is read off: ringing may take it below 0, and where media are scaled what it lacks may, too."""
         if state.between is not None:
-            return read_between(state.between, wi, wo, side)
+            return read_requested(state.between, wi, wo, side)
         if state.tables is not None:
             return read_rest(state.tables, wi, wo, side)
         return (jnp.zeros_like(wi[2] * wo[2]),)
 
     def _sum(self, state: Solved, rest: Channels, wi: Vector, wo: Vector, side: Side) -> Channels:
-        """The orders that are asked for, of the rest and what is known in closed form."""
-        parts = [rest, *_straight(state, wi, wo, side)]
+        """The requested orders, of the rest and what is known in closed form."""
+        parts = [rest, *_ballistic(state, wi, wo, side)]
         if self.orders == "multiple":
             if state.scaled is None:
                 return total(parts)
@@ -331,7 +331,7 @@ class AddingDoubling(DeterministicTransport):
         elements = make_elements(stack, plan, None, compile_element)
         return _tables_of_elements(without_base(stack), elements, first, once, plan)
 
-    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if not _is_split(stack, known):
             return _solve_between_at_once(stack, known, plan)
         elements = make_elements(stack, plan, known, compile_element)
@@ -361,7 +361,7 @@ class AddingDoubling(DeterministicTransport):
         return make_plan(stack, self._resolution(stack, known is not None), self.microfacets)
 
     def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
-        """The coarsest resolution that agrees with the one before to `tolerance`, at the directions asked for if
+        """The coarsest resolution that agrees with the one before to `tolerance`, at the requested directions if
         light is followed along them, else all over the hemispheres."""
         if is_traced(stack):
             raise ValueError(
@@ -381,7 +381,10 @@ class AddingDoubling(DeterministicTransport):
             state = options.prepare_for(stack, partial(known_directions, wi, wo) if known is not None else lambda: None)
             values = options.measured(state, wi, wo, "all", channel_count(stack), None)[0]
             # what is known in closed form does not change, and where it is a narrow peak it must not set the scale
-            solved, without = dataclasses.replace(options, orders="multiple"), dataclasses.replace(state, straight=None)
+            solved, without = (
+                dataclasses.replace(options, orders="multiple"),
+                dataclasses.replace(state, ballistic=None),
+            )
             found = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
             without = dataclasses.replace(without, scaled=None)
             rest = solved.measured(without, wi, wo, "all", channel_count(stack), None)[0]
@@ -411,16 +414,16 @@ class _Planned(AddingDoubling):
             return super()._solve(stack, first, once, plan)
         return _tables(stack, make_elements(stack, plan, None, replay(self.elements)), first, once, plan)
 
-    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+    def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if self.elements is None:
             return super()._solve_between(stack, known, plan)
         return _between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
-def _straight(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
-    if state.straight is None or side == "reflection":
+def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
+    if state.ballistic is None or side == "reflection":
         return []
-    return [evaluate_straight(state.straight, wi, wo)]
+    return [evaluate_ballistic(state.ballistic, wi, wo)]
 
 
 def _frames_inside() -> int:
@@ -454,7 +457,7 @@ def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, pla
 
 @filter_jit
 @exact_products
-def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> Between:
+def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
     return _between(stack, make_elements(stack, plan, known), known, plan)
 
 
@@ -468,7 +471,7 @@ def _tables_of_elements(
 
 @filter_jit
 @exact_products
-def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
+def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
     return _between(layers.stack(), elements, known, plan)
 
 
@@ -480,9 +483,9 @@ def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrd
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> Between:
+def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
     grid, _, rest, _ = assemble(stack, plan, elements)
-    return between(rest, known, grid.regions[-1].ior, stack.base is not None)
+    return requested_values(rest, known, grid.regions[-1].ior, stack.base is not None)
 
 
 def _probes(opaque: bool, known: KnownDirections | None) -> tuple[Array, Array]:

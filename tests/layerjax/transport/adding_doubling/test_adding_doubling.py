@@ -109,7 +109,7 @@ STACKS = {
 
 
 SLOW = ("flakes with Fresnel on paint", "coated metal", "rough glass")
-"""The others hold one medium in modes and two in ordinates; interfaces meet the walk in `test_straight`."""
+"""The others hold one medium in modes and two in ordinates; interfaces meet the walk in `test_ballistic`."""
 
 
 @pytest.fixture(

@@ -48,7 +48,7 @@ REVERSE = ("flakes", "haze on metal", "low coat on paint")
 
 SHORT_ONES = ("flakes", "low coat on paint")
 """Whose programs do as well. Those of a hazy coat are compared with differences in `test_known_directions`, and light
-that passes a slab straight is in `test_straight`."""
+that passes a slab straight is in `test_ballistic`."""
 
 
 def build_of(kind):

@@ -18,10 +18,10 @@ from layerjax._numerics import horizon, safe_sqrt
 from layerjax.channels import Channels, each, total
 from layerjax.directions import Vector, flip, sanitised, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces.interface import interface_transmission, is_straight
-from layerjax.transport.adding_doubling.asked import asked_region, turn
+from layerjax.surfaces.interface import interface_transmission, is_index_matched
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
+from layerjax.transport.adding_doubling.requested import requested_region, turn
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
 POINTS = (16, 12)
@@ -34,7 +34,7 @@ TINY = 1e-18
 """1/sr: of two lobes that are less the weights do not matter; their squares are none in single precision."""
 
 
-class Straight(eqx.Module):
+class Ballistic(eqx.Module):
     """The two interfaces, and the media above, between and below them."""
 
     upper: Interface
@@ -42,7 +42,7 @@ class Straight(eqx.Module):
     media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
 
 
-def straight(stack: Stack) -> Straight | None:
+def ballistic_paths(stack: Stack) -> Ballistic | None:
     """What light passes by two refractions alone; None, if none does."""
     faces = _faces(stack)
     if faces is None:
@@ -52,7 +52,7 @@ def straight(stack: Stack) -> Straight | None:
     assert isinstance(upper, Interface)
     assert isinstance(lower, Interface)
     above, between, below = (tuple(layer for layer in part if isinstance(layer, Medium)) for part in parts)
-    return Straight(upper, lower, (above, between, below))
+    return Ballistic(upper, lower, (above, between, below))
 
 
 def _faces(stack: Stack) -> tuple[int, int] | None:
@@ -62,7 +62,7 @@ def _faces(stack: Stack) -> tuple[int, int] | None:
     return (faces[0], faces[1]) if stack.base is None and len(faces) == 2 else None
 
 
-def without_straight(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
+def without_ballistic(stack: Stack, layers: Sequence[Layer], whole: Layer) -> Layer:
     """The whole stack without the light that passes by two refractions alone, as its layers have it."""
     faces = _faces(stack)
     if faces is None:
@@ -97,7 +97,7 @@ def _refracted_twice(layers: Sequence[tuple[Operator, Operator]], faces: Sequenc
     return passed
 
 
-def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
+def evaluate_ballistic(state: Ballistic, wi: Vector, wo: Vector) -> Channels:
     """BSDF of that light; wi and wo on either side, 0 for pairs on one side."""
     shape = jnp.broadcast_shapes(wi[2].shape, wo[2].shape)
     downward = wi[2] > 0
@@ -113,7 +113,7 @@ def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
     def nothing(*pairs: Array) -> Channels:
         return tuple(jnp.zeros(found.shape, found.dtype) for found in jax.eval_shape(passed, *pairs))
 
-    def some(rows: list[Array]) -> Channels:  # pairs on one side, which often lie together, are left out
+    def some(rows: list[Array]) -> Channels:  # pairs on one side, which often lie together, are omitted
         crossing, *pairs = rows
         return jax.lax.cond(jnp.any(crossing), passed, nothing, *pairs)
 
@@ -130,7 +130,7 @@ def evaluate_straight(state: Straight, wi: Vector, wo: Vector) -> Channels:
     return each(value, found, outside)
 
 
-def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
+def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) -> Channels:
     """f from above to below for light along (-sin, 0, cos) that leaves turned by an azimuth: arrays (pairs,) each.
 
     With m between, g_i and g_o the BTDFs from m out along either direction, f = n^2 * integral of g_i g_o cos(m). Rays
@@ -151,8 +151,8 @@ def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
         return g_i, g_o / below**2, tuple(jnp.exp(-depth) for depth in depths)
 
-    # a BTDF at equal indices is a delta: then the rays of its own side are the whole
-    delta_i, delta_o = is_straight(inner), is_straight(inner / below)
+    # a BTDF at equal indices is a delta: then the rays of that side are the whole
+    delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)
     (x, y, z), share = _rays(cosine_i, inner, faces[0])
     g_i, g_o, passed = parts(x, y, z)
     counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, g_i / (g_i + g_o + TINY)))
@@ -167,7 +167,7 @@ def _passed(state: Straight, cosine_i: Array, cosine_o: Array, azimuth: Array) -
 
 def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:
     """Where facets refract light along (-sin, 0, cos) to, z counted on the far side, and its shares."""
-    rays, share = refracted_rays(asked_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
+    rays, share = refracted_rays(requested_region(cosine, jnp.ones_like(ratio)), ratio, normals, POINTS)
     x, y, z = sanitised(rays, rays[2] > 0)  # of rays back up, whose share is 0, masking has no meaning
 
     def both(part: Array, mirrored: Array) -> Array:  # shares stand for mirror images too

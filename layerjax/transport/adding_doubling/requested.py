@@ -1,4 +1,4 @@
-"""Directions that are asked for, as directions of the grid: light along them is followed exactly, nothing is read off.
+"""Requested directions as directions of the grid: light along them is followed exactly, nothing is read off.
 
 Where a stack begins (and, if light passes it, ends) with an interface, all that such directions need is what the
 interface lets in from each: columns of its operators, of nodes that carry no weight in any sum. What lies behind does
@@ -19,7 +19,7 @@ from layerjax.transport.contract import Side
 from layerjax.transport.known_directions import KnownDirections
 
 
-class Between(eqx.Module):
+class RequestedValues(eqx.Module):
     """f of the paths with more than one event between known directions.
 
     values: (out, in, channels, modes), over the cosines above, and if light passes those below. of_wi, of_wo: see
@@ -32,13 +32,13 @@ class Between(eqx.Module):
     opaque: bool = eqx.field(static=True)
 
 
-def asked_region(cosine: Array, ior: Array) -> Region:
+def requested_region(cosine: Array, ior: Array) -> Region:
     """The directions as nodes without weight."""
     zero = jnp.zeros_like(cosine)
     return Region(ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), zero, zero, zero == 0)
 
 
-def between(whole: Layer, known: KnownDirections, bottom: Array, opaque: bool) -> Between:
+def requested_values(whole: Layer, known: KnownDirections, bottom: Array, opaque: bool) -> RequestedValues:
     """Values from the operators of a stack solved at the known directions; bottom: index below the stack."""
     above, below = known.above.size, 0 if opaque else known.below.size
     rows = [(whole.reflect_top.rest, whole.transmit_up.rest), (whole.transmit_down.rest, whole.reflect_bottom.rest)]
@@ -54,10 +54,10 @@ def between(whole: Layer, known: KnownDirections, bottom: Array, opaque: bool) -
         lower = [whole_block(block, below, size) for block, size in zip(rows[1], (above, below), strict=True)]
         full = jnp.concatenate([full, bottom**2 * jnp.concatenate(lower, axis=-1)], axis=-2)
     values = jnp.transpose(full, (2, 3, 0, 1)) / (2.0 * jnp.pi)
-    return Between(values, known.of_wi, known.of_wo, opaque)
+    return RequestedValues(values, known.of_wi, known.of_wo, opaque)
 
 
-def read_between(found: Between, wi: Vector, wo: Vector, side: Side) -> Channels:
+def read_requested(found: RequestedValues, wi: Vector, wo: Vector, side: Side) -> Channels:
     """BSDF of the paths with more than one event, which ringing may take below 0."""
     edge, (z_i, z_o) = horizon(wi[2].dtype), (wi[2], wo[2])
     if found.opaque or side == "reflection":
