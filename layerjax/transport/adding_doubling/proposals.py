@@ -59,7 +59,7 @@ def proposal_density(state: FirstOrder, wi: Vector, wo: Vector) -> Array:
 
 
 def _shares(state: FirstOrder) -> tuple[float, float, float, float]:
-    """Probabilities of the lobes of media and faces, of a single interface, and of the two cosine lobes, wi's side first."""
+    """Probabilities of lobes of media and faces, of a single interface, and of two cosine lobes, wi's side first."""
     if state.opaque:
         return 0.6, 0.0, 0.4, 0.0
     return (0.5, 0.0, 0.25, 0.25) if state.crossing is None else (0.3, 0.4, 0.15, 0.15)
