@@ -59,15 +59,15 @@ def evaluate(
             numbers.
         wo: unit directions towards the viewer, shape ``(..., 3)``. Same side as wi: reflection; opposite: transmission.
         transport: see `prepare`.
-        side: which pairs are asked for: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
-            one below. Other pairs give 0, and what only they need is left out of the program.
+        side: the pairs that are evaluated: ``"all"``; ``"reflection"``, both above; ``"transmission"``, one above and
+            one below. Other pairs give 0, and what only they need is not in the program.
         key: a JAX random key, which `RandomWalk` needs and others ignore. The same key gives the same values.
 
     Returns:
         Values of shape ``broadcast(wi, wo)[:-1] + (C,)``, of a map ``broadcast(S, wi[..., 0], wo[..., 0]) + (C,)``, in
         the floating type of the directions, the channel axis last. A direction in the tangent plane gives 0. Of a map
-        every texel is what its stack alone gives, in chunks that stay in the cache; what `"auto"` and `AddingDoubling`
-        leave open is chosen once, for the texel that asks for most.
+        every texel is what its stack alone gives, in chunks that stay in the cache; the resolution of `"auto"` and
+        `AddingDoubling` is chosen once, for the texel that needs the finest.
     """
     return evaluate_known(stack, wi, wo, transport, side=side, key=key)
 
@@ -205,7 +205,7 @@ def albedo(
     nodes: int = 32,
     key: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Directional albedo: the shares of light along wi scattered to wi's own side and to the other, ``(..., C)`` each.
+    """Directional albedo: the shares of light along wi that are reflected and transmitted, ``(..., C)`` each.
 
     The part that passes without scattering is not in it (see `unscattered`). By quadrature adapted to every lobe, with
     `nodes` Gauss points a dimension and panel: 32 give 1e-6 as a rule, and 4e-3 at worst over the documented box, where
@@ -228,7 +228,7 @@ def albedo(
 
 @broadcasting
 def unscattered(stack: Stack | Mixture, wi: ArrayLike) -> Array:
-    """Share of radiance along wi that passes straight through the stack without a collision, shape ``(..., C)``.
+    """Share of radiance along wi that passes the stack without a collision, shape ``(..., C)``.
 
     The delta part of the BSDF: 0 over an opaque base and through rough interfaces. Maps of stacks as in `evaluate`.
     """
@@ -361,7 +361,7 @@ def _evaluate_map(
 
 
 def _compared(stack: Stack | Prepared, transport: Transport, known: Known) -> list[Prepared] | None:
-    """The stack prepared for the transports that errors are told by; None, if it knows them itself."""
+    """The stack prepared for the transports of an error estimate; None, if it knows errors itself."""
     others = transport.compared()
     if others is None:
         return None

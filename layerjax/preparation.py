@@ -71,7 +71,7 @@ def choose_transport(
     Args:
         stack: the layered material. What is traced in it counts as not known. Of a mixture `evaluate` chooses for each
             part; here that which carries all of them, as fine as the part needs that needs most.
-        wi, wo: directions of `evaluate`, as there. Left out: they are many, or not known.
+        wi, wo: directions of `evaluate`, as there. None: they are many, or not known.
         transport: see `prepare`.
 
     Raises:

@@ -25,7 +25,7 @@ from layerjax.phase import HenyeyGreenstein, PhaseFunction
 from layerjax.surfaces import Surface
 
 LEAST_EXTINCTION = 1e-10
-"""In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be asked for."""
+"""In 1/mm, stands for 0 where derivatives by the coefficients of a turbid medium may be needed."""
 
 
 class Interface(Shown):
@@ -42,8 +42,8 @@ class Interface(Shown):
 
     Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1 + 1e-9
     and alpha 0.3 a passage at 75 degrees loses 20 %, and a base that is lit and seen at 75 degrees is 36 % darker.
-    Transports with ``microfacets="multiple"`` carry on what facets block; where the index does not change, leave the
-    interface out (one of exactly the index above it is left out by itself).
+    Transports with ``microfacets="multiple"`` carry on what facets block; where the index does not change, omit the
+    interface (one of exactly the index above it is omitted automatically).
     """
 
     ior: Parameter = parameter("Interface.ior")
@@ -127,7 +127,7 @@ class Stack(Shown):
     """Layers from top to bottom over a base.
 
     Numbers of shape ``(N,)`` or ``(H, W)`` make it a map of stacks, one for every texel: see `layerjax._shapes` for how
-    they are told from channels.
+    they are distinguished from channels.
 
     Args:
         layers: any number of `Interface`, `Medium` and `TurbidMedium`, the topmost first.
@@ -183,7 +183,7 @@ def simplify(stack: Stack) -> Stack:
     """The same stack without what its concrete values say is not there.
 
     Turbid media become media. Media of thickness 0 go, and interfaces whose index is that of what lies above them (all
-    light passes straight); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
+    light passes); f0 = 1 becomes None; f0 = 0 and albedo = 0 or 1 become Python floats, known while tracing.
     Axes of media that are the normal go: what is symmetric about it is so by structure.
     Traced values are kept as they are, so derivatives with respect to them are exact.
     """

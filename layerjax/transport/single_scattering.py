@@ -7,7 +7,7 @@ the reflection and the transmission of a layer are, in a form without cancellati
 
 with (m, y) = (0, a + b) on the same side and (min(a, b), |a - b|) on opposite sides (Eqs. 12 and 16, the sign of Eq. 15
 put right), times the attenuation of the layers that lie between it and wi, and between it and wo. Where either side is
-asked for it is evaluated as (exp(-p) - exp(-q)) / (q - p), which is smooth at a = b: (p, q) = (0, a + b) or (a, b).
+possible it is evaluated as (exp(-p) - exp(-q)) / (q - p), which is smooth at a = b: (p, q) = (0, a + b) or (a, b).
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Light that passes a slab by two refractions, at its two interfaces, and meets nothing between: in closed form.
 
-Both lobes may be narrower than the nodes are apart, which then do not tell where they overlap. The directions between
+Both lobes may be narrower than the nodes are apart, which then miss where they overlap. The directions between
 are integrated over along the facets that either side sees, and the two sums weighed against each other (Veach & Guibas
 1995): the narrower lobe gives the points, the wider the values.
 """

@@ -94,7 +94,7 @@ def interface_layer(
 
     Args:
         enters: whether light from above counts as entering.
-        asked: directions outside that stand in the place of the outer nodes. The operators are then those of light
+        requested: directions outside that stand in the place of the outer nodes. The operators are then those of light
             that comes from them, and per projected solid angle over 2 pi for light that leaves along them; what the
             interface reflects outside is omitted.
         behind: what light that enters meets next.
@@ -126,7 +126,7 @@ def _operators(
     behind: Behind,
     requested: int = 0,
 ) -> list[Parts]:
-    """Reflection outside, light that enters, light that leaves, reflection inside: of the first `asked`, or of all.
+    """Reflection outside, light that enters, light that leaves, reflection inside: of the first `requested`, or of all.
 
     What is returned after it was lost to masking has met several facets: it is no path of one event.
     """
@@ -158,7 +158,7 @@ def _operators(
 
 
 def _of_requested(parts: Parts, place: int, requested: int) -> Parts:
-    """Of the first `asked` directions outside alone: outer reflection, light that enters, that leaves, inner one."""
+    """The first `requested` directions outside alone: outer reflection, light that enters, that leaves, inner one."""
     rows, columns = (requested if place in (0, 2) else None), (requested if place in (0, 1) else None)
     return Parts(*(None if part is None else part[:, :rows, :columns] for part in (parts.first, parts.rest)))
 
@@ -166,7 +166,7 @@ def _of_requested(parts: Parts, place: int, requested: int) -> Parts:
 def _followed(
     grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, behind: Behind
 ) -> list[Parts]:
-    """The four operators (see `_operators`) for directions asked for, where what masking loses is lost: no sum over
+    """The four operators (see `_operators`) for requested directions, where what masking loses is lost: no sum over
     directions outside is needed."""
     ratio = inner.ior / requested.ior
     if behind == "diffuse":  # only smooth functions are summed over what is let in

@@ -58,8 +58,8 @@ class ENDF(DeterministicTransport):
     2e6), and by 0.21 for indices down to 0.5; that of the paper's form reaches 2.2 at grazing light.
 
     Args:
-        bounces: how often light may meet the lower side, 0 to 16; 0: the surface alone (and, through a slab, what goes
-            straight). The second and later ones are not in the paper.
+        bounces: how often light may meet the lower side, 0 to 16; 0: the surface alone (and, through a slab, what is
+            not reflected). The second and later ones are not in the paper.
         form: ``"reciprocal"``, lobes about the half vector below the surface: reciprocal, exact for a smooth coat, and
             not in the paper; ``"paper"``, the paper's lobes with its slips corrected, which follow wi (the paper traces
             from the viewer: swap wi and wo for that) and are not reciprocal.

@@ -1,8 +1,8 @@
 """Random numbers of the walk: a counter-based hash, stateless but for a counter.
 
 PCG4D (Jarzynski & Olano 2020, "Hash functions for GPU rendering", JCGT 9(3)) turns four 32-bit words into four. The
-words are (counter, lane, key, key): every lane has its own stream of 2^32 blocks, and no stream starts where another
-goes on. A block of four numbers costs a dozen integer products, which is a fraction of what threefry takes.
+words are (counter, lane, key, key): every lane has its own stream of 2^32 blocks, and no stream overlaps
+another. A block of four numbers costs a dozen integer products, which is a fraction of what threefry takes.
 """
 
 import jax
