@@ -61,8 +61,8 @@ def solve(
     """The grid, the whole stack as one layer, that less what is known in closed form, see `ballistic`, and its outer
     faces, see `outer_faces`.
 
-    requested: directions outside to stand in the place of the grid's, see `interface_layer`; the stack then begins (and if
-    light passes it, ends) with an interface.
+    requested: directions outside in the place of the grid's, see `interface_layer`; the stack then begins (and if light
+    passes it, ends) with an interface.
     """
     return assemble(stack, plan, make_elements(stack, plan, requested))
 
