@@ -95,7 +95,7 @@ def test_a_killed_search_resumes_and_finds_the_same(
     assert set(Store.read(directory / STORE).keys()) == set(whole.keys())
 
 
-@pytest.mark.parametrize("correlated", [0.2, 1.0])
+@pytest.mark.parametrize("correlated", [pytest.param(0.2, marks=pytest.mark.slow), 1.0])
 def test_the_options_of_its_fits_decide_on_a_discrepancy(data: fits.Measurements, correlated: float) -> None:
     """Residuals of a stack without the haze are correlated by more than 0.2, which is the default, and below 1."""
     options = replace(SHORT, fit=fits.FitOptions(autocorrelation=correlated))

@@ -75,6 +75,7 @@ def test_gradients_are_those_within_jit(name, ruled):
     same(value, function(AT), 1e-12)
 
 
+@pytest.mark.slow
 def test_jacobians_forward_and_backward_are_those_within_jit(ruled):
     def values(x):
         return lj.evaluate(coat(AT | x), WI, WO, TRANSPORT)
