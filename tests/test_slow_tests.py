@@ -10,10 +10,11 @@ from tools.slow_tests import (
     WORKERS,
     Recorder,
     Row,
-    number,
+    collected,
+    commit_number,
     pytest_runtest_setup,
     read,
-    told,
+    summary,
     turns,
     write,
 )
@@ -46,9 +47,11 @@ def test_tables_are_read_as_they_are_written(tmp_path) -> None:
     assert path.read_text().splitlines()[0] == "a.py::test_a,2.0,3,passed"
 
 
-def test_what_waits_and_what_failed_is_told() -> None:
+def test_what_waits_and_what_failed_is_listed() -> None:
     table = {"a.py::test_a": Row(1.0, 7, "failed"), "a.py::test_b": Row(1.0, 9, "passed")}
-    lines = list(told(["a.py::test_c[1]", "a.py::test_c[2]"], ["a.py::test_b", "a.py::test_a", "a.py::test_d"], table))
+    lines = list(
+        summary(["a.py::test_c[1]", "a.py::test_c[2]"], ["a.py::test_b", "a.py::test_a", "a.py::test_d"], table)
+    )
     assert lines[0].split() == ["2", "of", "a.py::test_c"]
     assert [line.split()[-1] for line in lines[2:5]] == ["a.py::test_d", "a.py::test_a", "a.py::test_b"]
     assert lines[5:] == ["failed when they ran last: 1", "     7 a.py::test_a"]
@@ -85,4 +88,11 @@ def test_a_turn_ends_with_its_window(monkeypatch) -> None:
 
 
 def test_commits_are_numbered() -> None:
-    assert number() > 0  # in a folder without history too
+    assert commit_number() > 0  # in a folder without history too
+
+
+def test_slow_tests_are_collected_by_their_whole_names() -> None:
+    """Whatever options the project gives to pytest."""
+    found = collected("tests/test_site.py")
+    assert found
+    assert all(name.startswith("tests/test_site.py::test_") for name in found)

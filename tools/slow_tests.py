@@ -67,7 +67,7 @@ def turns(tests: Iterable[str], table: dict[str, Row], room: float) -> list[list
     return dealt + alone
 
 
-def number() -> int:
+def commit_number() -> int:
     """Of this commit: how many there are; where there is no history, that of the day."""
     try:
         count = subprocess.run(["git", "rev-list", "--count", "HEAD"], cwd=ROOT, capture_output=True, text=True)
@@ -77,13 +77,13 @@ def number() -> int:
     return int(count.stdout) if count.returncode == 0 and not shallow else int(time.time() // 86400)
 
 
-def collected() -> list[str]:
-    command = [sys.executable, "-m", "pytest", "-o", "addopts=", "-m", "slow", "--collect-only", "-q"]
+def collected(folder: str = "tests") -> list[str]:
+    command = [sys.executable, "-m", "pytest", "-o", "addopts=", "-m", "slow", "--collect-only", "-q", folder]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     return [line for line in done.stdout.splitlines() if "::" in line]
 
 
-def told(drawn: list[str], tests: list[str], table: dict[str, Row]) -> Iterable[str]:
+def summary(drawn: list[str], tests: list[str], table: dict[str, Row]) -> Iterable[str]:
     yield from (f"  {count:4d} of {name}" for name, count in Counter(test.split("[")[0] for test in drawn).items())
     waiting = sorted((table.get(test, Row()).last, test) for test in set(tests) - set(drawn))
     yield "not run for longest (number of the commit):"
@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--all", action="store_true", help="all slow tests, however long they take")
     parser.add_argument("--turn", type=int, help="another turn than that of the commit")
     options = parser.parse_args(arguments)
-    tests, now = collected(), number()
+    tests, now = collected(), commit_number()
     if not tests:
         print("no slow test was found")
         return 1
@@ -135,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
     drawn = dealt[turn]
     seconds = [table.get(test, Row()).seconds for test in drawn]
     print(f"turn {turn} of {len(dealt)}: {len(drawn)} of {len(tests)} slow tests, {sum(seconds):.0f} s of one process")
-    print("\n".join(told(drawn, tests, table)), flush=True)
+    print("\n".join(summary(drawn, tests, table)), flush=True)
     if not options.all:
         until, limit = time.time() + WINDOW, max(WINDOW, 3.0 * max(seconds))
         os.environ |= {"SLOW_TESTS_UNTIL": str(until), "SLOW_TESTS_LIMIT": str(limit)}

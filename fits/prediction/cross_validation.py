@@ -118,8 +118,7 @@ def cross_validate(
         rest = refit(without(fit.problem, held_out), *starts)
         each, effective = np.empty((0, *density[rows].shape)), 0.0
         while not len(each) or (errors[number] > options.monte_carlo_error and len(each) < options.most_draws):
-            again = seed + len(each)
-            prediction = posterior_predictive(rest, data, draws=draws, seed=again, proposal=proposal)
+            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
             each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
             effective += prediction.effective_draws
             density[rows] = logsumexp(each, axis=0) - math.log(len(each))
