@@ -11,7 +11,7 @@ beside the quadratures at random points, half of them in the layers where energi
 quantity                            rms, largest
 =================================== ================
 mirrors                             1e-4, 6e-4
-retained light                      1.5e-3, 1.2e-2
+share within a cone                 1.5e-3, 1.2e-2
 interfaces, "single"                2e-3, 3e-2
 interfaces, "multiple", alpha > .01 2e-3, 3e-2
 conductors, "single", k > 0.3       1e-3, 7e-3
@@ -169,7 +169,7 @@ def retained_share(cosine: Array, alpha: Array, ratio: Array) -> Array:
 
 
 def retained_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array, Array, Array]:
-    """Where directions, widths and critical cosines lie on the axes of the table of retained light.
+    """Where directions, widths and critical cosines lie on the axes of the table of `retained_share`.
 
     The cosine counts from the critical one, in what the width of the lobe is there, and extends beyond 1.
     """
@@ -229,8 +229,8 @@ def _means_of_facets(
     """Mean reflectance of facets by their cosines, by channels: of the first ones with the shares of the first set,
     of the next with those of the next; in a loop, that XLA compiles a facet once."""
 
-    def add(sums: list[Channels], given: tuple[Array, Array]) -> tuple[list[Channels], None]:
-        u, shares = given
+    def add(sums: list[Channels], tabulated: tuple[Array, Array]) -> tuple[list[Channels], None]:
+        u, shares = tabulated
         levels = each(lambda ior, k: fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
         after = []
         for total, share in zip(sums, shares, strict=True):

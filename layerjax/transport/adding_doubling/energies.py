@@ -110,7 +110,7 @@ def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
 def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
     """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
 
-    def kept(one: Array, other: Array) -> Array:
+    def balanced(one: Array, other: Array) -> Array:
         return not_negative(not_negative(one) + (other - not_negative(other)))
 
-    return each(kept, near, far), each(kept, far, near)
+    return each(balanced, near, far), each(balanced, far, near)

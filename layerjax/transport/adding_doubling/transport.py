@@ -99,7 +99,7 @@ class Solved(eqx.Module):
 
     first: FirstOrder
     tables: Tables | None
-    between: RequestedValues | None = None
+    requested: RequestedValues | None = None
     ballistic: Ballistic | None = None
     scaled: FirstOrder | None = None
 
@@ -236,7 +236,7 @@ class AddingDoubling(DeterministicTransport):
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, None]:
-        if state.between is None:
+        if state.requested is None:
             return super().measured(state, wi, wo, side, channels, key)
         i, o = split(wi), split(wo)
         values = self.evaluate(state, i, o, side)
@@ -245,23 +245,23 @@ class AddingDoubling(DeterministicTransport):
     def doubt(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
         least = FACETS_ERROR if state.first.layered else 0.0
 
-        def found(wi: Vector, wo: Vector) -> Channels:
+        def doubts(wi: Vector, wo: Vector) -> Channels:
             rest = self._rest(state, wi, wo, side)
             lowest = rest if state.scaled is None else self._sum(state, rest, wi, wo, side)
             return tuple(least * jnp.abs(pick(rest, c)) + not_negative(-pick(lowest, c)) for c in range(channels))
 
-        return in_chunks(found, wi, wo)
+        return in_chunks(doubts, wi, wo)
 
     def coarser(self) -> "AddingDoubling":
         """This transport at about two thirds of the resolution, for an estimate of the error."""
-        return self._at(self._given().coarser())
+        return self._at(self._as_resolution().coarser())
 
     def finer(self) -> "AddingDoubling":
         """This transport at about four thirds of the resolution."""
-        return self._at(self._given().finer())
+        return self._at(self._as_resolution().finer())
 
     def compared(self) -> tuple["AddingDoubling", ...]:
-        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._given()))
+        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._as_resolution()))
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         rest = self._rest(state, wi, wo, side)
@@ -271,8 +271,8 @@ class AddingDoubling(DeterministicTransport):
 
     def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         """What is read off: ringing may take it below 0, and where media are scaled what it lacks may, too."""
-        if state.between is not None:
-            return read_requested(state.between, wi, wo, side)
+        if state.requested is not None:
+            return read_requested(state.requested, wi, wo, side)
         if state.tables is not None:
             return read_rest(state.tables, wi, wo, side)
         return (jnp.zeros_like(wi[2] * wo[2]),)
@@ -340,7 +340,7 @@ class AddingDoubling(DeterministicTransport):
     def _at(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
-    def _given(self) -> Resolution:
+    def _as_resolution(self) -> Resolution:
         if self.nodes is None:
             raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
         return Resolution(self.nodes, self.modes or modes_for(self.nodes), self.ordinates or ORDINATES_LADDER[0])
@@ -417,7 +417,7 @@ class _Planned(AddingDoubling):
     def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if self.elements is None:
             return super()._solve_between(stack, known, plan)
-        return _between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
+        return _values_between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
 def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
@@ -458,7 +458,7 @@ def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, pla
 @filter_jit
 @exact_products
 def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _between(stack, make_elements(stack, plan, known), known, plan)
+    return _values_between(stack, make_elements(stack, plan, known), known, plan)
 
 
 @filter_jit
@@ -472,7 +472,7 @@ def _tables_of_elements(
 @filter_jit
 @exact_products
 def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _between(layers.stack(), elements, known, plan)
+    return _values_between(layers.stack(), elements, known, plan)
 
 
 def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
@@ -483,7 +483,7 @@ def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrd
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
+def _values_between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
     grid, _, rest, _ = assemble(stack, plan, elements)
     return requested_values(rest, known, grid.regions[-1].ior, stack.base is not None)
 

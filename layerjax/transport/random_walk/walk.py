@@ -166,13 +166,13 @@ class Walk:
         """Scattering in a medium."""
         scene, wi, medium = self.scene, scale(-1.0, path.direction), arrival.medium
         area = scene.cross_section(medium, wi)
-        direction, kept = scene.deflect(medium, wi, u[1], u[2])
+        direction, weight = scene.deflect(medium, wi, u[1], u[2])
         if target is None:
-            return Event(direction, kept, arrival.collides)
+            return Event(direction, weight, arrival.collides)
         density, share = scene.collide(medium, wi, target.direction, area)
         sent = tuple(density * pick(share, c) for c in range(scene.channels))
         next_density = scene.collide(medium, wi, direction, area)[0] if self.mixes else None
-        event = Event(direction, kept, arrival.collides, sent, density, next_density)
+        event = Event(direction, weight, arrival.collides, sent, density, next_density)
         if path.relay is None:
             return event
         density, share = scene.collide(medium, wi, path.relay.travel, area)
@@ -200,7 +200,7 @@ class Walk:
             assert surface is not None
             beyond = jnp.where(from_above, surface + 1, surface)
             path = path._replace(region=jnp.where(at_surface & hit.crosses, beyond, path.region))
-        event = Event(hit.direction, hit.kept, hit.survives, hit.towards_target, leaves=leaves)
+        event = Event(hit.direction, hit.weight, hit.survives, hit.towards_target, leaves=leaves)
         if self.adjacent and towards is not None:
             densities = [
                 surfaces.density(scene, surface, entered_above, entry, w, diffuse=self.multiple)
@@ -269,7 +269,7 @@ class Walk:
 
     def _continue(self, path: PathState, arrival: Arrival, event: Event, u: list[Array]) -> tuple[PathState, Array]:
         """The path after its event, and whether it ends; one that has drawn its aim becomes light along wi."""
-        throughput = tuple(path.throughput[c] * pick(event.kept, c) for c in range(self.scene.channels))
+        throughput = tuple(path.throughput[c] * pick(event.weight, c) for c in range(self.scene.channels))
         after = path._replace(direction=event.direction, throughput=throughput)
         ends = arrival.escapes | ~event.survives
         if self.fades:
