@@ -34,7 +34,6 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.channels import Channels, each
-from layerjax.microsurface.directional_albedo import Microfacets
 from layerjax.microsurface.splines import read
 from layerjax.tables import load
 
@@ -90,15 +89,15 @@ MIRROR = Warp((0.0, 1.0), 0.0)
 RETAINED = Warp((0.0, 0.5), 0.0)
 
 
-def interface_energies(cosine: Array, alpha: Array, ior: Array, microfacets: Microfacets) -> tuple[Array, Array]:
+def interface_energies(cosine: Array, alpha: Array, ior: Array, multiple: bool) -> tuple[Array, Array]:
     """Reflectance and transmittance of a rough interface.
 
     Args:
         ior: index on the far side over that on the side of incidence.
-        microfacets: ``"single"``, where light that a facet sends into another is lost (Walter 2007), or ``"multiple"``,
-            where the two add up to 1.
+        multiple: whether light that a facet sends into another is followed, where the two add up
+            to 1; else it is lost (Walter 2007).
     """
-    if microfacets == "multiple":
+    if multiple:
         reflected = _from_root(_dielectric(cosine, alpha, ior, 0, 1)[0])
         return reflected, 1.0 - reflected
     root, passed = _dielectric(cosine, alpha, ior, 1, 2)
@@ -116,14 +115,14 @@ def mirror_energy(cosine: Array, alpha: Array) -> Array:
     return at_most(_on_plane(cosine, alpha, "mirror", 1)[0], 1.0)
 
 
-def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, microfacets: Microfacets) -> Channels:
+def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, multiple: bool) -> Channels:
     """Reflectance of a rough conductor, by channels.
 
     Args:
         ior, k: over the index of the medium above.
-        microfacets: ``"single"``, or ``"multiple"``, where light loses its Fresnel share at every facet that it meets.
+        multiple: whether light is followed from facet to facet, and loses its Fresnel share at each.
     """
-    if microfacets == "single":
+    if not multiple:
         total, *facing = _on_plane(cosine, alpha, "mirror", 1 + len(SLICES))
         (levels,) = _means_of_facets(facing, (SLICES,), ior, k)
         return channels.times((at_most(total, 1.0),), levels)

@@ -17,7 +17,6 @@ from layerjax import fresnel
 from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax.directions import Vector, half_vector
-from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_light import (
@@ -81,7 +80,7 @@ def interface_layer(
     below: Region,
     normals: Normals,
     modes: int,
-    microfacets: Microfacets,
+    multiple: bool,
     *,
     enters: bool = True,
     requested: Region | None = None,
@@ -101,12 +100,19 @@ def interface_layer(
     """
     near, far = (above, below) if enters else (below, above)
     if requested is None:
-        operators = _operators(grid, near, far, normals, modes, microfacets, next_event)
-    elif microfacets == "single":
+        operators = _operators(grid, near, far, normals, modes, multiple, next_event)
+    elif not multiple:
         operators = _followed(grid, requested, far, normals, modes, next_event)
     else:  # what masking loses is returned in proportion to sums over all directions outside
         operators = _operators(
-            grid, joined(requested, near), far, normals, modes, microfacets, next_event, requested.weight.size
+            grid,
+            joined(requested, near),
+            far,
+            normals,
+            modes,
+            multiple,
+            next_event,
+            requested.weight.size,
         )
     outer, into, out, inner = (_channelled(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
@@ -122,7 +128,7 @@ def _operators(
     far: Region,
     normals: Normals,
     modes: int,
-    microfacets: Microfacets,
+    multiple: bool,
     next_event: NextEvent,
     requested: int = 0,
 ) -> list[Parts]:
@@ -148,7 +154,7 @@ def _operators(
     )
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
     returned: list[Array | None] = [None] * 4
-    if microfacets == "multiple":
+    if multiple:
         turned = [
             _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
@@ -334,7 +340,7 @@ def _reflection(
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
     """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
-    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, "multiple")
+    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, True)
     gain = at_least(level - once, 0.0)
     return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
@@ -44,15 +43,15 @@ class Plan(eqx.Module):
     modes: int = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
     ranks: tuple[int, ...] | None = eqx.field(static=True)
-    microfacets: Microfacets = eqx.field(static=True)
+    multiple: bool = eqx.field(static=True)
 
 
-def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) -> Plan:
+def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), microfacets)
-    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), microfacets)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple)
+    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple)
 
 
 def solve(
@@ -196,7 +195,7 @@ def _interface(
         below,
         normals,
         plan.modes,
-        plan.microfacets,
+        plan.multiple,
         enters=enters,
         requested=outside,
         next_event=next_event,
@@ -229,7 +228,7 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
 def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     indices, base = numbers
     here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
-    return base_layer(here, _relative(base, here.ior), plan.modes, plan.microfacets)
+    return base_layer(here, _relative(base, here.ior), plan.modes, plan.multiple)
 
 
 def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:

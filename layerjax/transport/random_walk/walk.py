@@ -21,7 +21,6 @@ from jax import Array
 
 from layerjax.channels import Channels, largest, pick
 from layerjax.directions import Vector, scale, select
-from layerjax.microsurface import Microfacets
 from layerjax.surfaces import Conductor
 from layerjax.transport.random_walk import microsurface, surfaces
 from layerjax.transport.random_walk.flight import boundary, free_flight
@@ -52,7 +51,7 @@ class Walk:
         scene: the stack.
         wi: where the light comes from, path by path.
         wo: where light should go, or None for a walk that only follows it.
-        microfacets: whether light that stays on a rough surface is followed.
+        multiple: whether light that stays on a rough surface is followed.
         orders: which orders count (see `layerjax.RandomWalk`).
         count_orders: whether to count events although all orders count.
     """
@@ -62,7 +61,7 @@ class Walk:
         scene: Scene,
         wi: Vector,
         wo: Vector | None,
-        microfacets: Microfacets,
+        multiple: bool,
         orders: Orders = "all",
         count_orders: bool = False,
     ):
@@ -70,7 +69,7 @@ class Walk:
         self.wi = wi
         self.orders: Orders = orders
         self.counts = count_orders or orders != "all"
-        self.multiple = microfacets == "multiple" and microsurface.applies(scene)
+        self.multiple = multiple and microsurface.applies(scene)
         self.goal = None if wo is None else make_goal(scene, wo)
         self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other

@@ -26,7 +26,6 @@ from layerjax._devices import exact_products
 from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick, select, times
 from layerjax.directions import Vector, sanitised
-from layerjax.microsurface import Microfacets
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
@@ -78,11 +77,11 @@ class DiffuseBase(eqx.Module):
         return tuple(pick(incoming, c) * pick(factor, c) for c in range(max(len(incoming), len(factor))))
 
 
-def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> DiffuseBase:
+def make_diffuse(stack: Stack, base: Surface, multiple: bool) -> DiffuseBase:
     """The diffuse part of a simplified stack over a diffuse base."""
     bare = Stack(stack.layers, None)
     # planned out here: what is known of the layers while tracing saves the solver work
-    plan = make_plan(bare, Resolution(NODES, 1, (2, 4)), microfacets)
+    plan = make_plan(bare, Resolution(NODES, 1, (2, 4)), multiple)
     return _closed_form(bare, base, plan, precision(stack))
 
 
@@ -134,7 +133,7 @@ def _refracted_table(bare: Stack, grid: Grid, incoming: Array, plan: Plan) -> Ar
 
     def entering(region: Region) -> Array:
         _, passed, lost = facet_energies(region, below, normals)
-        return passed + lost if plan.microfacets == "multiple" else passed
+        return passed + lost if plan.multiple else passed
 
     at_nodes, at_points = entering(top), entering(table_region(grid, top))
     typical = safe_div(incoming @ top.weight, at_nodes @ top.weight)[:, None]
