@@ -250,10 +250,10 @@ COMMANDS = {
     ),
     "simulate": Command(
         "simulate goniometer measurements of a stack, with noise",
-        "layerjax simulate --stack coat.toml --incidence 10 30 50 70 --noise 0.05 --out simulated.csv",
+        "layerjax simulate --stack coat.toml --incidence 10,30,50,70 --noise 0.05 --out simulated.csv",
         {
             "--out": _out("CSV", "file to write; its name ends in .csv"),
-            "--incidence": _several(_INCIDENCE, "DEG", type=float, default=(10, 30, 50, 70)),
+            "--incidence": _several(_INCIDENCE, "DEG", type=degrees, default=([10, 30, 50, 70],)),
             "--azimuth": _several(_PLANES, "DEG", type=float, default=(0,)),
         },
         "--stack --noise --seed --force",
@@ -280,7 +280,10 @@ COMMANDS = {
             "--to": _one("rgl: Mitsuba's and pbrt's tensor file; openpbr: MaterialX", choices=EXPORTS, required=True),
             "--out": _out("FILE"),
             "--wavelengths": _several(
-                "wavelengths of the channels, for a spectral rgl file", "NM", type=_number(float, 1.0), default=None
+                "wavelengths of the channels, for a spectral rgl file",
+                "NM",
+                type=_number(float, 1.0, 1e9),
+                default=None,
             ),
         },
         "--force",

@@ -25,7 +25,7 @@ def simulate(arguments: Namespace) -> int:
     from fits.problem.stack_file import read_problem
 
     given = read_problem(arguments.stack)
-    geometry = slices(arguments.incidence, azimuth=arguments.azimuth)
+    geometry = slices([theta for several in arguments.incidence for theta in several], azimuth=arguments.azimuth)
     data = run_simulation(
         _at_start(given.stack), geometry, transport=given.transport, noise=arguments.noise, seed=arguments.seed
     )

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import logsumexp
 
-import layerjax as lj
-from fits.data.geometry import Geometry, polar
+from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
@@ -30,11 +29,11 @@ from fits.problem.discrepancy import softness as softness_of
 from fits.problem.instrument import gain_unknown
 from fits.problem.model import Model
 from fits.problem.problem import polar_angles
+from fits.problem.simulate import require_visible
 from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
 from layerjax._checks import in_short, require_kind
 from layerjax.compiling import programs_kept
-from layerjax.mixture import stacks_of
 
 if TYPE_CHECKING:
     from fits.sampling.proposals import Density
@@ -356,23 +355,9 @@ def _measurements(fit: Fit, at: Geometry | Measurements) -> Measurements:
                 f"predict: the measurements have the channels {', '.join(at.channels)}, the fit {', '.join(channels)}"
             )
         return at.used()
-    _require_visible(fit, at)
+    require_visible("predict", fit.problem.stack, light=at.wi, viewer=at.wo)
     values = np.zeros((len(at), len(channels)))
     return Measurements(at.wi, at.wo, values, None, np.ones(len(at), bool), channels, Source("", "memory"))
-
-
-def _require_visible(fit: Fit, at: Geometry) -> None:
-    """Refuse directions in or below the surface of an opaque stack, whose BSDF is 0 there and has no logarithm."""
-    material = fit.problem.stack
-    if not isinstance(material, lj.Stack | lj.Mixture) or any(one.base is None for one in stacks_of(material)):
-        return
-    for name, w in (("light", at.wi), ("viewer", at.wo)):
-        lowest = float(polar(w).max(initial=0.0))
-        if lowest >= 90.0:
-            raise ValueError(
-                f"predict: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
-                "[0, 90) degrees"
-            )
 
 
 def _posterior_draws(

@@ -5,12 +5,14 @@ import math
 import numpy as np
 
 import layerjax as lj
+from fits.data.geometry import Floats, polar
 from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
 from layerjax._checks import in_short, require_kind
 from layerjax.compiling import programs_kept
+from layerjax.mixture import stacks_of
 
 
 @programs_kept()
@@ -38,12 +40,14 @@ def simulate(
         stack gives 0 and `floor` is 0 carry no noise, which no measurement does: they are masked.
 
     Raises:
-        ValueError: a negative `noise` or `floor`, or a transport that is random or cannot carry the stack.
+        ValueError: a negative `noise` or `floor`, a light below an opaque stack, or a transport that is random or
+            cannot carry the stack.
     """
     for name, level in (("noise", noise), ("floor", floor)):
         if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
             raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
     require_kind("geometry", geometry, Geometry, Measurements)
+    require_visible("simulate", stack, light=geometry.wi)
     # evaluate picks the precision of the directions: float64 if the session has it turned on
     exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)
     sigma = np.hypot(noise * exact, floor)
@@ -60,3 +64,16 @@ def simulate(
         channel_names(exact.shape[1]),
         Source("", "simulated", "brdf", notes),
     )
+
+
+def require_visible(of: str, material: object, **directions: Floats) -> None:
+    """Refuse directions in or below the surface of an opaque stack, whose BSDF is 0 there; `of` says whose they are."""
+    if not isinstance(material, lj.Stack | lj.Mixture) or any(one.base is None for one in stacks_of(material)):
+        return
+    for name, w in directions.items():
+        lowest = float(polar(w).max(initial=0.0))
+        if lowest >= 90.0:
+            raise ValueError(
+                f"{of}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
+                "[0, 90) degrees"
+            )

@@ -175,6 +175,28 @@ def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_agai
     refused(r"\(file [0-9a-f]{8}, not")
 
 
+@pytest.mark.parametrize("removed", ["coated.csv/coat", "coated.csv"])
+def test_a_result_that_is_removed_during_the_run_is_not_counted(
+    folder: Path, counted: list[str], monkeypatch: pytest.MonkeyPatch, removed: str
+) -> None:
+    fit_one = batch.fit_one
+
+    def remove(job: batch.Job, task: batch.Task) -> batch.Row:
+        if task.key == "paint.csv/bare":  # after both of the other file
+            shutil.rmtree(job.out / removed)
+        return fit_one(job, task)
+
+    monkeypatch.setattr(batch, "fit_one", remove)
+    found = fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", **FEW)
+    gone = [f"{row['file']}/{row['stack']}" for row in found.rows if "was removed" in row["status"]]
+    assert gone == [one for one in ("coated.csv/coat", "coated.csv/bare") if one.startswith(removed)]
+    assert not found.complete
+    assert [line["result"] == "failed" for line in table()].count(True) == len(gone)
+    monkeypatch.setattr(batch, "fit_one", fit_one)
+    assert fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", **FEW).complete
+    assert len(counted) == 4 + len(gone)
+
+
 @pytest.mark.slow
 def test_held_out_data_decide(folder: Path) -> None:
     reading = ReadOptions(hold_out=("incidence=50",))

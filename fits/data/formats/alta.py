@@ -127,7 +127,7 @@ def _quantity(
     if holds is None:
         raise ValueError(
             f"{path}: {f'PARAM_OUT {word}' if words else 'no PARAM_OUT: the header'} does not say what the values are: "
-            f"give quantity (--quantity), one of {', '.join(QUANTITIES)}"
+            f"give quantity=... (--read quantity=...), one of {', '.join(QUANTITIES)}"
         )
     return holds, names
 

@@ -216,10 +216,11 @@ def _compared(
     if by.together:
         raise ValueError(
             f"{path}: a comment says that two beams were compared, and the header that two spheres stand together: "
-            "say which holds with corrected (--corrected, --no-corrected)"
+            "say which holds by corrected=True or False (--read corrected=yes or no)"
         )
     return None, [
-        "a comment says that two beams were compared: spheres are ignored, as by iad -X (--no-corrected counts them)"
+        "a comment says that two beams were compared: spheres are ignored, as by iad -X "
+        "(--read corrected=no counts them)"
     ]
 
 
@@ -324,7 +325,7 @@ def _one(path: Path, letter: str, columns: dict[str, Floats], default: float, to
     if np.ptp(values) > (SAME_VALUE * np.mean(values) if tolerance is None else tolerance):
         raise ValueError(
             f"{path}: {letter}, the {COLUMNS[letter]}, goes from {values.min():g} to {values.max():g}, "
-            "and one slab has one: restrict the wavelengths, by wavelengths=(low, high) or --wavelengths LOW,HIGH"
+            "and one slab has one: restrict the wavelengths, by wavelengths=(low, high) or --read wavelengths=LOW,HIGH"
         )
     return float(np.mean(values))
 
