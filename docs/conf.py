@@ -29,7 +29,7 @@ extensions = [
 exclude_patterns = ["_build", "_cache", "jupyter_execute", "**.ipynb_checkpoints"]
 default_role = "py:obj"  # docstrings name things in single quotes
 
-# notebooks run at build, and again only where their content has changed; -D nb_execution_mode=off leaves it out
+# notebooks run at build, and again only where their content has changed; -D nb_execution_mode=off skips that
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(Path(__file__).parent / "_cache")
 nb_execution_timeout = 600

@@ -81,7 +81,7 @@ def over_devices(function: Callable[[Any], Any], rows: Any, least: int, filled: 
     if not missing:
         return shared(rows)
     more = jax.tree.map(lambda row: jnp.concatenate([row, row[:missing]]), rows)
-    return jax.tree.map(lambda found: found[:count], shared(more))
+    return jax.tree.map(lambda part: part[:count], shared(more))
 
 
 @cache

@@ -76,7 +76,7 @@ def parameter(
     default: Any = dataclasses.MISSING,
     optional: bool = False,
     ranged: bool = True,
-    between: tuple[float, float] | None = None,
+    limits: tuple[float, float] | None = None,
 ) -> Any:
     """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
 
@@ -84,8 +84,8 @@ def parameter(
     depends on other fields, and is checked by the class. `between`: the range of a class that is not in `RANGES`, such
     as one's own; it joins them.
     """
-    if between is not None:
-        RANGES[name] = between
+    if limits is not None:
+        RANGES[name] = limits
 
     def convert(value: Any) -> Any:
         if (optional and value is None) or is_placeholder(value):

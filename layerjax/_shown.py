@@ -23,9 +23,9 @@ CALLED_HERE = {"roughness": "alpha", "eta": "ior", "n": "ior", "kappa": "k", "de
 class Shown(eqx.Module):
     """A module that is shown as the call that makes it, and whose arguments are named where one is unknown."""
 
-    def __new__(cls, *_: Any, **given: Any) -> Self:
-        known = [] if not given else [*inspect.signature(cls.__init__).parameters][1:]
-        for name in given:
+    def __new__(cls, *_: Any, **fields: Any) -> Self:
+        known = [] if not fields else [*inspect.signature(cls.__init__).parameters][1:]
+        for name in fields:
             if name not in known:
                 meant = CALLED_HERE.get(name)
                 hint = f" ({meant}?)" if meant in known else ""

@@ -70,8 +70,8 @@ def filter_jit(function: Callable[P, T]) -> Callable[P, T]:
 
     @cache
     def outermost() -> Callable[P, T]:
-        given: dict[str, Any] = {"compiler_options": compiler_options() or None}
-        return eqx.filter_jit(function, **given)
+        settings: dict[str, Any] = {"compiler_options": compiler_options() or None}
+        return eqx.filter_jit(function, **settings)
 
     @wraps(function)
     def call(*arguments: P.args, **options: P.kwargs) -> T:

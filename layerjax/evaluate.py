@@ -98,7 +98,7 @@ def evaluate_known(
         )
     if isinstance(stack, Mixture):
         return _of_parts(stack).mean(
-            lambda part, own: evaluate_known(part, wi, wo, transport, side=side, key=own, known=known), key
+            lambda part, subkey: evaluate_known(part, wi, wo, transport, side=side, key=subkey, known=known), key
         )
     shape = _shape_of(stack)
     if shape:
@@ -216,7 +216,7 @@ def albedo(
     require_count("nodes", nodes, 1)
     (wi,) = read_directions(wi=wi)
     if isinstance(stack, Mixture):
-        return _of_parts(stack).mean(lambda part, own: albedo(part, wi, transport, nodes=nodes, key=own), key)
+        return _of_parts(stack).mean(lambda part, subkey: albedo(part, wi, transport, nodes=nodes, key=subkey), key)
     shape = _shape_of(stack)
     if shape:
         mapped, chosen, at = _mapped(stack, transport, shape, wi)
@@ -293,7 +293,9 @@ def _mixed_with_error(
     mixture: Mixture, wi: Array, wo: Array, transport: Any, side: Side, key: Array | None
 ) -> tuple[Array, Array]:
     """Standard errors of independent walks add in squares, numerical errors as they are."""
-    found = mixture.weighed(lambda part, own: evaluate_with_error(part, wi, wo, transport, side=side, key=own), key)
+    found = mixture.weighed(
+        lambda part, subkey: evaluate_with_error(part, wi, wo, transport, side=side, key=subkey), key
+    )
     values = sum(share * value for share, (value, _) in found)
     errors = jnp.stack(jnp.broadcast_arrays(*(share * error for share, (_, error) in found)))
     return values, jnp.linalg.norm(errors, axis=0) if _is_random(mixture, transport) else jnp.sum(errors, axis=0)
@@ -313,7 +315,7 @@ def _sample_mixture(mixture: Mixture, wi: Array, key: Array, transport: Any) -> 
     mixture = _of_parts(mixture) if shape else prepare(mixture, transport)
     wi = jnp.broadcast_to(wi, (*jnp.broadcast_shapes(shape, wi.shape[:-1]), 3))
     draws, choice, values = jax.random.split(key, 3)
-    found = mixture.weighed(lambda part, own: sample(part, wi, own, transport)[:2], draws)
+    found = mixture.weighed(lambda part, subkey: sample(part, wi, subkey, transport)[:2], draws)
     pick = jax.random.uniform(choice, wi.shape[:-1], wi.dtype)
     passed, (wo, own) = found[0]
     for share, (drawn, density) in found[1:]:

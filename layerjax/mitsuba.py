@@ -110,7 +110,7 @@ class Material:
     def value(self, light: Any, viewer: Any, place: Any) -> Any:
         """The BSDF in 1/sr without the cosine, a spectrum; place: what the key of a random transport is made of too."""
 
-        def found(numbers: Any, light: Any, viewer: Any, *place: Any) -> tuple[Array, ...]:
+        def values_of(numbers: Any, light: Any, viewer: Any, *place: Any) -> tuple[Array, ...]:
             key = _key(light, viewer, *place) if self.is_random else None
             if numbers:
                 values = evaluate(self.with_numbers(numbers), _rows(light), _rows(viewer), self.transport, key=key)
@@ -119,32 +119,32 @@ class Material:
             return self._by_colour(values)
 
         places = [place] if self.is_random and dr.width(place) else []
-        return mi.Spectrum(*_called(found, self._varying(), light, viewer, *places))
+        return mi.Spectrum(*_called(values_of, self._varying(), light, viewer, *places))
 
     def passing(self, wi: Any) -> Any:
         """Share of the light that passes without being scattered, a spectrum."""
 
-        def found(numbers: Any, wi: Any) -> tuple[Array, ...]:
+        def shares_of(numbers: Any, wi: Any) -> tuple[Array, ...]:
             return self._by_colour(unscattered(self.with_numbers(numbers), _rows(wi)))
 
-        return mi.Spectrum(*_called(found, self._varying(), wi))
+        return mi.Spectrum(*_called(shares_of, self._varying(), wi))
 
     def density(self, wi: Any, wo: Any) -> Any:
         """Density of `draw`, in 1/sr, without derivatives."""
 
-        def found(_: Any, wi: Any, wo: Any) -> tuple[Array, ...]:
+        def densities_of(_: Any, wi: Any, wo: Any) -> tuple[Array, ...]:
             return (pdf(self.prepared, _rows(wi), _rows(wo)),)
 
-        return _called(found, {}, dr.detach(wi), dr.detach(wo))[0]
+        return _called(densities_of, {}, dr.detach(wi), dr.detach(wo))[0]
 
     def draw(self, wi: Any, uniform: Any) -> tuple[Any, Any]:
         """Directions and their densities, without derivatives; uniform: numbers that the key is made of."""
 
-        def found(_: Any, wi: Any, uniform: Any) -> tuple[Array, ...]:
+        def draws_of(_: Any, wi: Any, uniform: Any) -> tuple[Array, ...]:
             wo, density, _ = sample(self.prepared, _rows(wi), _key(wi, uniform))
             return (*wo.T, density)
 
-        *wo, density = _called(found, {}, dr.detach(wi), dr.detach(uniform))
+        *wo, density = _called(draws_of, {}, dr.detach(wi), dr.detach(uniform))
         return mi.Vector3f(*wo), density
 
     def _varying(self) -> dict[str, Any]:

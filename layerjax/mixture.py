@@ -25,7 +25,7 @@ RANGES[WEIGHTS] = (0.0, 1.0)
 _PARTS = "Mixture.parts"
 
 SUM_SLACK = 1e-6
-"""By which the sum of weights may differ from 1, as files round them."""
+"""How far the sum of weights may be from 1: files round them."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _TAKEN = ("weights", "parts", "layers", "base", "scale", "noise")
@@ -143,10 +143,10 @@ def stacks_by_name(material: Stack | Mixture, prefix: str = "") -> dict[str, Sta
     """The stacks that a material is made of, by what names of their numbers begin with, such as ``coat.``."""
     if not isinstance(material, Mixture):
         return {prefix: material}
-    found: dict[str, Stack] = {}
+    stacks: dict[str, Stack] = {}
     for name, part in material.parts.items():
-        found |= stacks_by_name(part, f"{prefix}{name}.")
-    return found
+        stacks |= stacks_by_name(part, f"{prefix}{name}.")
+    return stacks
 
 
 def _by_name(parts: Mapping[str, Any], weights: Any) -> dict[str, Any]:

@@ -135,12 +135,12 @@ def _meant(transport: object) -> str:
     return f"; {named.__name__}() is one" if isinstance(named, type) and issubclass(named, Transport) else ""
 
 
-def _finest(found: Sequence[AddingDoubling]) -> AddingDoubling:
+def _finest(transports: Sequence[AddingDoubling]) -> AddingDoubling:
     """As fine in each dimension as the finest of them."""
-    cosines = [one.ordinates or (0, 0) for one in found]
+    cosines = [one.ordinates or (0, 0) for one in transports]
     return replace(
-        found[0],
-        nodes=max(one.nodes or 0 for one in found),
-        modes=max(one.modes or 0 for one in found),
+        transports[0],
+        nodes=max(one.nodes or 0 for one in transports),
+        modes=max(one.modes or 0 for one in transports),
         ordinates=(max(first for first, _ in cosines), max(second for _, second in cosines)),
     )

@@ -37,13 +37,13 @@ class Interface(Shown):
     ior          eta    [0.25, 4]          index of what lies below, relative to what surrounds the stack
     alpha        alpha  [1e-4, 1]          width of the normals; for ``"vmf"`` [1e-4, 15], with kappa = 2 / alpha^2
     distribution D      "ggx" or   "ggx"   of the normals: GGX, or von Mises-Fisher (carried by `ENDF`, and, with
-                        "vmf"              ``microfacets="single"``, `AddingDoubling`, `RandomWalk`)
+                        "vmf"              ``facet_multiple_scattering=False``, `AddingDoubling`, `RandomWalk`)
     ============ ====== ========== ======= ==========================================================================
 
     Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1 + 1e-9
     and alpha 0.3 a passage at 75 degrees loses 20 %, and a base that is lit and seen at 75 degrees is 36 % darker.
-    Transports with ``microfacets="multiple"`` carry on what facets block; where the index does not change, omit the
-    interface (one of exactly the index above it is omitted automatically).
+    Transports with ``facet_multiple_scattering=True`` carry on what facets block; where the index does not change, omit
+    the interface (one of exactly the index above it is omitted automatically).
     """
 
     ior: Parameter = parameter("Interface.ior")

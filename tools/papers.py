@@ -93,7 +93,7 @@ PAPERS = (
         2016,
         "Heitz, Hanika, d'Eon & Dachsbacher 2016, *Multiple-Scattering Microfacet BSDFs with the Smith Model*",
         ("microsurface/*", "transport/random_walk/*", "precompute/microsurface*"),
-        'Interfaces and conductors with `microfacets="multiple"`.',
+        "Interfaces and conductors with `facet_multiple_scattering=True`.",
     ),
 )
 """In the order of the page."""

@@ -43,9 +43,9 @@ TEXT = """\
 
 {environment}
 `Statistical(symmetric=False)` and, in brackets, the symmetric model, with their other options as they are by default,
-beside `RandomWalk(microfacets="multiple")` with {paths:,} paths an angle. *Estimate* is what the corrected 2018 model
-has been found to reach by others (with noise of 0.02 to 0.03 in its total variation); a star marks what is beyond it by
-more than 0.5 % and 0.02.
+beside `RandomWalk(facet_multiple_scattering=True)` with {paths:,} paths an angle. *Estimate* is what the corrected
+2018 model has been found to reach by others (with noise of 0.02 to 0.03 in its total variation); a star marks what is
+beyond it by more than 0.5 % and 0.02.
 
 ## Albedo and shape
 
@@ -135,7 +135,7 @@ def compare(case: Case, paths: int, key: jax.Array) -> list[Row]:
     angles = ANGLES[: len(case.variation)]
     wi = jnp.asarray(lj.direction(np.radians(angles), np.zeros(len(angles))))
     seen = lj.goniophotometer(
-        case.stack, wi, key=key, paths=paths, polar=RINGS, azimuth=SECTORS, orders=2, microfacets="multiple"
+        case.stack, wi, key=key, paths=paths, polar=RINGS, azimuth=SECTORS, orders=2, facet_multiple_scattering=True
     )
     energy, error, albedo, noise, once = (
         np.asarray(value)[:, 0, ..., 0]
@@ -179,7 +179,14 @@ def below_errors(paths: int) -> NDArray[np.float64]:
     for number, (coat, metal, alpha) in enumerate(itertools.product(COATS, METALS, WIDTHS)):
         stack = lj.Stack([lj.Interface(*coat)], lj.Conductor(*metal, alpha))
         seen = lj.goniophotometer(
-            stack, wi, key=jax.random.key(number), paths=paths, polar=1, azimuth=1, orders=2, microfacets="multiple"
+            stack,
+            wi,
+            key=jax.random.key(number),
+            paths=paths,
+            polar=1,
+            azimuth=1,
+            orders=2,
+            facet_multiple_scattering=True,
         )
         below = np.asarray(seen.albedo[:, 0, 0] - seen.orders[:, 0, 0, 0])
         errors.append([100 * (_lobe_energies(stack, ANGLES, own)[1] / below - 1) for own in (False, True)])
@@ -254,7 +261,7 @@ def _energies(rows: Sequence[Row]) -> str:
 
 def _lobe_energies(stack: lj.Stack, angles: Sequence[float], own_side: bool = False) -> NDArray[np.float64]:
     """Energies of the model's lobes, (lobes, angles)."""
-    options = Options(FORWARD.microfacets, FORWARD.scattering, FORWARD.angles, own_side)
+    options = Options(FORWARD.facet_multiple_scattering, FORWARD.scattering, FORWARD.angles, own_side)
     found = statistics(stack, jnp.cos(jnp.radians(jnp.asarray(angles))), options)
     return np.stack([entry.lobe.energy[0][0] for entry in found.reflected])
 

@@ -6,5 +6,4 @@ more than one facet; `energy_tables` reads them off `splines`; `heitz_walk` is t
 facet at a time.
 """
 
-from layerjax.microsurface.directional_albedo import Microfacets as Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies as interface_energies

@@ -1,10 +1,11 @@
 """Directional energies of rough GGX interfaces: what a surface reflects and transmits of light from one direction.
 
-``microfacets="single"`` is one event with separable Smith masking (Walter et al. 2007), by quadrature over the facets
-that are seen. ``"multiple"`` is the walk on the microsurface of Heitz et al. 2016 ("Multiple-scattering microfacet
-BSDFs with the Smith model"): its first event by quadrature, with height-correlated masking, and of what that leaves on
-the surface the share that returns, a smooth function fitted to walks (`layerjax.precompute.microsurface`). Of
-conductors there are the parts: `reflecting` facets, and `first_mirror` for `conductor_multiple_reflectance` to go on.
+Without multiple scattering between facets ("single") this is one event with separable Smith masking (Walter et al.
+2007), by quadrature over the visible facets. With it ("multiple") it is the walk on the microsurface of Heitz et al.
+2016 ("Multiple-scattering microfacet BSDFs with the Smith model"): its first event by quadrature, with height-
+correlated masking, and of what that leaves on the surface the share that returns, a smooth function fitted to walks
+(`layerjax.precompute.microsurface`). Of conductors there are the parts: `reflecting` facets, and `first_mirror` for
+`conductor_multiple_reflectance` to go on.
 
 Cosines are those of incidence, in (0, 1]; alpha is in [1e-4, 1]; all arguments broadcast. `points` is the number of
 points from pole to rim of the cap of visible facets, for each of its parts. Absolute errors, largest and rms:
@@ -27,7 +28,7 @@ reflect totally (there by 0.01 if "single").
 """
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,8 +50,6 @@ from layerjax.microsurface.visible_facets import (
     refracting,
 )
 
-Microfacets = Literal["single", "multiple"]
-
 POINTS = 12
 
 SMOOTH = 1e-4
@@ -62,19 +61,19 @@ def is_smooth(alpha: Any) -> bool:
     return not isinstance(alpha, jax.core.Tracer) and bool(np.all(np.asarray(alpha) <= SMOOTH))
 
 
-@partial(jax.jit, static_argnames=("microfacets", "points"))
+@partial(jax.jit, static_argnames=("multiple", "points"))
 def interface_energies(
-    cosine: ArrayLike, alpha: ArrayLike, ior: ArrayLike, microfacets: Microfacets, *, points: int = POINTS
+    cosine: ArrayLike, alpha: ArrayLike, ior: ArrayLike, multiple: bool, *, points: int = POINTS
 ) -> tuple[Array, Array]:
     """Reflectance and transmittance of a rough dielectric interface.
 
     Args:
         cosine, alpha: see above.
         ior: index on the far side over that on the side of incidence, in [0.25, 4].
-        microfacets: ``"single"``, where R + T < 1, or ``"multiple"``, where R + T = 1.
+        multiple: whether light that a facet sends into another is followed: R + T = 1; else R + T < 1.
     """
     cosine, alpha, ior = _arrays(cosine, alpha, ior)
-    if microfacets == "single":
+    if not multiple:
         cap = make_cap(cosine, alpha)
         return _reflected(cap, ior, points), _passing(cap, ior, points)[1]
     first, reflected_on, refracted_on = first_event(cosine, alpha, ior, points=points)

@@ -11,7 +11,7 @@ beside the quadratures at random points, half of them in the layers where energi
 quantity                            rms, largest
 =================================== ================
 mirrors                             1e-4, 6e-4
-retained light                      1.5e-3, 1.2e-2
+share within a cone                 1.5e-3, 1.2e-2
 interfaces, "single"                2e-3, 3e-2
 interfaces, "multiple", alpha > .01 2e-3, 3e-2
 conductors, "single", k > 0.3       1e-3, 7e-3
@@ -34,7 +34,6 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import at_least, at_most, safe_sqrt
 from layerjax.channels import Channels, each
-from layerjax.microsurface.directional_albedo import Microfacets
 from layerjax.microsurface.splines import read
 from layerjax.tables import load
 
@@ -90,15 +89,15 @@ MIRROR = Warp((0.0, 1.0), 0.0)
 RETAINED = Warp((0.0, 0.5), 0.0)
 
 
-def interface_energies(cosine: Array, alpha: Array, ior: Array, microfacets: Microfacets) -> tuple[Array, Array]:
+def interface_energies(cosine: Array, alpha: Array, ior: Array, multiple: bool) -> tuple[Array, Array]:
     """Reflectance and transmittance of a rough interface.
 
     Args:
         ior: index on the far side over that on the side of incidence.
-        microfacets: ``"single"``, where light that a facet sends into another is lost (Walter 2007), or ``"multiple"``,
-            where the two add up to 1.
+        multiple: whether light that a facet sends into another is followed, where the two add up
+            to 1; else it is lost (Walter 2007).
     """
-    if microfacets == "multiple":
+    if multiple:
         reflected = _from_root(_dielectric(cosine, alpha, ior, 0, 1)[0])
         return reflected, 1.0 - reflected
     root, passed = _dielectric(cosine, alpha, ior, 1, 2)
@@ -116,14 +115,14 @@ def mirror_energy(cosine: Array, alpha: Array) -> Array:
     return at_most(_on_plane(cosine, alpha, "mirror", 1)[0], 1.0)
 
 
-def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, microfacets: Microfacets) -> Channels:
+def conductor_energies(cosine: Array, alpha: Array, ior: Channels, k: Channels, multiple: bool) -> Channels:
     """Reflectance of a rough conductor, by channels.
 
     Args:
         ior, k: over the index of the medium above.
-        microfacets: ``"single"``, or ``"multiple"``, where light loses its Fresnel share at every facet that it meets.
+        multiple: whether light is followed from facet to facet, and loses its Fresnel share at each.
     """
-    if microfacets == "single":
+    if not multiple:
         total, *facing = _on_plane(cosine, alpha, "mirror", 1 + len(SLICES))
         (levels,) = _means_of_facets(facing, (SLICES,), ior, k)
         return channels.times((at_most(total, 1.0),), levels)
@@ -169,7 +168,7 @@ def retained_share(cosine: Array, alpha: Array, ratio: Array) -> Array:
 
 
 def retained_places(cosine: Array, alpha: Array, critical: Array) -> tuple[Array, Array, Array]:
-    """Where directions, widths and critical cosines lie on the axes of the table of retained light.
+    """Where directions, widths and critical cosines lie on the axes of the table of `retained_share`.
 
     The cosine counts from the critical one, in what the width of the lobe is there, and extends beyond 1.
     """
@@ -229,8 +228,8 @@ def _means_of_facets(
     """Mean reflectance of facets by their cosines, by channels: of the first ones with the shares of the first set,
     of the next with those of the next; in a loop, that XLA compiles a facet once."""
 
-    def add(sums: list[Channels], given: tuple[Array, Array]) -> tuple[list[Channels], None]:
-        u, shares = given
+    def add(sums: list[Channels], tabulated: tuple[Array, Array]) -> tuple[list[Channels], None]:
+        u, shares = tabulated
         levels = each(lambda ior, k: fresnel.conductor(at_most(at_least(u, 0.0), 1.0), ior, k), ior, k)
         after = []
         for total, share in zip(sums, shares, strict=True):

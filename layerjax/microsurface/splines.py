@@ -117,8 +117,8 @@ def _summed(
         corner = corner + column_stride * jnp.arange(columns, dtype=corner.dtype).reshape(-1, *(1,) * corner.ndim)
     *outer, last = (offset for _, offset, _ in found)
 
-    def step(sums: list[Array], given: tuple[Array, ...]) -> tuple[list[Array], None]:
-        tap, basis, sloping = given
+    def step(sums: list[Array], along_axes: tuple[Array, ...]) -> tuple[list[Array], None]:
+        tap, basis, sloping = along_axes
         place = corner + sum(tap[axis] * strides[axis] for axis in range(len(outer)))
         row = [flat.at[place + k].get(mode="promise_in_bounds", wrap_negative_indices=False) for k in range(4)]
         along = _dot(weights(last), row)

@@ -132,9 +132,9 @@ def _estimate(
     shape = (cosine.shape[0], paths)
     cosine, alpha, ior, k = (jnp.broadcast_to(x[:, None], shape).astype(jnp.float32) for x in (cosine, alpha, ior, k))
     zero, up = jnp.zeros_like(cosine), jnp.zeros(shape, bool)
-    heights, walks = jax.random.split(key)
+    height_key, walk_key = jax.random.split(key)
     travel: Vector = (jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), zero, -cosine)
-    height = -jnp.log1p(-jax.random.uniform(heights, shape, jnp.float32)) * cosine / facing_area(travel, alpha)
+    height = -jnp.log1p(-jax.random.uniform(height_key, shape, jnp.float32)) * cosine / facing_area(travel, alpha)
 
     def goes_on(state: tuple[Any, ...]) -> Array:
         return (state[0] < FACETS) & (jnp.max(jnp.mean(state[3] * state[4], axis=1)) > ENOUGH)
@@ -142,7 +142,7 @@ def _estimate(
     def step(state: tuple[Any, ...]) -> tuple[Any, ...]:
         facet, travel, height, weight, level, ior, beyond, near, far = state
         begins = facet == 0
-        u = jax.random.uniform(jax.random.fold_in(walks, facet), (4, *shape), jnp.float32)
+        u = jax.random.uniform(jax.random.fold_in(walk_key, facet), (4, *shape), jnp.float32)
         wi = scale(-1.0, travel)
         m, c = meet_facet(wi, alpha, u[0], u[1])
         wo = reflect(wi, m)

@@ -6,13 +6,13 @@ from layerjax.transport.contract import Transport
 from layerjax.transport.single_scattering import SingleScattering
 
 
-def automatic(given: Stack, simplified: Stack) -> Transport:
+def automatic(stack: Stack, simplified: Stack) -> Transport:
     """The rule of ``transport="auto"``, see `layerjax.prepare`. What is traced counts as not known.
 
     An interface counts where it was given, though its index may be known to be that of what lies above it: a fit that
     passes through that index stays with one transport.
     """
-    if any(isinstance(layer, Interface) for layer in given.layers):
+    if any(isinstance(layer, Interface) for layer in stack.layers):
         return AddingDoubling()
     # of light that meets nothing twice one event is the whole; thin media do not count: a share of 1e-4 along the
     # normal is a hundredth at grazing angles

@@ -257,5 +257,5 @@ def refuse_vmf(stack: Stack, names: Sequence[str], transport: str) -> None:
         if isinstance(part, Interface | Conductor) and part.distribution == "vmf":
             raise ValueError(
                 f'{name}.distribution: {transport} carries no "vmf" normals; AddingDoubling and RandomWalk with '
-                'microfacets="single" do, and ENDF for metals, coated metals and slabs'
+                "facet_multiple_scattering=False do, and ENDF for metals, coated metals and slabs"
             )

@@ -16,7 +16,7 @@ from jax import Array
 from layerjax._numerics import at_most, horizon
 
 MOST_COSINES = 256
-"""With more distinct cosines on a side nothing is gained by knowing them."""
+"""Nothing is gained by knowing more distinct cosines than these on a side."""
 
 MOST_PAIRS = 20_000
 """Larger batches are not looked at."""

@@ -204,19 +204,19 @@ def choices(slab: Media, wi: Vector) -> list[tuple[Array, Any]]:
     wi = sanitised(wi, valid)
     depths = optical_depths(slab.media, wi)
     paths = _paths(depths, wi)
-    found: list[tuple[Array, Any]] = []
+    events: list[tuple[Array, Any]] = []
     for k in _scattering(slab):
         medium = slab.media[k]
         collides = mean(times(tuple(jnp.exp(-path) for path in paths[k]), tuple(map(one_minus_exp, depths[k]))))
         survives = 1.0 if is_known(medium.albedo, 1.0) else largest(per_channel(medium.albedo))
-        found.append((collides * survives, medium.phase))
+        events.append((collides * survives, medium.phase))
     if slab.base is not None:
         reached = jnp.ones_like(wi[2])
         for depth in depths:
             reached = reached * mean(tuple(jnp.exp(-d) for d in depth))
-        found.append((reached, slab.base))
-    total = sum((weight for weight, _ in found), jnp.zeros_like(wi[2]))
-    return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in found]
+        events.append((reached, slab.base))
+    total = sum((weight for weight, _ in events), jnp.zeros_like(wi[2]))
+    return [(jnp.where(valid, safe_div(weight, total), 0.0), lobe) for weight, lobe in events]
 
 
 def draw(choices: list[tuple[Array, Any]], wi: Vector, uniforms: tuple[Array, Array, Array]) -> Vector:

@@ -11,11 +11,11 @@ from layerjax.microsurface.multiple_bounces import conductor_multiple_reflectanc
 from layerjax.microsurface.visible_facets import make_cap
 
 
-@partial(jax.jit, static_argnames=("microfacets", "points"))
-def conductor_energy(cosine, alpha, ior, k, microfacets, *, points=POINTS):
+@partial(jax.jit, static_argnames=("multiple", "points"))
+def conductor_energy(cosine, alpha, ior, k, multiple, *, points=POINTS):
     """Reflectance, with the arguments of `layerjax.microsurface.energy_tables.conductor_energies`, of one channel."""
     cosine, alpha, ior, k = jnp.broadcast_arrays(*map(jnp.asarray, (cosine, alpha, ior, k)))
-    if microfacets == "single":
+    if not multiple:
         upper = reflecting(make_cap(cosine, alpha), points)
         reflectance = fresnel.conductor(upper.facing, ior[..., None, None], k[..., None, None])
         return upper.mean(reflectance * masking(upper.reflected(), upper.alpha))

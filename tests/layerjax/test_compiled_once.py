@@ -42,7 +42,7 @@ TRANSPORTS = {
     "endf": lj.ENDF(),
     "weidlich wilkie": lj.WeidlichWilkie(),
     "adding": lj.AddingDoubling(**RESOLUTION),
-    "adding multiple": lj.AddingDoubling(**RESOLUTION, microfacets="multiple"),
+    "adding multiple": lj.AddingDoubling(**RESOLUTION, facet_multiple_scattering=True),
     "walk": lj.RandomWalk(paths=64),
     "auto": "auto",
 }

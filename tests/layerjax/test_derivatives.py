@@ -31,10 +31,10 @@ TRANSPORTS = {
     "WeidlichWilkie": lj.WeidlichWilkie(),
     "ENDF": lj.ENDF(),
     "AddingDoubling": SOLVER,
-    "AddingDoubling, multiple": lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6), microfacets="multiple"),
+    "AddingDoubling, multiple": lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6), facet_multiple_scattering=True),
     "Statistical": lj.Statistical(),
     "Statistical, forward": lj.Statistical(symmetric=False),
-    "Statistical, single": lj.Statistical(microfacets="single"),
+    "Statistical, single": lj.Statistical(facet_multiple_scattering=False),
 }
 SINGLE = 1e-2
 """Share of a slope that single precision may be off by, beside the rounding of values."""

@@ -30,12 +30,15 @@ CASES = {
     "WeidlichWilkie": (lj.WeidlichWilkie(), ("varnish", "coated metal", "dyed varnish", "two coats on paint")),
     "ENDF": (lj.ENDF(), ("face", "coated metal", "coated metal, vmf", "slab, vmf")),
     "Statistical": (lj.Statistical(), ("haze over metal", "varnish", "coated metal", "hazy varnish", "plate")),
-    "Statistical, single": (lj.Statistical(microfacets="single"), ("varnish",)),
+    "Statistical, single": (lj.Statistical(facet_multiple_scattering=False), ("varnish",)),
     "AddingDoubling": (
         lj.AddingDoubling(nodes=6, modes=6, ordinates=(4, 6)),
         ("haze over paint", "flakes over rough paint", "varnish, vmf", "hazy coat on metal", "clear plate"),
     ),
-    "AddingDoubling, multiple": (lj.AddingDoubling(nodes=6, modes=6, microfacets="multiple"), ("coated metal",)),
+    "AddingDoubling, multiple": (
+        lj.AddingDoubling(nodes=6, modes=6, facet_multiple_scattering=True),
+        ("coated metal",),
+    ),
 }
 
 

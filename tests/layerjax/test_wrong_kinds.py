@@ -33,8 +33,8 @@ FUNCTIONS = {
         "polar": 1,
         "azimuth": 1,
         "orders": 2,
-        "lanes": 64,
-        "microfacets": "single",
+        "batch_size": 64,
+        "facet_multiple_scattering": False,
     },
 }
 
@@ -50,9 +50,9 @@ CLASSES = {
     "OrenNayar": {"albedo": 0.5, "roughness": 0.3},
     "VMFDiffuse": {"albedo": 0.5, "roughness": 0.3},
     "Conductor": {"ior": 0.2, "k": 3.0, "alpha": 0.1, "distribution": "ggx"},
-    "AddingDoubling": {"nodes": 8, "modes": 4, "microfacets": "single", "tolerance": 1e-3},
+    "AddingDoubling": {"nodes": 8, "modes": 4, "facet_multiple_scattering": False, "tolerance": 1e-3},
     "ENDF": {"bounces": 1},
-    "RandomWalk": {"paths": 64, "orders": "all", "microfacets": "single", "lanes": 64},
+    "RandomWalk": {"paths": 64, "orders": "all", "facet_multiple_scattering": False, "batch_size": 64},
     "Statistical": {"symmetric": True},
     "SingleScattering": {},
     "SpongeCake": {},

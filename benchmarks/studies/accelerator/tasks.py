@@ -35,7 +35,7 @@ KNOWN = {
         *MATERIALS,
         Material("hazy varnish on metal", _VARNISH, _varnish, lj.AddingDoubling()),
         Material("hazy varnish on metal, coarse", _VARNISH, _varnish, lj.AddingDoubling(nodes=6, modes=8)),
-        Material("hazy varnish on metal, walked", _VARNISH, _varnish, lj.RandomWalk(paths=1024, lanes=2**18)),
+        Material("hazy varnish on metal, walked", _VARNISH, _varnish, lj.RandomWalk(paths=1024, batch_size=2**18)),
     )
 }
 

@@ -36,8 +36,8 @@ class Model:
 MODELS = (
     Model("single scattering", {"first order": lj.SingleScattering()}),
     Model("SpongeCake", {"two lobes": lj.SpongeCake()}),
-    Model("statistics, forward", {"2018": lj.Statistical(symmetric=False, microfacets="single")}),
-    Model("statistics, symmetric", {"2018": lj.Statistical(microfacets="single")}),
+    Model("statistics, forward", {"2018": lj.Statistical(symmetric=False, facet_multiple_scattering=False)}),
+    Model("statistics, symmetric", {"2018": lj.Statistical(facet_multiple_scattering=False)}),
     Model("ENDF, paper", {"one bounce": lj.ENDF(form="paper")}),
     Model("ENDF, reciprocal", {"one bounce": lj.ENDF()}),
     Model("Weidlich & Wilkie", {"one half vector": lj.WeidlichWilkie()}),

@@ -112,7 +112,7 @@ def gains(work: Path, count: int, epochs: int, report: Callable[[str], None]) ->
     none = Parts(False, False, False, False)
     steps = {
         "as in the paper: one weight for both sides": (none, ENERGY),
-        "reflection and transmission apart": (none._replace(apart=True), ENERGY),
+        "reflection and transmission apart": (none._replace(by_side=True), ENERGY),
         "and blurred": (Parts(rim=False, slopes=False), ENERGY),
         "and with a Schlick term": (Parts(slopes=False), ENERGY),
         "and with slopes: as it ships": (Parts(), ENERGY),

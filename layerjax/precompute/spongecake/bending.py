@@ -131,7 +131,7 @@ def _root(net: eqx.nn.MLP, bent: Bent) -> Array:
 
 @eqx.filter_jit
 def _balances(
-    kinds: tuple[str, ...], nets: Mapping[int, eqx.nn.MLP], given: dict[str, Array]
+    kinds: tuple[str, ...], nets: Mapping[int, eqx.nn.MLP], materials: dict[str, Array]
 ) -> tuple[Array, Array, Array]:
     """Directions, energies and log c of n materials: (n, d, 3), (n, d), (n, d)."""
 
@@ -139,7 +139,7 @@ def _balances(
         found = balance(tuple(media_of(stack_of(kinds, True, numbers))), nets, RULE)
         return jnp.stack(found.wi, axis=-1), found.energy, found.log
 
-    return jax.lax.map(one, given)
+    return jax.lax.map(one, materials)
 
 
 def _path(folder: Path, media: int, seed: int, number: int) -> Path:

@@ -47,12 +47,12 @@ SPREAD = 0.2
 
 
 class Parts(NamedTuple):
-    """What the second lobe has beyond the paper's: to measure the gain of each. `apart`: weights of the two sides."""
+    """What the second lobe has beyond the paper's: to measure the gain of each. `by_side`: weights of the two sides."""
 
     blur: bool = True
     rim: bool = True
     slopes: bool = True
-    apart: bool = True
+    by_side: bool = True
 
 
 ALL_PARTS = Parts()
@@ -129,7 +129,7 @@ def predict(
         weights = weights._replace(lobes=weights.lobes * jnp.asarray([1.0, 0.0]))
     if not parts.slopes:
         weights = weights._replace(slopes=jnp.zeros_like(weights.slopes), rims=jnp.zeros_like(weights.rims))
-    if not parts.apart:  # those of reflection above for all
+    if not parts.by_side:  # those of reflection above for all
         weights = Weights(*(jnp.broadcast_to(part[:1], part.shape) for part in weights))
     slab = _slab(media, shape.alpha, shape.thickness, shape.blur, jnp.ones_like(media.albedo), None)
     second = SecondLobe(slab, jax.tree.map(lambda part: part[None], weights))

@@ -78,7 +78,7 @@ def half_space(width: float, nodes: int = 40, modes: int = 1, cosines: tuple[flo
     dt = np.tile(last / PANELS * dt, PANELS)
     norm = 0.5 if k < 1e-12 else k / -np.expm1(-2.0 * k)
     density = norm * np.exp(-2.0 * k * np.sin(0.5 * t) ** 2) * np.sin(t) * dt  # azimuth integrated
-    seen, hidden = _seen(u, t, modes), _seen(-u, t, modes)
+    seen, hidden = _facing_means(u, t, modes), _facing_means(-u, t, modes)
     sign = (-1.0) ** np.arange(modes)[:, None, None]
     weighted = density / np.pi * seen
     return HalfSpace(
@@ -92,7 +92,7 @@ def half_space(width: float, nodes: int = 40, modes: int = 1, cosines: tuple[flo
     )
 
 
-def _seen(cosine: np.ndarray, tilt: np.ndarray, modes: int) -> np.ndarray:
+def _facing_means(cosine: np.ndarray, tilt: np.ndarray, modes: int) -> np.ndarray:
     """Means (mode, cosine, tilt) over the azimuth of max(w.m, 0) cos(m phi), in closed form."""
     along = cosine[:, None] * np.cos(tilt)
     across = np.sqrt((1.0 - cosine) * (1.0 + cosine))[:, None] * np.sin(tilt)

@@ -32,7 +32,7 @@ class Areas(NamedTuple):
     """Projected areas of the flakes for a direction above: sigma(w), sigma(-w), and the mean of both."""
 
     ahead: Array
-    behind: Array
+    facing_away: Array
     mean: Array
 
 
@@ -61,12 +61,12 @@ def areas(w: Vector, k: Array) -> Areas:
         w: components of any shape.
         k: concentration in [0, 1e17], shape ().
     """
-    behind = _behind(w[2], safe_sqrt(w[0] * w[0] + w[1] * w[1]), k)
+    facing_away = _facing_away(w[2], safe_sqrt(w[0] * w[0] + w[1] * w[1]), k)
     step = resultant(k)[0] * w[2]  # sigma(w) - sigma(-w) = B(k) w_z, B = coth(k) - 1/k
-    return Areas(behind + step, behind, behind + 0.5 * step)
+    return Areas(facing_away + step, facing_away, facing_away + 0.5 * step)
 
 
-def _behind(cosine: Array, sine: Array, k: Array) -> Array:
+def _facing_away(cosine: Array, sine: Array, k: Array) -> Array:
     """sigma(-w): the flakes at an elevation t above the plane that -w is normal to, ring by ring."""
     dtype = jnp.result_type(cosine, k)
     x, weight = (jnp.asarray(a, dtype) for a in gauss_legendre(20 if jnp.finfo(dtype).bits == 64 else 16))

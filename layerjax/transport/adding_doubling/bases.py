@@ -9,7 +9,6 @@ from layerjax import fresnel
 from layerjax._numerics import at_least, safe_div
 from layerjax.channels import per_channel, pick
 from layerjax.directions import Vector, reflect
-from layerjax.microsurface import Microfacets
 from layerjax.surfaces import Conductor, Surface
 from layerjax.transport.adding_doubling.facet_light import ENERGY_POINTS, Normals, of_facets, seen_share
 from layerjax.transport.adding_doubling.grid import Region
@@ -17,16 +16,16 @@ from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import modes_at_nodes, projected_weight, scaled_to_energy
 
 
-def base_layer(region: Region, base: Surface, modes: int, microfacets: Microfacets) -> Layer:
+def base_layer(region: Region, base: Surface, modes: int, multiple: bool) -> Layer:
     """An opaque base under a region, as Fourier modes."""
     weight = projected_weight(region)
     kernels = modes_at_nodes(base.evaluate, region, region, modes)
     if isinstance(base, Conductor):
-        return Layer(_conductor(region, base, kernels, microfacets))
+        return Layer(_conductor(region, base, kernels, multiple))
     return Layer(Parts(jnp.stack(kernels) * weight[:, None]))
 
 
-def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microfacets: Microfacets) -> Parts:
+def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], multiple: bool) -> Parts:
     normals = Normals(base.alpha, base.distribution)
 
     def seen_by(m: Vector, facing: Array, weight: Array, wi: Vector) -> tuple[Array, Array]:
@@ -38,7 +37,7 @@ def _conductor(region: Region, base: Conductor, kernels: Sequence[Array], microf
     for c, kernel in enumerate(kernels):
         energy = jnp.sum(seen * fresnel.conductor(cosine, pick(ior, c), pick(k, c)), axis=-1)
         operators.append(scaled_to_energy(region, kernel, energy))
-        if microfacets == "multiple":
+        if multiple:
             gain = _coloured_return(energy, jnp.sum(seen, axis=-1), region.weight)
             given.append(jnp.zeros_like(operators[-1]).at[0].set(gain))
     return Parts(jnp.stack(operators), jnp.stack(given) if given else None)

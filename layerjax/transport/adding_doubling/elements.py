@@ -165,31 +165,31 @@ def _linear_jvp(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return value, _combined(slopes, tangents[2])
 
 
-def _by_itself(function: Callable[[Array], Any], scalars: Scalars, given: Array) -> Any:
+def _by_itself(function: Callable[[Array], Any], scalars: Scalars, argument: Array) -> Any:
     """function(given), formed once: XLA would form what it finds again for every element of whatever uses it.
 
     Barriers are gone by the time that XLA fuses on a processor; what branches give is not fused with anything.
     """
-    shapes = jax.eval_shape(function, given)
+    shapes = jax.eval_shape(function, argument)
 
     def nothing(_: Array) -> Any:
         return jax.tree.map(lambda leaf: jnp.full(leaf.shape, jnp.nan, leaf.dtype), shapes)
 
-    return jax.lax.cond(_are_numbers(scalars), function, nothing, given)
+    return jax.lax.cond(_are_numbers(scalars), function, nothing, argument)
 
 
 def _are_numbers(scalars: Scalars) -> Array:
     return reduce(jnp.logical_and, (scalar == scalar for scalar in scalars), jnp.asarray(True))
 
 
-def _tied(found: Any, scalars: Scalars) -> Any:
+def _tied(arrays: Any, scalars: Scalars) -> Any:
     """What was found, all of it a function of the scalars in form, at no cost.
 
     Under `vmap` an output of a custom derivative that does not depend on them would have no batch as a value and one
     as soon as it is differentiated, and programs that are batched before that are then given the wrong shape.
     """
     is_number = _are_numbers(scalars)
-    return jax.tree.map(lambda leaf: jnp.where(is_number, leaf, leaf), found)
+    return jax.tree.map(lambda leaf: jnp.where(is_number, leaf, leaf), arrays)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

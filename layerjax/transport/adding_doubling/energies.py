@@ -14,7 +14,6 @@ from jax import Array
 from layerjax._numerics import at_least, at_most, horizon, not_negative
 from layerjax.channels import Channels, each, select, times, total
 from layerjax.directions import Vector, flip
-from layerjax.microsurface import Microfacets
 from layerjax.stack import Interface, Stack
 from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, Parts
@@ -76,7 +75,7 @@ def _share(part: Array, whole: Array, weight: Array) -> Array:
 
 
 def directional_albedo(
-    first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int, microfacets: Microfacets
+    first: FirstOrder, shares: list[Channels], wi: Vector, nodes: int, multiple: bool
 ) -> tuple[Channels, Channels]:
     """Energy that leaves on wi's side and on the other; shares: the three of `node_shares` along wi."""
     single = SingleScattering()
@@ -88,7 +87,7 @@ def directional_albedo(
         lambda once, lost, out: at_most(at_least(lost * out, 0.0), at_least(1.0 - once, 0.0)), once, lost, shares[0]
     )
     inside = each(lambda once, stays: at_least(1.0 - once - stays, 0.0), once, stays)
-    parts = [once, times(inside, near)] + ([stays] if microfacets == "multiple" else [])  # else masking absorbs it
+    parts = [once, times(inside, near)] + ([stays] if multiple else [])  # else masking absorbs it
     visible = jnp.abs(wi[2]) > horizon(wi[2].dtype)
     if first.lower is None:
         visible = visible & (wi[2] > 0)
@@ -110,7 +109,7 @@ def _lost(media: Media, w: Vector, reflected: Array, nodes: int) -> Array:
 def none_negative(near: Channels, far: Channels) -> tuple[Channels, Channels]:
     """Two energies, none below 0: what interpolation takes one below it is the other's, and their sum is kept."""
 
-    def kept(one: Array, other: Array) -> Array:
+    def balanced(one: Array, other: Array) -> Array:
         return not_negative(not_negative(one) + (other - not_negative(other)))
 
-    return each(kept, near, far), each(kept, far, near)
+    return each(balanced, near, far), each(balanced, far, near)

@@ -70,7 +70,7 @@ def of_facets(
     """function(m, m . wi, weights, wi) of the normals seen from the nodes, (nodes, points); see `seen_facets`."""
     alpha, kind = jnp.asarray(normals.alpha, region.cosine.dtype), normals.distribution
 
-    def seen(rows: tuple[Array, ...]) -> Any:
+    def of_nodes(rows: tuple[Array, ...]) -> Any:
         cosine, sine, *at = rows
         wi: Vector = (-sine[:, None], jnp.zeros_like(sine[:, None]), cosine[:, None])
         return function(*seen_facets(cosine, sine, Parallels(*at), alpha, kind, points[1]), wi)
@@ -78,7 +78,7 @@ def of_facets(
     polar = polar_angles(region.cosine, region.sine, alpha, kind, ratio, way, points[0])
     # outside of the loop: kept in memory, not computed again for each of the facets' numbers
     at = parallels(region.cosine, region.sine, polar, alpha, kind, ratio, way)
-    return by_rows(seen, (region.cosine, region.sine, *at))
+    return by_rows(of_nodes, (region.cosine, region.sine, *at))
 
 
 def _through(

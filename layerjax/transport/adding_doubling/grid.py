@@ -67,7 +67,7 @@ class Grid(eqx.Module):
     """Nodes of all panels in s, and the regions from top to bottom."""
 
     edges: Array
-    apart: Array
+    least_width: Array
     regions: tuple[Region, ...]
     nodes: int = eqx.field(static=True)
 
@@ -81,13 +81,13 @@ class Grid(eqx.Module):
         """Number of nodes of all panels."""
         return self.edges.shape[0] * self.nodes
 
-    def bounds(self, panel: Array | np.ndarray, own: Array) -> tuple[Array, Array]:
+    def bounds(self, panel: Array | np.ndarray, squared_index: Array) -> tuple[Array, Array]:
         """Lower and upper end in s^2 of panels, in regions of index squared `own`.
 
         A panel that regions share ends for each of them where its own directions do.
         """
         low, high = jnp.concatenate([jnp.zeros(1, self.edges.dtype), self.edges[:-1]])[panel], self.edges[panel]
-        return low, jnp.where(jnp.abs(high - own) < self.apart, own, high)
+        return low, jnp.where(jnp.abs(high - squared_index) < self.least_width, squared_index, high)
 
     @property
     def panels(self) -> np.ndarray:
@@ -115,8 +115,8 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     else:
         edges = jnp.stack([squares[ranks.index(rank)] for rank in range(max(ranks) + 1)])
     x, w = (jnp.asarray(array, dtype) for array in gauss_legendre(nodes))
-    apart = (MERGED * x[0]) ** 2
-    grid = Grid(_merged(edges, apart), apart, (), nodes)
+    least_width = (MERGED * x[0]) ** 2
+    grid = Grid(_merged(edges, least_width), least_width, (), nodes)
     x2 = (x * x)[None]
     regions = []
     for n2 in squares:
@@ -132,7 +132,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
     return eqx.tree_at(lambda g: g.regions, grid, tuple(regions))
 
 
-def _merged(edges: Array, apart: Array) -> Array:
+def _merged(edges: Array, least_width: Array) -> Array:
     """The edges, each moved up to the next one if that is nearer than `apart`.
 
     Between indices that nearly agree a panel of its own would hold no node that counts, and the values would change
@@ -140,7 +140,7 @@ def _merged(edges: Array, apart: Array) -> Array:
     """
     merged = [edges[-1]]
     for k in range(edges.shape[0] - 2, -1, -1):
-        merged.insert(0, jnp.where(merged[0] - edges[k] < apart, merged[0], edges[k]))
+        merged.insert(0, jnp.where(merged[0] - edges[k] < least_width, merged[0], edges[k]))
     return jnp.stack(merged)
 
 
@@ -157,44 +157,46 @@ def spread(grid: Grid, ior: Array, cosine: Array, sine2: Array, blur: Array) -> 
         sine2: their sin(theta)^2.
         blur: half the width in s^2 of what is around each edge, of the order of the distance between directions.
     """
-    own = ior * ior
-    squared = own * sine2
+    squared_index = ior * ior
+    squared = squared_index * sine2
     reached = [jnp.ones_like(squared)]
     placed = []
-    below = jnp.zeros_like(own)
+    below = jnp.zeros_like(squared_index)
     for k in range(grid.edges.shape[0]):
-        low, high = grid.bounds(np.asarray(k), own)
+        low, high = grid.bounds(np.asarray(k), squared_index)
         width = jnp.where(high > low, high - low, 1.0)
-        above = _around(grid, own, k, blur)
-        x2 = ((high - own) + own * cosine * cosine) / width
+        above = _around(grid, squared_index, k, blur)
+        x2 = ((high - squared_index) + squared_index * cosine * cosine) / width
         x = _coordinate_between(x2, (squared - low) / width, below / width, above / width)
-        reached.append(_step(squared - grid.edges[k], above, grid.edges[k] < own - grid.apart))
+        reached.append(_step(squared - grid.edges[k], above, grid.edges[k] < squared_index - grid.least_width))
         share = jnp.where(high > low, reached[-2] - reached[-1], 0.0)
         placed.append(share[..., None] * lagrange(x, grid.nodes))
         below = above
     return jnp.concatenate(placed, axis=-1)
 
 
-def _around(grid: Grid, own: Array, k: int, blur: Array) -> Array:
+def _around(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
     """Half the width of what is around the upper edge of a panel; 0 where there is none in the region."""
     if k + 1 == grid.edges.shape[0]:
-        return jnp.zeros_like(own)
-    edge, after, before = grid.edges[k], own, jnp.zeros_like(own)
+        return jnp.zeros_like(squared_index)
+    edge, after, before = grid.edges[k], squared_index, jnp.zeros_like(squared_index)
     for other in range(grid.edges.shape[0] - 2, k, -1):  # panels of equal indices have no extent
-        after = jnp.where((edge < grid.edges[other]) & (grid.edges[other] < own), grid.edges[other], after)
+        after = jnp.where((edge < grid.edges[other]) & (grid.edges[other] < squared_index), grid.edges[other], after)
     for other in range(k):
         before = jnp.where(grid.edges[other] < edge, grid.edges[other], before)
     return jnp.where(
-        edge < own - grid.apart, at_most(at_most(blur[k], NEAR * (edge - before)), NEAR * (after - edge)), 0.0
+        edge < squared_index - grid.least_width,
+        at_most(at_most(blur[k], NEAR * (edge - before)), NEAR * (after - edge)),
+        0.0,
     )
 
 
-def _step(beyond: Array, around: Array, inner: Array) -> Array:
+def _step(distance: Array, around: Array, inner: Array) -> Array:
     """How much of a direction lies beyond an edge: 0 to 1 over what is around it."""
     wide = around > 0
-    t = jnp.clip(0.5 * (beyond / jnp.where(wide, around, 1.0) + 1.0), 0.0, 1.0)
+    t = jnp.clip(0.5 * (distance / jnp.where(wide, around, 1.0) + 1.0), 0.0, 1.0)
     smooth = t * t * t * (10.0 + t * (6.0 * t - 15.0))
-    return jnp.where(inner, jnp.where(wide, smooth, beyond >= 0), 0.0)
+    return jnp.where(inner, jnp.where(wide, smooth, distance >= 0), 0.0)
 
 
 def _coordinate_between(x2: Array, rest2: Array, below: Array, above: Array) -> Array:
@@ -295,11 +297,13 @@ def interpolated(grid: Grid, rows: Array, ior: Array, cosine: Array, sine2: Arra
 def table_region(grid: Grid, region: Region) -> Region:
     """The points of a table in a region (panels * points,), all of weight 1; the normal where there is none."""
     x, _ = table_matrix(grid.nodes)
-    own = region.ior**2
-    low, high = grid.bounds(grid.panels, own)
+    squared_index = region.ior**2
+    low, high = grid.bounds(grid.panels, squared_index)
     rest = jnp.asarray(x * x, high.dtype) * (high - low)
-    exists = (high <= own) & (high > low)
-    cosine = jnp.sqrt(at_least(jnp.where(exists, (own - high + rest) / own, 1.0), LEAST_COSINE**2)).ravel()
+    exists = (high <= squared_index) & (high > low)
+    cosine = jnp.sqrt(
+        at_least(jnp.where(exists, (squared_index - high + rest) / squared_index, 1.0), LEAST_COSINE**2)
+    ).ravel()
     one = jnp.ones_like(cosine)
     return Region(region.ior, cosine, safe_sqrt((1.0 - cosine) * (1.0 + cosine)), one, one, one > 0)
 

@@ -17,7 +17,6 @@ from layerjax import fresnel
 from layerjax._batching import by_rows
 from layerjax._numerics import at_least, at_most, safe_div, safe_sqrt
 from layerjax.directions import Vector, half_vector
-from layerjax.microsurface import Microfacets
 from layerjax.microsurface.directional_albedo import interface_energies
 from layerjax.surfaces.microfacet import mirror_lobe
 from layerjax.transport.adding_doubling.facet_light import (
@@ -33,7 +32,7 @@ from layerjax.transport.adding_doubling.inverse import inverse
 from layerjax.transport.adding_doubling.operators import Layer, Parts
 from layerjax.transport.adding_doubling.sampling import azimuths, cosines, modes_at_nodes, scaled_to_energy
 
-Behind = Literal["diffuse", "narrow", "faces"]
+NextEvent = Literal["diffuse", "narrow", "faces"]
 """Of an interface: what turns light into all directions, so that none is ballistic; what does not; or other faces
 alone, which keep light between them."""
 
@@ -81,11 +80,11 @@ def interface_layer(
     below: Region,
     normals: Normals,
     modes: int,
-    microfacets: Microfacets,
+    multiple: bool,
     *,
     enters: bool = True,
     requested: Region | None = None,
-    behind: Behind,
+    next_event: NextEvent,
 ) -> Layer:
     """Rough dielectric interface between two regions, as Fourier modes (Walter 2007).
 
@@ -101,12 +100,19 @@ def interface_layer(
     """
     near, far = (above, below) if enters else (below, above)
     if requested is None:
-        operators = _operators(grid, near, far, normals, modes, microfacets, behind)
-    elif microfacets == "single":
-        operators = _followed(grid, requested, far, normals, modes, behind)
+        operators = _operators(grid, near, far, normals, modes, multiple, next_event)
+    elif not multiple:
+        operators = _followed(grid, requested, far, normals, modes, next_event)
     else:  # what masking loses is returned in proportion to sums over all directions outside
         operators = _operators(
-            grid, joined(requested, near), far, normals, modes, microfacets, behind, requested.weight.size
+            grid,
+            joined(requested, near),
+            far,
+            normals,
+            modes,
+            multiple,
+            next_event,
+            requested.weight.size,
         )
     outer, into, out, inner = (_channelled(parts) for parts in operators)
     return Layer(outer, inner, into, out) if enters else Layer(inner, outer, out, into)
@@ -122,8 +128,8 @@ def _operators(
     far: Region,
     normals: Normals,
     modes: int,
-    microfacets: Microfacets,
-    behind: Behind,
+    multiple: bool,
+    next_event: NextEvent,
     requested: int = 0,
 ) -> list[Parts]:
     """Reflection outside, light that enters, light that leaves, reflection inside: of the first `requested`, or of all.
@@ -132,7 +138,7 @@ def _operators(
     """
     outside, down, lost_outside = facet_energies(near, far, normals)
     inside, up, lost_inside = facet_energies(far, near, normals)
-    unresolved_share = _unresolved_share(grid, normals)
+    unsampled_share = _unsampled_share(grid, normals)
     through = _deposit(
         grid, *refracted_densely(grid, near, far, normals, modes), far, near, modes, _blur(grid, near, far, normals)
     )
@@ -141,19 +147,21 @@ def _operators(
     outer = None
     if not requested:
         rest = jnp.where(near.weight > 0, down - jnp.sum(through[0], axis=-2), 0.0)
-        outer = _reflection(near, outside, rest, unresolved_share, far.ior / near.ior, normals, modes)
+        outer = _reflection(near, outside, rest, unsampled_share, far.ior / near.ior, normals, modes)
     rest = jnp.where(far.weight > 0, up - safe_div(through[0] @ near.weight, far.weight), 0.0)
-    inner = _reflection(far, inside, rest, unresolved_share, near.ior / far.ior, normals, modes, _kept(grid, behind))
+    inner = _reflection(
+        far, inside, rest, unsampled_share, near.ior / far.ior, normals, modes, _trapped_blur(grid, next_event)
+    )
     once: list[Array | None] = [outer, through, _adjoint(through, leaving, far), inner]
-    given: list[Array | None] = [None] * 4
-    if microfacets == "multiple":
+    returned: list[Array | None] = [None] * 4
+    if multiple:
         turned = [
             _turned_back(a, b.ior / a.ior, normals.alpha, level, lost)
             for a, b, level, lost in ((near, far, outside, lost_outside), (far, near, inside, lost_inside))
         ]
         gains = _given_back((lost_outside, lost_inside), turned, (near.weight, far.weight), (leaving, far.weight))
-        given = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
-    found = list(map(Parts, once, given))
+        returned = [jnp.zeros((modes, *gain.shape), gain.dtype).at[0].set(gain) for gain in gains]
+    found = list(map(Parts, once, returned))
     return [_of_requested(parts, place, requested) for place, parts in enumerate(found)] if requested else found
 
 
@@ -164,12 +172,12 @@ def _of_requested(parts: Parts, place: int, requested: int) -> Parts:
 
 
 def _followed(
-    grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, behind: Behind
+    grid: Grid, requested: Region, inner: Region, normals: Normals, modes: int, next_event: NextEvent
 ) -> list[Parts]:
     """The four operators (see `_operators`) for requested directions, where what masking loses is lost: no sum over
     directions outside is needed."""
     ratio = inner.ior / requested.ior
-    if behind == "diffuse":  # only smooth functions are summed over what is let in
+    if next_event == "diffuse":  # only smooth functions are summed over what is let in
         least = LEAST_POINTS[normals.distribution]
         points = max(least[0], grid.nodes), max(least[1], modes // 2)
         rays = refracted_rays(requested, ratio, normals, points)
@@ -178,11 +186,11 @@ def _followed(
     through = _deposit(grid, *rays, inner, requested, modes, _blur(grid, requested, inner, normals))
     inside = reflected_energy(inner, 1.0 / ratio, normals)
     back = _adjoint(through, jnp.ones_like(requested.weight), inner)
-    face = _face(inner, inside, 1.0 / ratio, normals, modes, _kept(grid, behind))
+    face = _face(inner, inside, 1.0 / ratio, normals, modes, _trapped_blur(grid, next_event))
     return [Parts(operator) for operator in (None, through, back, face)]
 
 
-def _unresolved_share(grid: Grid, normals: Normals) -> Array:
+def _unsampled_share(grid: Grid, normals: Normals) -> Array:
     return 1.0 / (1.0 + (jnp.asarray(normals.alpha) * grid.nodes / RESOLVED) ** 4)
 
 
@@ -192,15 +200,15 @@ def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
     again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    apart = facet_spacing(grid, normals) * (1.0 - _unresolved_share(grid, normals))
+    apart = facet_spacing(grid, normals) * (1.0 - _unsampled_share(grid, normals))
     if grid.interfaces == 1:
         return BLUR * apart * jnp.ones_like(grid.edges)
     steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
     return BLUR_BETWEEN * apart * jnp.abs(1.0 - near.ior / far.ior) * steepness
 
 
-def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int, kept: float = 0.0) -> Array:
-    """Reflection at an interface, seen from one side; kept: see `_kept`.
+def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: int, trapped_blur: float = 0.0) -> Array:
+    """Reflection at an interface, seen from one side; trapped_blur: see `_trapped_blur`.
 
     Light that two interfaces reflect totally would go back and forth for ever: a little is lost.
     """
@@ -208,15 +216,15 @@ def _face(region: Region, energy: Array, ior: Array, normals: Normals, modes: in
 
     def reflection(wi: Vector, wo: Vector) -> list[Array]:
         h, cosine = half_vector(wi, wo, same_side=True)
-        level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes), kept))
+        level = fresnel.dielectric(cosine, ior, _critical_blur(wi, wo, ior, np.pi / azimuths(modes), trapped_blur))
         return [level * mirror_lobe(h, wi, wo, *normals)]
 
     return scaled_to_energy(region, modes_at_nodes(reflection, region, region, modes)[0], energy)
 
 
-def _kept(grid: Grid, behind: Behind) -> float:
+def _trapped_blur(grid: Grid, next_event: NextEvent) -> float:
     """Angle between nodes, of which two panels or more are in any medium between faces, where light is kept there."""
-    return 0.25 * np.pi / grid.nodes if behind == "faces" else 0.0
+    return 0.25 * np.pi / grid.nodes if next_event == "faces" else 0.0
 
 
 def _critical_blur(wi: Vector, wo: Vector, ior: Array, azimuth: float, polar: float) -> Array:
@@ -269,7 +277,8 @@ def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) ->
     `up` from far ones.
 
     Polynomials put negative energies on some nodes, too, so that factors could be of any size. What is added goes with
-    the size of what is there, F_ij + |F_ij| (a_i + b_j), all modes alike: a and b solve a symmetric positive system.
+    the size of what is there, F_ij + |F_ij| (a_i + b_j), the same for all modes: a and b solve a symmetric positive
+    system.
     """
     up = up * far.weight
     typical = safe_div(jnp.outer(up, down), jnp.sum(up))
@@ -279,11 +288,11 @@ def _balanced(flux: Array, near: Region, far: Region, down: Array, up: Array) ->
     ridge = max(RIDGE, np.sqrt(jnp.finfo(size.dtype).eps))
     rows = at_least(jnp.sum(crossing, axis=1) + ridge * up, TINY)
     columns = jnp.sum(crossing, axis=0) + ridge * down * near.weight
-    lack = up - flux[0] @ near.weight
+    missing = up - flux[0] @ near.weight
     # rows are eliminated: columns alone are left
-    wanted = (down - jnp.sum(flux[0], axis=0)) * near.weight - (lack / rows) @ crossing
+    wanted = (down - jnp.sum(flux[0], axis=0)) * near.weight - (missing / rows) @ crossing
     schur = jnp.diag(jnp.where(columns > 0, columns, 1.0)) - crossing.T @ (crossing / rows[:, None])
-    a = (lack - crossing @ (inverse(schur) @ wanted)) / rows
+    a = (missing - crossing @ (inverse(schur) @ wanted)) / rows
     # only a_i + b_j of nodes that exchange light is known: directions of no weight have a b alone
     of_nodes = jnp.where(near.weight > 0, a[:, None], 0.0)
     b = safe_div(down - jnp.sum(flux[0] + size * of_nodes, axis=0), jnp.sum(size, axis=0))
@@ -311,11 +320,11 @@ def _reflection(
     region: Region,
     level: Array,
     rest: Array,
-    unresolved_share: Array,
+    unsampled_share: Array,
     ior: Array,
     normals: Normals,
     modes: int,
-    kept: float = 0.0,
+    trapped_blur: float = 0.0,
 ) -> Array:
     """Reflection on one side, with the rest that nodes let pass too little or too much: none of it is lost.
 
@@ -323,15 +332,15 @@ def _reflection(
     it is, and may change by a larger share the stronger it is.
     """
     most = _most(level)
-    resolved = (1.0 - unresolved_share) * at_most(at_least(rest, -most), most)
-    lobe = _face(region, level + resolved, ior, normals, modes, kept)
-    return lobe + unresolved_share * jnp.diag(at_least(rest, -level))
+    resolved = (1.0 - unsampled_share) * at_most(at_least(rest, -most), most)
+    lobe = _face(region, level + resolved, ior, normals, modes, trapped_blur)
+    return lobe + unsampled_share * jnp.diag(at_least(rest, -level))
 
 
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
     """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
-    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, "multiple")
+    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, True)
     gain = at_least(level - once, 0.0)
     return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
 

@@ -82,8 +82,11 @@ def kernel_modes(phase: PhaseFunction, with_schlick: bool, region: Region, modes
     area = phase.cross_section((region.sine, jnp.zeros_like(region.sine), region.cosine))
     if phase.moments(1) is not None:
         return _by_moments(phase, with_schlick, region, modes, carried, area)
-    found = modes_at_nodes(lambda wi, wo: _both_sides(phase, with_schlick, wi, wo), region, region, modes)
-    plain, schlick = (found[0], found[1]), (found[2], found[3]) if with_schlick else None
+    truncated_kernel = modes_at_nodes(lambda wi, wo: _both_sides(phase, with_schlick, wi, wo), region, region, modes)
+    plain, schlick = (
+        (truncated_kernel[0], truncated_kernel[1]),
+        (truncated_kernel[2], truncated_kernel[3]) if with_schlick else None,
+    )
     return _balanced(Kernel(plain, schlick, area, region.cosine, region.solid, None))
 
 
@@ -94,14 +97,14 @@ def _by_moments(
     weight = 2.0 * jnp.pi * region.solid
     turned_round = jnp.asarray((-1.0) ** np.arange(modes), weight.dtype)[:, None, None]
 
-    def found(is_schlick: bool) -> tuple[Pair, Array]:
+    def truncated_kernel(is_schlick: bool) -> tuple[Pair, Array]:
         chi, onward, back = truncated(phase, is_schlick, carried, weight.dtype)
         reflect, transmit = kernel_of_moments(chi, region.cosine, region.sine, modes)
         return (reflect + turned_round * ballistic_share(back * jnp.ones_like(weight), weight), transmit), onward
 
-    plain, onward = found(False)
+    plain, onward = truncated_kernel(False)
     missing = area - onward - weight @ (plain[0][0] + plain[1][0])
-    schlick, fifth = found(True) if with_schlick else (None, onward)
+    schlick, fifth = truncated_kernel(True) if with_schlick else (None, onward)
     shares = onward + missing, fifth + jnp.zeros_like(missing)
     return Kernel(plain, schlick, area, region.cosine, region.solid, None, shares)
 

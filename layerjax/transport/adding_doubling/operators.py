@@ -59,12 +59,12 @@ class Layer(eqx.Module):
 def add(upper: Layer, lower: Layer) -> Layer:
     """`upper` on top of `lower` (Grant & Hunt 1969); light from below only if `lower` lets any pass."""
     down, up = (upper.direct_down, lower.direct_down), (lower.direct_up, upper.direct_up)
-    falling, extra = _between(upper.reflect_bottom, lower.reflect_top, upper.transmit_down, down[0])
+    falling, extra = _falling(upper.reflect_bottom, lower.reflect_top, upper.transmit_down, down[0])
     reflect_top = _returned(upper.reflect_top, upper.transmit_up, lower.reflect_top, (down[0], up[1]), falling)
     if lower.transmit_down.total is None and down[1] is None:
         return Layer(reflect_top)
     transmit_down = _passed(upper.transmit_down, lower.transmit_down, down, falling, extra)
-    rising, extra = _between(lower.reflect_top, upper.reflect_bottom, lower.transmit_up, up[0])
+    rising, extra = _falling(lower.reflect_top, upper.reflect_bottom, lower.transmit_up, up[0])
     reflect_bottom = _returned(
         lower.reflect_bottom, lower.transmit_down, upper.reflect_bottom, (up[0], down[1]), rising
     )
@@ -85,13 +85,13 @@ def double(
     """
     down, up = direct
     back = Parts(turn(reflect.first), turn(reflect.rest))
-    falling, extra = _between(back, reflect, transmit, down)
+    falling, extra = _falling(back, reflect, transmit, down)
     rising = Parts(turn(transmit.first), turn(transmit.rest))
     both = _returned(reflect, rising, reflect, (down, up), falling)
     return both.rest, _passed(transmit, transmit, (down, down), falling, extra).rest
 
 
-def _between(back: Parts, base: Parts, transmit: Parts, direct: Operator) -> tuple[Operator, Operator]:
+def _falling(back: Parts, base: Parts, transmit: Parts, direct: Operator) -> tuple[Operator, Operator]:
     """Diffuse flux that falls on the far layer, and the part of it that was reflected at least once."""
     loop = matmul(back.total, base.total)
     if loop is None:

@@ -57,19 +57,19 @@ def requested_values(whole: Layer, known: KnownDirections, bottom: Array, opaque
     return RequestedValues(values, known.of_wi, known.of_wo, opaque)
 
 
-def read_requested(found: RequestedValues, wi: Vector, wo: Vector, side: Side) -> Channels:
+def read_requested(solved: RequestedValues, wi: Vector, wo: Vector, side: Side) -> Channels:
     """BSDF of the paths with more than one event, which ringing may take below 0."""
     edge, (z_i, z_o) = horizon(wi[2].dtype), (wi[2], wo[2])
-    if found.opaque or side == "reflection":
+    if solved.opaque or side == "reflection":
         valid = (z_i > edge) & (z_o > edge)
     else:
         valid = (jnp.abs(z_i) > edge) & (jnp.abs(z_o) > edge)
         if side == "transmission":
             valid = valid & (z_i * z_o < 0)
-    last = found.values.shape[0] - 1
-    out, into = jnp.minimum(found.of_wo, last), jnp.minimum(found.of_wi, last)
-    modes = np.arange(found.values.shape[-1])
-    series = found.values[out, into]
+    last = solved.values.shape[0] - 1
+    out, into = jnp.minimum(solved.of_wo, last), jnp.minimum(solved.of_wi, last)
+    modes = np.arange(solved.values.shape[-1])
+    series = solved.values[out, into]
     waves = jnp.where(modes == 0, 1.0, 2.0) * jnp.cos(turn(wi, wo)[..., None] * modes)
     total = jnp.sum(series * waves[..., None, :], axis=-1)
     return tuple(jnp.where(valid, total[..., c], 0.0) for c in range(total.shape[-1]))

@@ -80,8 +80,8 @@ def balance(
 ) -> tuple[Array, Array]:
     """Factors d, (nodes,), for which sum d_i K_ij d_j scatters `energy` when summed with `weight`; and what is missing.
 
-    Scaling both sides alike keeps a kernel reciprocal and its lobes where they are. With each kernel goes the function
-    that takes d to the factors of its outgoing directions.
+    Scaling both sides by the same factors keeps a kernel reciprocal and its lobes where they are. With each kernel goes
+    the function that takes d to the factors of its outgoing directions.
     """
 
     def scattered(scale: Array) -> Array:

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import Distribution
 from layerjax.stack import Interface, Medium, Stack
 from layerjax.surfaces import Conductor, Lambertian, Surface
@@ -25,7 +24,7 @@ from layerjax.transport.adding_doubling.elements import Make, Scalars, build_ele
 from layerjax.transport.adding_doubling.energies import Face, outer_faces
 from layerjax.transport.adding_doubling.facet_light import Normals
 from layerjax.transport.adding_doubling.grid import Grid, Region, make_grid
-from layerjax.transport.adding_doubling.interfaces import Behind, interface_layer
+from layerjax.transport.adding_doubling.interfaces import NextEvent, interface_layer
 from layerjax.transport.adding_doubling.media import Kernel, kernel_modes, kernel_ordinates, medium_layer
 from layerjax.transport.adding_doubling.moments import terms
 from layerjax.transport.adding_doubling.operators import Layer, add
@@ -44,15 +43,15 @@ class Plan(eqx.Module):
     modes: int = eqx.field(static=True)
     azimuths: int | None = eqx.field(static=True)
     ranks: tuple[int, ...] | None = eqx.field(static=True)
-    microfacets: Microfacets = eqx.field(static=True)
+    multiple: bool = eqx.field(static=True)
 
 
-def make_plan(stack: Stack, resolution: Resolution, microfacets: Microfacets) -> Plan:
+def make_plan(stack: Stack, resolution: Resolution, multiple: bool) -> Plan:
     """The plan for a simplified stack."""
     if any(map(is_tilted, stack.layers)):
         nodes, azimuths = resolution.ordinates
-        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), microfacets)
-    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), microfacets)
+        return Plan(nodes, azimuths // 2 + 1, azimuths, ranks(stack), multiple)
+    return Plan(resolution.nodes, resolution.modes, None, ranks(stack), multiple)
 
 
 def solve(
@@ -72,19 +71,19 @@ def make_elements(stack: Stack, plan: Plan, requested: KnownDirections | None, m
     dtype = _dtype(stack)
     indices = _indices(stack, dtype)
     faces = iter(_interfaces(stack, plan, indices, requested, make))
-    found: list[Any] = []
+    elements: list[Any] = []
     region = 0
     for layer in stack.layers:
         if isinstance(layer, Interface):
-            found.append(next(faces))
+            elements.append(next(faces))
             region += 1
         else:
             tilted = plan.azimuths is not None and is_tilted(layer)
             options = plan, region, layer.f0 is not None, tilted, dtype
-            found.append(make(_kernel, options, (indices, layer.phase), None, dtype))
+            elements.append(make(_kernel, options, (indices, layer.phase), None, dtype))
     if stack.base is not None:
-        found.append(make(_base, (plan, region, dtype), (indices, stack.base), None, dtype))
-    return found
+        elements.append(make(_base, (plan, region, dtype), (indices, stack.base), None, dtype))
+    return elements
 
 
 def assemble(
@@ -145,41 +144,41 @@ def _interfaces(
 ) -> list[Layer]:
     """Every interface of a stack as a layer. Many of a kind share one program, which is compiled once."""
     interfaces = [layer for layer in stack.layers if isinstance(layer, Interface)]
-    behind: Behind = "narrow" if stack.base is None or isinstance(stack.base, Conductor) else "diffuse"
+    next_event: NextEvent = "narrow" if stack.base is None or isinstance(stack.base, Conductor) else "diffuse"
     if stack.base is None and len(interfaces) > 1:
-        behind = "faces"
+        next_event = "faces"
     dtype = indices[0].dtype
-    found: dict[int, Layer] = {}
-    alike: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
+    layers: dict[int, Layer] = {}
+    by_kind: dict[tuple[Distribution, bool], list[int]] = defaultdict(list)
     for region, layer in enumerate(interfaces):
         leaves = stack.base is None and 1 < region + 1 == len(interfaces)
         if requested is not None and (layer is stack.layers[0] or leaves):
-            options = plan, layer.distribution, not leaves, behind, dtype, region
+            options = plan, layer.distribution, not leaves, next_event, dtype, region
             along = requested.below if leaves else requested.above
-            found[region] = make(_interface, options, (indices, layer.alpha), along, dtype)
+            layers[region] = make(_interface, options, (indices, layer.alpha), along, dtype)
         else:
-            alike[layer.distribution, not leaves].append(region)
-    for kind, regions in alike.items():
+            by_kind[layer.distribution, not leaves].append(region)
+    for kind, regions in by_kind.items():
         alphas = [jnp.asarray(interfaces[region].alpha, dtype) for region in regions]
         if len(regions) < MANY:
             for region, alpha in zip(regions, alphas, strict=True):
-                options = plan, *kind, behind, dtype, region
-                found[region] = make(_interface, options, (indices, alpha), None, dtype)
+                options = plan, *kind, next_event, dtype, region
+                layers[region] = make(_interface, options, (indices, alpha), None, dtype)
         else:
-            build = partial(_numbered_interface, plan, *kind, behind, dtype)
-            layers = jax.lax.map(
+            build = partial(_numbered_interface, plan, *kind, next_event, dtype)
+            together = jax.lax.map(
                 lambda each, build=build: element(build, (indices, each[1]), each[0], dtype),
                 (jnp.asarray(regions), jnp.stack(alphas)),
             )
-            found.update((region, jax.tree.map(itemgetter(k), layers)) for k, region in enumerate(regions))
-    return [found[region] for region in range(len(interfaces))]
+            layers.update((region, jax.tree.map(itemgetter(k), together)) for k, region in enumerate(regions))
+    return [layers[region] for region in range(len(interfaces))]
 
 
 def _interface(
     plan: Plan,
     distribution: Distribution,
     enters: bool,
-    behind: Behind,
+    next_event: NextEvent,
     dtype: Any,
     region: int | Array,
     numbers: Any,
@@ -191,15 +190,23 @@ def _interface(
     outside = None if requested is None else requested_region(requested, (above if enters else below).ior)
     normals = Normals(jnp.asarray(alpha, dtype), distribution)
     return interface_layer(
-        grid, above, below, normals, plan.modes, plan.microfacets, enters=enters, requested=outside, behind=behind
+        grid,
+        above,
+        below,
+        normals,
+        plan.modes,
+        plan.multiple,
+        enters=enters,
+        requested=outside,
+        next_event=next_event,
     )
 
 
 def _numbered_interface(
-    plan: Plan, distribution: Distribution, enters: bool, behind: Behind, dtype: Any, numbers: Any, region: Array
+    plan: Plan, distribution: Distribution, enters: bool, next_event: NextEvent, dtype: Any, numbers: Any, region: Array
 ) -> Layer:
     """An interface under a region whose number is traced."""
-    return _interface(plan, distribution, enters, behind, dtype, region, numbers, None)
+    return _interface(plan, distribution, enters, next_event, dtype, region, numbers, None)
 
 
 def _region(grid: Grid, place: int | Array) -> Region:
@@ -221,7 +228,7 @@ def _kernel(plan: Plan, region: int, fresnel: bool, tilted: bool, dtype: Any, nu
 def _base(plan: Plan, region: int, dtype: Any, numbers: Any, _: None) -> Layer:
     indices, base = numbers
     here = make_grid(indices, plan.ranks, plan.nodes, dtype).regions[region]
-    return base_layer(here, _relative(base, here.ior), plan.modes, plan.microfacets)
+    return base_layer(here, _relative(base, here.ior), plan.modes, plan.multiple)
 
 
 def followed(stack: Stack, known: Known) -> tuple[Stack, KnownDirections] | None:

@@ -110,9 +110,9 @@ def _values(
 ) -> tuple[Array, ...] | None:
     """The quadrants one after the other, an array a channel; None where nothing scatters more than once."""
 
-    def table(there: Operator, back: Operator, out: _End, into: _End) -> Array | None:
-        there, back = (_per_weight(flux, end, azimuths) for flux, end in ((there, out), (back, into)))
-        return _quadrant(there, turned(back, azimuths), out, into, azimuths, steps)
+    def table(flux: Operator, back: Operator, out: _End, into: _End) -> Array | None:
+        flux, back = (_per_weight(operator, end, azimuths) for operator, end in ((flux, out), (back, into)))
+        return _quadrant(flux, turned(back, azimuths), out, into, azimuths, steps)
 
     above = whole.reflect_top.rest
     quadrants = [table(above, above, top, top)]
@@ -138,13 +138,13 @@ def _per_weight(flux: Operator, out: _End, azimuths: int | None) -> Operator:
 
 
 def _quadrant(
-    there: Operator, back: Operator, out: _End, into: _End, azimuths: int | None, steps: int | None
+    flux: Operator, reverse: Operator, out: _End, into: _End, azimuths: int | None, steps: int | None
 ) -> Array | None:
     """A table of reciprocal values; back: the same light the other way round, turned to the directions of `there`."""
-    if there is None or back is None:
+    if flux is None or reverse is None:
         return None
     count = azimuths or 1
-    mean = 0.5 * (there + jnp.swapaxes(back, -1, -2))
+    mean = 0.5 * (flux + jnp.swapaxes(reverse, -1, -2))
     values = mean * (jnp.repeat(out.region.cosine, count)[:, None] + jnp.repeat(into.region.cosine, count))
     fine = out.lift @ values @ jnp.swapaxes(into.lift, -1, -2)
     if steps is None:

@@ -21,13 +21,13 @@ import numpy as np
 from jax import Array
 
 from layerjax._batching import in_chunks
+from layerjax._checks import require_choice
 from layerjax._devices import exact_products
 from layerjax._numerics import not_negative, safe_div
 from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.compiling import filter_jit, is_outermost, is_traced
 from layerjax.directions import Vector, direction, split
-from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.ballistic import Ballistic, ballistic_paths, evaluate_ballistic
@@ -99,7 +99,7 @@ class Solved(eqx.Module):
 
     first: FirstOrder
     tables: Tables | None
-    between: RequestedValues | None = None
+    requested: RequestedValues | None = None
     ballistic: Ballistic | None = None
     scaled: FirstOrder | None = None
 
@@ -107,10 +107,10 @@ class Solved(eqx.Module):
 class AddingDoubling(DeterministicTransport):
     """Deterministic solution of any stack, all orders of scattering, lit from above and from below.
 
-    Carries everything that a `Stack` holds; von Mises-Fisher normals with ``microfacets="single"`` only. The work per
-    stack is done in `prepare`; a pair then costs about a microsecond, or 20 to 65 through two interfaces and no base,
-    where light that refracts at both and meets nothing else is integrated over their facets. `evaluate` of a stack that
-    begins (and, if light passes it, ends) with an interface, along up to 256 distinct cosines that are known
+    Carries everything that a `Stack` holds; von Mises-Fisher normals with ``facet_multiple_scattering=False`` only. The
+    work per stack is done in `prepare`; a pair then costs about a microsecond, or 20 to 65 through two interfaces and
+    no base, where light that refracts at both and meets nothing else is integrated over their facets. `evaluate` of a
+    stack that begins (and, if light passes it, ends) with an interface, along up to 256 distinct cosines that are known
     beforehand, reads nothing off tables: light along them is followed exactly, and half the nodes and modes give the
     same error or less.
 
@@ -139,11 +139,11 @@ class AddingDoubling(DeterministicTransport):
         orders: ``"all"``, only paths with one event (``"first"``, nothing is solved), or those with more
             (``"multiple"``). An event is a collision, a reflection or refraction at an interface, or a reflection at
             the base.
-        microfacets: ``"single"``, Walter 2007: light that a facet sends into another is lost; or ``"multiple"``: it is
-            returned diffusely, so that interfaces conserve energy (after Kulla & Conty 2017): lossless stacks return
-            what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within 1 % of an index
-            of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface at grazing, below
-            a cosine of 0.05, may lose or gain a quarter.
+        facet_multiple_scattering: whether light that a facet sends into another is returned diffusely, so that
+            interfaces conserve energy (after Kulla & Conty 2017); else it is lost (Walter 2007). Lossless stacks then
+            return what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within 1 % of an
+            index of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface at grazing,
+            below a cosine of 0.05, may lose or gain a quarter.
 
     Raises:
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.
@@ -156,7 +156,7 @@ class AddingDoubling(DeterministicTransport):
     ordinates: tuple[int, int] | None = eqx.field(static=True, default=None)
     tolerance: float | None = eqx.field(static=True, default=None)
     orders: Orders = eqx.field(static=True, default="all")
-    microfacets: Microfacets = eqx.field(static=True, default="single")
+    facet_multiple_scattering: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
         for name, value, least in (("nodes", self.nodes, 2), ("modes", self.modes, 1)):
@@ -173,14 +173,12 @@ class AddingDoubling(DeterministicTransport):
             isinstance(self.tolerance, float | np.floating) and 0.0 < self.tolerance < 1.0
         ):
             raise ValueError(f"AddingDoubling.tolerance: {self.tolerance!r} is outside (0, 1)")
-        for name, choice, choices in (("orders", self.orders, Orders), ("microfacets", self.microfacets, Microfacets)):
-            if choice not in get_args(choices):
-                allowed = ", ".join(map(repr, get_args(choices)))
-                raise ValueError(f"AddingDoubling.{name}: {choice!r} is not one of {allowed}")
+        require_choice("AddingDoubling.orders", self.orders, get_args(Orders))
+        require_choice("AddingDoubling.facet_multiple_scattering", self.facet_multiple_scattering, (False, True))
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        if self.microfacets == "multiple":
-            refuse_vmf(stack, names, 'AddingDoubling(microfacets="multiple")')
+        if self.facet_multiple_scattering:
+            refuse_vmf(stack, names, "AddingDoubling(facet_multiple_scattering=True)")
 
     def chosen_for(self, stack: Stack, known: Known) -> "AddingDoubling":
         found = followed(stack, known) if self.orders != "first" else None
@@ -236,7 +234,7 @@ class AddingDoubling(DeterministicTransport):
     def measured(
         self, state: Solved, wi: Array, wo: Array, side: Side, channels: int, key: Array | None
     ) -> tuple[Array, None]:
-        if state.between is None:
+        if state.requested is None:
             return super().measured(state, wi, wo, side, channels, key)
         i, o = split(wi), split(wo)
         values = self.evaluate(state, i, o, side)
@@ -245,23 +243,23 @@ class AddingDoubling(DeterministicTransport):
     def doubt(self, state: Solved, wi: Array, wo: Array, side: Side, channels: int) -> Array | float:
         least = FACETS_ERROR if state.first.layered else 0.0
 
-        def found(wi: Vector, wo: Vector) -> Channels:
+        def doubts(wi: Vector, wo: Vector) -> Channels:
             rest = self._rest(state, wi, wo, side)
             lowest = rest if state.scaled is None else self._sum(state, rest, wi, wo, side)
             return tuple(least * jnp.abs(pick(rest, c)) + not_negative(-pick(lowest, c)) for c in range(channels))
 
-        return in_chunks(found, wi, wo)
+        return in_chunks(doubts, wi, wo)
 
     def coarser(self) -> "AddingDoubling":
         """This transport at about two thirds of the resolution, for an estimate of the error."""
-        return self._at(self._given().coarser())
+        return self._at(self._as_resolution().coarser())
 
     def finer(self) -> "AddingDoubling":
         """This transport at about four thirds of the resolution."""
-        return self._at(self._given().finer())
+        return self._at(self._as_resolution().finer())
 
     def compared(self) -> tuple["AddingDoubling", ...]:
-        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._given()))
+        return tuple(one for one in (self.coarser(), self.finer()) if one != self._at(self._as_resolution()))
 
     def evaluate(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         rest = self._rest(state, wi, wo, side)
@@ -271,8 +269,8 @@ class AddingDoubling(DeterministicTransport):
 
     def _rest(self, state: Solved, wi: Vector, wo: Vector, side: Side) -> Channels:
         """What is read off: ringing may take it below 0, and where media are scaled what it lacks may, too."""
-        if state.between is not None:
-            return read_requested(state.between, wi, wo, side)
+        if state.requested is not None:
+            return read_requested(state.requested, wi, wo, side)
         if state.tables is not None:
             return read_rest(state.tables, wi, wo, side)
         return (jnp.zeros_like(wi[2] * wo[2]),)
@@ -302,7 +300,9 @@ class AddingDoubling(DeterministicTransport):
         if state.tables is not None and self.orders == "all":
             energies = read_energies(state.tables, wi)
             if state.first.layered:
-                return directional_albedo(state.scaled or state.first, energies, wi, nodes, self.microfacets)
+                return directional_albedo(
+                    state.scaled or state.first, energies, wi, nodes, self.facet_multiple_scattering
+                )
             met = interaction_probability(state.first, wi)
             near, far = none_negative(*energies)
             return (near, far) if met is None else (times(near, met), times(far, met))
@@ -322,7 +322,7 @@ class AddingDoubling(DeterministicTransport):
         return near, far
 
     def _is_solved(self, stack: Stack) -> bool:
-        gives_back = self.microfacets == "multiple" and isinstance(stack.base, Conductor)
+        gives_back = self.facet_multiple_scattering and isinstance(stack.base, Conductor)
         return self.orders != "first" and (len(stack.layers) > 0 or gives_back)
 
     def _solve(self, stack: Stack, first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
@@ -340,7 +340,7 @@ class AddingDoubling(DeterministicTransport):
     def _at(self, resolution: Resolution) -> "AddingDoubling":
         return dataclasses.replace(self, **resolution._asdict(), tolerance=None)
 
-    def _given(self) -> Resolution:
+    def _as_resolution(self) -> Resolution:
         if self.nodes is None:
             raise ValueError("AddingDoubling.nodes: none are given; choose_transport finds them for a stack")
         return Resolution(self.nodes, self.modes or modes_for(self.nodes), self.ordinates or ORDINATES_LADDER[0])
@@ -358,7 +358,7 @@ class AddingDoubling(DeterministicTransport):
         return self.nodes is None
 
     def _plan(self, stack: Stack, known: KnownDirections | None) -> Plan:
-        return make_plan(stack, self._resolution(stack, known is not None), self.microfacets)
+        return make_plan(stack, self._resolution(stack, known is not None), self.facet_multiple_scattering)
 
     def _climbed(self, stack: Stack, known: KnownDirections | None) -> "AddingDoubling":
         """The coarsest resolution that agrees with the one before to `tolerance`, at the requested directions if
@@ -417,7 +417,7 @@ class _Planned(AddingDoubling):
     def _solve_between(self, stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
         if self.elements is None:
             return super()._solve_between(stack, known, plan)
-        return _between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
+        return _values_between(stack, make_elements(stack, plan, known, replay(self.elements)), known, plan)
 
 
 def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channels]:
@@ -458,7 +458,7 @@ def _solve_at_once(stack: Stack, first: FirstOrder, once: FirstOrder | None, pla
 @filter_jit
 @exact_products
 def _solve_between_at_once(stack: Stack, known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _between(stack, make_elements(stack, plan, known), known, plan)
+    return _values_between(stack, make_elements(stack, plan, known), known, plan)
 
 
 @filter_jit
@@ -472,7 +472,7 @@ def _tables_of_elements(
 @filter_jit
 @exact_products
 def _between_of_elements(layers: Layers, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
-    return _between(layers.stack(), elements, known, plan)
+    return _values_between(layers.stack(), elements, known, plan)
 
 
 def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrder | None, plan: Plan) -> Tables:
@@ -483,7 +483,7 @@ def _tables(stack: Stack, elements: list[Any], first: FirstOrder, once: FirstOrd
     return make_tables(grid, whole, rest, plan.azimuths, stack.base is not None, met, outer, onward)
 
 
-def _between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
+def _values_between(stack: Stack, elements: list[Any], known: KnownDirections, plan: Plan) -> RequestedValues:
     grid, _, rest, _ = assemble(stack, plan, elements)
     return requested_values(rest, known, grid.regions[-1].ior, stack.base is not None)
 

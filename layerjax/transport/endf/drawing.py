@@ -87,9 +87,9 @@ def _proposals(coat: Coat, options: Options, wi: Vector, opaque: bool) -> list[P
     return _shared(found)
 
 
-def _shared(found: list[Proposal]) -> list[Proposal]:
-    total = sum((lobe.share + LEAST_SHARE for lobe in found[1:]), found[0].share + LEAST_SHARE)
-    return [lobe._replace(share=(1.0 - COSINE) * (lobe.share + LEAST_SHARE) / total) for lobe in found]
+def _shared(lobes: list[Proposal]) -> list[Proposal]:
+    total = sum((lobe.share + LEAST_SHARE for lobe in lobes[1:]), lobes[0].share + LEAST_SHARE)
+    return [lobe._replace(share=(1.0 - COSINE) * (lobe.share + LEAST_SHARE) / total) for lobe in lobes]
 
 
 def draw(coat: Coat, options: Options, wi: Vector, uniforms: tuple[Array, Array, Array], opaque: bool) -> Vector:

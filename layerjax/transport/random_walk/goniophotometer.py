@@ -18,9 +18,8 @@ from layerjax._numerics import broadcasting, horizon
 from layerjax._parameters import in_precision
 from layerjax._shapes import channel_count, require_single
 from layerjax.directions import read_directions, split
-from layerjax.microsurface import Microfacets
 from layerjax.stack import Stack, require_numbers, simplify
-from layerjax.transport.random_walk.lanes import Record, added, follow, quotas, standard_error, upright
+from layerjax.transport.random_walk.batches import Record, added, follow, quotas, standard_error, upright
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
@@ -68,8 +67,8 @@ def goniophotometer(
     polar: int = 10,
     azimuth: int = 24,
     orders: int = 8,
-    microfacets: Microfacets = "single",
-    lanes: int = 4096,
+    facet_multiple_scattering: bool = False,
+    batch_size: int = 4096,
 ) -> Goniogram:
     """Energies that leave a stack, lit along wi.
 
@@ -81,8 +80,8 @@ def goniophotometer(
         paths: number of paths for each wi, >= 2.
         polar, azimuth: number of bins, equal in |cos(theta)| and in phi.
         orders: number of orders that are distinguished.
-        microfacets: see `RandomWalk`.
-        lanes: number of paths that are under way at a time.
+        facet_multiple_scattering: see `RandomWalk`.
+        batch_size: number of paths that are under way at a time.
 
     Raises:
         ValueError: a count is too small, or the stack holds a placeholder.
@@ -92,14 +91,14 @@ def goniophotometer(
     require_numbers(stack)
     require_single(stack, "goniophotometer")
     require_count("paths", paths, 2)
-    for name, value in (("polar", polar), ("azimuth", azimuth), ("orders", orders), ("lanes", lanes)):
+    for name, value in (("polar", polar), ("azimuth", azimuth), ("orders", orders), ("batch_size", batch_size)):
         require_count(name, value, 1)
-    require_choice("microfacets", microfacets, ("single", "multiple"))
+    require_choice("facet_multiple_scattering", facet_multiple_scattering, (False, True))
     require_key(key)
     (wi,) = read_directions(wi=wi)
     slim = in_precision(simplify(stack), wi.dtype)
-    counts = (paths, polar, azimuth, orders, min(lanes, paths))
-    return _measure(slim, wi, channel_count(stack), key, counts, microfacets)
+    counts = (paths, polar, azimuth, orders, min(batch_size, paths))
+    return _measure(slim, wi, channel_count(stack), key, counts, facet_multiple_scattering)
 
 
 @eqx.filter_jit
@@ -109,14 +108,14 @@ def _measure(
     channels: int,
     key: Array,
     counts: tuple[int, int, int, int, int],
-    microfacets: Microfacets,
+    facet_multiple_scattering: bool,
 ) -> Goniogram:
-    paths, polar, azimuth, orders, lanes = counts
+    paths, polar, azimuth, orders, batch_size = counts
     dtype, batch = wi.dtype, wi.shape[:-1]
     scene = Scene(stack, channels, dtype)
     words = key_words(key)
     bins = 2 * polar * azimuth
-    owed, record = quotas(paths, lanes), _recorder(polar, azimuth, orders)
+    owed, record = quotas(paths, batch_size), _recorder(polar, azimuth, orders)
 
     def one(question: tuple[Array, Array]) -> tuple[Array, Array]:
         index, direction = question
@@ -124,10 +123,10 @@ def _measure(
         edge = horizon(dtype)
         valid = w[2] > edge if stack.base is not None else jnp.abs(w[2]) > edge
         w = upright(w, valid)
-        spread = jnp.full(lanes, w[0]), jnp.full(lanes, w[1]), jnp.full(lanes, w[2])
-        walk = Walk(scene, spread, None, microfacets, count_orders=True)
+        spread = jnp.full(batch_size, w[0]), jnp.full(batch_size, w[1]), jnp.full(batch_size, w[2])
+        walk = Walk(scene, spread, None, facet_multiple_scattering, count_orders=True)
         empty = [(jnp.zeros((rows, 2 * channels), dtype),) * 2 for rows in (bins, 2 * (orders + 1))]
-        lane = index.astype(jnp.uint32) * jnp.uint32(lanes) + jnp.arange(lanes, dtype=jnp.uint32)
+        lane = index.astype(jnp.uint32) * jnp.uint32(batch_size) + jnp.arange(batch_size, dtype=jnp.uint32)
         remaining = jnp.where(valid, owed, 0)
         (cells, _), (slots, _) = follow(walk, record, tuple(empty), lane, remaining, words, dtype)
         shaped = cells.reshape(2, polar, azimuth, channels, 2), slots.reshape(2, orders + 1, channels, 2)

@@ -175,7 +175,7 @@ def meet_opposite(
     rates = goal.rates if path.aim is None else path.aim.rates
     crossed = [jnp.where(goal.inner == region, 1.0, 0.0) for region in scene.region_of]
     passed = scene.transmittance(crossed, rates) if scene.media else (jnp.ones_like(drawn),)
-    weight = tuple(pick(hit.kept, c) * pick(passed, c) * turned * share for c in range(scene.channels))
+    weight = tuple(pick(hit.weight, c) * pick(passed, c) * turned * share for c in range(scene.channels))
     weight = tuple(jnp.where(found, w, 0.0) for w in weight)
     of_relay = jnp.minimum(walked / drawn, most)
     aiming, relay = path.aiming, Relay(travel, scene.rates(travel), weight, jnp.where(found, of_relay, 0.0))

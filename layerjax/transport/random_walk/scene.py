@@ -104,7 +104,7 @@ class Scene:
             else:
                 value = phase.pdf(wi, wo)
             density = value if len(self.groups) == 1 else jnp.where(_is_in(medium, members), value, density)
-        return density, self._kept(medium, half[1] if half is not None else None)
+        return density, self._scattered_share(medium, half[1] if half is not None else None)
 
     def deflect(self, medium: Array | None, wi: Vector, u1: Array, u2: Array) -> tuple[Vector, Channels]:
         """A direction drawn from the phase function, and the share that is kept."""
@@ -114,9 +114,9 @@ class Scene:
             drawn = phase.sample(wi, u1, u2) if deflection is None else _deflected(wi, *deflection, u2)
             wo = drawn if len(self.groups) == 1 else select(_is_in(medium, members), drawn, wo)
         if not self._fresnel():
-            return wo, self._kept(medium, None)
+            return wo, self._scattered_share(medium, None)
         # |wi . h| of the pair: h is the flake's normal, along wi + wo
-        return wo, self._kept(medium, jnp.sqrt(jnp.maximum(0.5 + 0.5 * dot(wi, wo), 0.0)))
+        return wo, self._scattered_share(medium, jnp.sqrt(jnp.maximum(0.5 + 0.5 * dot(wi, wo), 0.0)))
 
     @property
     def lossless(self) -> bool:
@@ -126,7 +126,7 @@ class Scene:
     def _fresnel(self) -> bool:
         return any(medium.f0 is not None for medium in self.media)
 
-    def _kept(self, medium: Array | None, cosine: Array | None) -> Channels:
+    def _scattered_share(self, medium: Array | None, cosine: Array | None) -> Channels:
         shares = []
         for c in range(self.channels):
             albedos = [m.albedo if isinstance(m.albedo, float) else pick(per_channel(m.albedo), c) for m in self.media]

@@ -83,7 +83,7 @@ class Event(NamedTuple):
     """What happens to the light in one step, at a collision or at a surface."""
 
     direction: Vector
-    kept: Channels
+    weight: Channels
     survives: Array
     sent: Channels = ()
     """Light sent to the target, per solid angle."""
@@ -135,7 +135,7 @@ def merge(chosen: Array, a: Event, b: Event, channels: int) -> Event:
 
     return Event(
         select(chosen, a.direction, b.direction),
-        per_channel(a.kept, b.kept),
+        per_channel(a.weight, b.weight),
         either(a.survives, b.survives),
         per_channel(a.sent, b.sent),
         either(a.density, b.density),

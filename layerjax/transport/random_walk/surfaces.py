@@ -41,7 +41,7 @@ class Bounce(NamedTuple):
     """New direction of travel."""
     crosses: Array
     """Whether that lies on the other side."""
-    kept: Channels
+    weight: Channels
     """Share of the light that the new direction carries."""
     survives: Array
     """Whether it carries any."""
@@ -85,7 +85,7 @@ def bounce(
 
     Args:
         target: a direction of travel away from the surface requested of the scattered light, or None.
-        refracts: lanes that are to refract wherever that is possible (their `kept` then lacks the transmittance).
+        refracts: lanes that are to refract wherever that is possible (their `weight` then lacks the transmittance).
     """
     wi = _facing(turned(travel, from_above, -1.0))
     towards = None if target is None else turned(target, from_above)
@@ -98,13 +98,13 @@ def bounce(
 
         def event(distribution: Distribution) -> Bounce:
             wo, leaves, m = interface_event(wi, ior, alpha, u1, u2, u3, distribution)
-            kept = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
+            weight = masking((wo[0], wo[1], jnp.abs(wo[2])), alpha, distribution)
             if distribution != "ggx":
-                kept = kept * draw_weight(wi, m, alpha)
+                weight = weight * draw_weight(wi, m, alpha)
             sent: Channels = ()
             if towards is not None:
                 sent = (_interface(wi, towards, ior, alpha, distribution) * jnp.abs(towards[2]),)
-            return Bounce(sent, wo, wo[2] < 0, (kept,), leaves)
+            return Bounce(sent, wo, wo[2] < 0, (weight,), leaves)
 
         results.append(_by_distribution(scene, surface, event))
     if at_base is not False:
@@ -137,7 +137,7 @@ def merge(chosen: Array | bool, a: Bounce, b: Bounce) -> Bounce:
         channels(a.towards_target, b.towards_target),
         select(mask, a.direction, b.direction),
         jnp.where(mask, a.crosses, b.crosses),
-        channels(a.kept, b.kept),
+        channels(a.weight, b.weight),
         jnp.where(mask, a.survives, b.survives),
     )
 

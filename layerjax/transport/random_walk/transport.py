@@ -1,7 +1,7 @@
 """Monte Carlo reference: unbiased random walks through anything that a `Stack` holds.
 
 See `layerjax.transport.random_walk.walk` for the path of light, `layerjax.transport.random_walk.next_event` for what it
-adds to a BSDF value, `layerjax.transport.random_walk.lanes` for how paths share the lanes, and
+adds to a BSDF value, `layerjax.transport.random_walk.batches` for how paths share a batch, and
 `layerjax.transport.random_walk.random_numbers` for the random numbers.
 """
 
@@ -15,12 +15,11 @@ from layerjax._checks import require_choice, require_count
 from layerjax._numerics import horizon
 from layerjax.channels import Channels
 from layerjax.directions import Vector, flip, half_vector, reflect, sanitised, select
-from layerjax.microsurface import Microfacets
 from layerjax.normals.facets import reflection_pdf, sample
 from layerjax.stack import Interface, Stack
 from layerjax.surfaces.lambertian import sample_cosine
 from layerjax.transport.contract import RandomTransport, Side, refuse_vmf
-from layerjax.transport.random_walk.lanes import average, upright
+from layerjax.transport.random_walk.batches import average, upright
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.state import Step
 from layerjax.transport.random_walk.walk import Orders, Walk
@@ -29,33 +28,34 @@ from layerjax.transport.random_walk.walk import Orders, Walk
 class RandomWalk(RandomTransport):
     """All orders of scattering, unbiased, with a standard error; `evaluate` and `albedo` take a key.
 
-    Carries everything that a stack can hold; von Mises-Fisher normals with ``microfacets="single"`` only. Narrow lobes
-    are aimed at, not found by chance: of the interface that wo sees and, with ``microfacets="single"``, of the metal or
-    interface opposite. The same key and the same shapes give the same numbers, bit for bit.
+    Carries everything that a stack can hold; von Mises-Fisher normals with ``facet_multiple_scattering=False`` only.
+    Narrow lobes are aimed at, not found by chance: of the interface that wo sees and, without multiple scattering
+    between facets, of the metal or interface opposite. The same key and the same shapes give the same numbers, bit for
+    bit.
 
     Args:
         paths: number of paths for each pair of directions (for each direction of an albedo), >= 2.
-        microfacets: ``"single"``, one reflection or refraction at a rough surface (Walter et al. 2007), which loses
-            what is masked; ``"multiple"``, light is followed on it until it leaves (Heitz et al. 2016).
+        facet_multiple_scattering: whether light is followed on a rough surface until it leaves (Heitz et al. 2016);
+            else it is reflected or refracted once (Walter et al. 2007), and what is masked is lost.
         orders: ``"all"``; ``"first"``, paths of one event; ``"multiple"``, of two and more. An event is a collision, a
             reflection or refraction at an interface, or a reflection at the base.
-        lanes: number of paths that are under way at a time.
+        batch_size: number of paths that are under way at a time.
     """
 
     paths: int = eqx.field(static=True, default=16384)
-    microfacets: Microfacets = eqx.field(static=True, default="single")
+    facet_multiple_scattering: bool = eqx.field(static=True, default=False)
     orders: Orders = eqx.field(static=True, default="all")
-    lanes: int = eqx.field(static=True, default=4096)
+    batch_size: int = eqx.field(static=True, default=4096)
 
     def __check_init__(self) -> None:
         require_count("RandomWalk.paths", self.paths, 2)  # one gives no standard error
-        require_count("RandomWalk.lanes", self.lanes, 1)
-        require_choice("RandomWalk.microfacets", self.microfacets, ("single", "multiple"))
+        require_count("RandomWalk.batch_size", self.batch_size, 1)
+        require_choice("RandomWalk.facet_multiple_scattering", self.facet_multiple_scattering, (False, True))
         require_choice("RandomWalk.orders", self.orders, ("all", "first", "multiple"))
 
     def check(self, stack: Stack, names: Sequence[str]) -> None:
-        if self.microfacets == "multiple":
-            refuse_vmf(stack, names, 'RandomWalk(microfacets="multiple")')
+        if self.facet_multiple_scattering:
+            refuse_vmf(stack, names, "RandomWalk(facet_multiple_scattering=True)")
 
     def prepare(self, stack: Stack) -> Stack:
         return stack
@@ -74,12 +74,12 @@ class RandomWalk(RandomTransport):
         wi, wo = upright(wi, valid), upright(wo, valid)
 
         def walk(wi: Vector, wo: Vector) -> Walk:
-            return Walk(scene, wi, wo, self.microfacets, self.orders)
+            return Walk(scene, wi, wo, self.facet_multiple_scattering, self.orders)
 
         def tally(step: Step) -> Channels:
             return step.contribution
 
-        return average(walk, tally, channels, (wi, wo), valid, self.paths, self.lanes, key)
+        return average(walk, tally, channels, (wi, wo), valid, self.paths, self.batch_size, key)
 
     def estimate_albedo(self, state: Stack, wi: Vector, channels: int, key: Array) -> tuple[Array, Array]:
         """Shares scattered to wi's side, then to the other, and standard errors, shape (n, 2 channels) each."""
@@ -88,7 +88,7 @@ class RandomWalk(RandomTransport):
         valid = valid & (wi[2] > 0) if state.base is not None else valid
 
         def walk(wi: Vector) -> Walk:
-            return Walk(scene, wi, None, self.microfacets, self.orders, count_orders=True)
+            return Walk(scene, wi, None, self.facet_multiple_scattering, self.orders, count_orders=True)
 
         def tally(step: Step) -> Channels:
             assert step.order is not None
@@ -98,7 +98,9 @@ class RandomWalk(RandomTransport):
             downwards = tuple(jnp.where(counted & ~above, w, 0.0) for w in step.weight)
             return (*upwards, *downwards)
 
-        value, error = average(walk, tally, 2 * channels, (upright(wi, valid),), valid, self.paths, self.lanes, key)
+        value, error = average(
+            walk, tally, 2 * channels, (upright(wi, valid),), valid, self.paths, self.batch_size, key
+        )
         above = (wi[2] > 0)[:, None]
 
         def near_first(x: Array) -> Array:

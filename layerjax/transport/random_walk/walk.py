@@ -21,7 +21,6 @@ from jax import Array
 
 from layerjax.channels import Channels, largest, pick
 from layerjax.directions import Vector, scale, select
-from layerjax.microsurface import Microfacets
 from layerjax.surfaces import Conductor
 from layerjax.transport.random_walk import microsurface, surfaces
 from layerjax.transport.random_walk.flight import boundary, free_flight
@@ -52,7 +51,7 @@ class Walk:
         scene: the stack.
         wi: where the light comes from, path by path.
         wo: where light should go, or None for a walk that only follows it.
-        microfacets: whether light that stays on a rough surface is followed.
+        multiple: whether light that stays on a rough surface is followed.
         orders: which orders count (see `layerjax.RandomWalk`).
         count_orders: whether to count events although all orders count.
     """
@@ -62,7 +61,7 @@ class Walk:
         scene: Scene,
         wi: Vector,
         wo: Vector | None,
-        microfacets: Microfacets,
+        multiple: bool,
         orders: Orders = "all",
         count_orders: bool = False,
     ):
@@ -70,7 +69,7 @@ class Walk:
         self.wi = wi
         self.orders: Orders = orders
         self.counts = count_orders or orders != "all"
-        self.multiple = microfacets == "multiple" and microsurface.applies(scene)
+        self.multiple = multiple and microsurface.applies(scene)
         self.goal = None if wo is None else make_goal(scene, wo)
         self.aims = wo is not None and bool(scene.interfaces) and orders != "first"
         # where two surfaces enclose a region, light from one may be aimed through the other
@@ -166,13 +165,13 @@ class Walk:
         """Scattering in a medium."""
         scene, wi, medium = self.scene, scale(-1.0, path.direction), arrival.medium
         area = scene.cross_section(medium, wi)
-        direction, kept = scene.deflect(medium, wi, u[1], u[2])
+        direction, weight = scene.deflect(medium, wi, u[1], u[2])
         if target is None:
-            return Event(direction, kept, arrival.collides)
+            return Event(direction, weight, arrival.collides)
         density, share = scene.collide(medium, wi, target.direction, area)
         sent = tuple(density * pick(share, c) for c in range(scene.channels))
         next_density = scene.collide(medium, wi, direction, area)[0] if self.mixes else None
-        event = Event(direction, kept, arrival.collides, sent, density, next_density)
+        event = Event(direction, weight, arrival.collides, sent, density, next_density)
         if path.relay is None:
             return event
         density, share = scene.collide(medium, wi, path.relay.travel, area)
@@ -200,7 +199,7 @@ class Walk:
             assert surface is not None
             beyond = jnp.where(from_above, surface + 1, surface)
             path = path._replace(region=jnp.where(at_surface & hit.crosses, beyond, path.region))
-        event = Event(hit.direction, hit.kept, hit.survives, hit.towards_target, leaves=leaves)
+        event = Event(hit.direction, hit.weight, hit.survives, hit.towards_target, leaves=leaves)
         if self.adjacent and towards is not None:
             densities = [
                 surfaces.density(scene, surface, entered_above, entry, w, diffuse=self.multiple)
@@ -269,7 +268,7 @@ class Walk:
 
     def _continue(self, path: PathState, arrival: Arrival, event: Event, u: list[Array]) -> tuple[PathState, Array]:
         """The path after its event, and whether it ends; one that has drawn its aim becomes light along wi."""
-        throughput = tuple(path.throughput[c] * pick(event.kept, c) for c in range(self.scene.channels))
+        throughput = tuple(path.throughput[c] * pick(event.weight, c) for c in range(self.scene.channels))
         after = path._replace(direction=event.direction, throughput=throughput)
         ends = arrival.escapes | ~event.survives
         if self.fades:

@@ -26,14 +26,14 @@ from layerjax.stack import Medium
 from layerjax.transport.spongecake.mapping import (
     GEOMETRY_FEATURES,
     Numbers,
-    between,
+    features_of_pairs,
     geometry,
     in_order,
-    kept,
     medium_of,
     orders,
     pair_features,
     perceptron,
+    scattered_share,
 )
 
 POWER = 16
@@ -64,7 +64,7 @@ def share_of(media: tuple[Medium, ...]) -> Array:
     share = jnp.ones(1)
     for medium in media:
         f0 = 1.0 if medium.f0 is None else medium.f0
-        share = share * kept(jnp.asarray(medium.albedo), jnp.asarray(f0)) ** FADING
+        share = share * scattered_share(jnp.asarray(medium.albedo), jnp.asarray(f0)) ** FADING
     return share
 
 
@@ -98,7 +98,9 @@ def coefficients_of(net: eqx.nn.MLP, media: Numbers, turning: bool) -> Array:
     sides = []
     for side, order in zip((1.0, -1.0), orders(count), strict=False):
         turned = in_order(media, order)
-        raw = net(jnp.concatenate([*(geometry(medium_of(turned, k)) for k in range(count)), *between(turned)]))
+        raw = net(
+            jnp.concatenate([*(geometry(medium_of(turned, k)) for k in range(count)), *features_of_pairs(turned)])
+        )
         raw = LARGEST / POWER * jnp.tanh(raw / LARGEST)
         level, azimuthal = raw[: DEGREE + 1], raw[DEGREE + 1 :].reshape(count, -1)
         parts = [_powers(level).at[0].add(1.0)]

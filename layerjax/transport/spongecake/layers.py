@@ -31,18 +31,18 @@ def pair_of(media: tuple[Medium, ...]) -> tuple[Medium, ...]:
 def _together(one: Medium, other: Medium) -> Medium:
     keeper, guest = sorted((one, other), key=lambda medium: -float(np.mean(_scattering(medium))))
     depths = [jnp.asarray(medium.thickness) * _area(medium.phase) for medium in (keeper, guest)]
-    albedos = [jnp.asarray(medium.albedo) * _kept(medium) for medium in (keeper, guest)]
+    albedos = [jnp.asarray(medium.albedo) * _scattered_share(medium) for medium in (keeper, guest)]
     total = depths[0] + depths[1]
-    albedo = (depths[0] * albedos[0] + depths[1] * albedos[1]) / total / _kept(keeper)
+    albedo = (depths[0] * albedos[0] + depths[1] * albedos[1]) / total / _scattered_share(keeper)
     albedo = jnp.where(albedo < 1.0, albedo, 1.0)
     return eqx.tree_at(lambda m: (m.thickness, m.albedo), keeper, (total / _area(keeper.phase), albedo))
 
 
 def _scattering(medium: Medium) -> Array:
-    return jnp.asarray(medium.thickness) * _area(medium.phase) * jnp.asarray(medium.albedo) * _kept(medium)
+    return jnp.asarray(medium.thickness) * _area(medium.phase) * jnp.asarray(medium.albedo) * _scattered_share(medium)
 
 
-def _kept(medium: Medium) -> Array:
+def _scattered_share(medium: Medium) -> Array:
     """Mean of the Schlick term over isotropic pairs of directions."""
     f0 = 1.0 if medium.f0 is None else medium.f0
     return jnp.asarray(f0 + (1.0 - f0) * 2.0 / 42.0)

@@ -147,7 +147,7 @@ def weights_of(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Arr
         rims.append(LEAST_SLOPE * (1.0 - strength[:, 2 * count + 2] / LN2))
     above, below = 0, len(lobes) - 1
     through = (sum(lobe[1] for lobe in lobes) / len(lobes), sum(level[1] for level in levels) / len(levels))
-    share = jnp.sum(kept(media.albedo, media.f0) * media.thickness / (1.0 + media.thickness)) ** 2
+    share = jnp.sum(scattered_share(media.albedo, media.f0) * media.thickness / (1.0 + media.thickness)) ** 2
     return Weights(
         share * jnp.stack([lobes[above][0], lobes[below][0], through[0]]),
         LEVEL * share * jnp.stack([levels[above][0], levels[below][0], through[1]]),
@@ -162,7 +162,7 @@ def _answer(net: eqx.nn.MLP, media: Numbers, mean_albedo: Array, mean_f0: Array)
     for k in range(count):
         medium = medium_of(media, k)
         features += [geometry(medium), _optics(medium, mean_albedo[k], mean_f0[k])]
-    return net(jnp.concatenate([*features, *between(media)]))
+    return net(jnp.concatenate([*features, *features_of_pairs(media)]))
 
 
 def geometry(medium: Numbers) -> Array:
@@ -178,7 +178,7 @@ def geometry(medium: Numbers) -> Array:
     return jnp.concatenate([medium.kind, jnp.stack(numbers)])
 
 
-def between(media: Numbers) -> list[Array]:
+def features_of_pairs(media: Numbers) -> list[Array]:
     """Inputs of networks that describe the angle of two axes, one array or none."""
     if len(media.thickness) == 1:
         return []
@@ -199,7 +199,7 @@ def _optics(medium: Numbers, mean_albedo: Array, mean_f0: Array) -> Array:
     return jnp.stack(numbers)
 
 
-def kept(albedo: Array, f0: Array) -> Array:
+def scattered_share(albedo: Array, f0: Array) -> Array:
     """About the share of light that survives a collision, between 0 and 1."""
     return albedo * (0.1 + 0.9 * f0)
 

@@ -26,7 +26,6 @@ from layerjax._devices import exact_products
 from layerjax._numerics import at_least, at_most, horizon, safe_div, safe_sqrt
 from layerjax.channels import Channels, per_channel, pick, select, times
 from layerjax.directions import Vector, sanitised
-from layerjax.microsurface import Microfacets
 from layerjax.quadrature import gauss_legendre
 from layerjax.stack import Interface, Stack, media_of, optical_depths
 from layerjax.surfaces import Lambertian, Surface
@@ -69,20 +68,20 @@ class DiffuseBase(eqx.Module):
         """BRDF of the light that has reached the base, 0 unless both directions are above."""
         edge = horizon(wi[2].dtype)
         valid = (wi[2] > edge) & (wo[2] > edge)
-        there, back = (_arriving(self, sanitised(w, valid)) for w in (wi, wo))
-        return select(valid, times(there, back, per_channel(self.level)))
+        incoming, back = (_arriving(self, sanitised(w, valid)) for w in (wi, wo))
+        return select(valid, times(incoming, back, per_channel(self.level)))
 
     def albedo(self, wi: Vector) -> Channels:
         """Energy of `value` for light along wi, above."""
-        there, factor = _arriving(self, wi), per_channel(self.energy)
-        return tuple(pick(there, c) * pick(factor, c) for c in range(max(len(there), len(factor))))
+        incoming, factor = _arriving(self, wi), per_channel(self.energy)
+        return tuple(pick(incoming, c) * pick(factor, c) for c in range(max(len(incoming), len(factor))))
 
 
-def make_diffuse(stack: Stack, base: Surface, microfacets: Microfacets) -> DiffuseBase:
+def make_diffuse(stack: Stack, base: Surface, multiple: bool) -> DiffuseBase:
     """The diffuse part of a simplified stack over a diffuse base."""
     bare = Stack(stack.layers, None)
     # planned out here: what is known of the layers while tracing saves the solver work
-    plan = make_plan(bare, Resolution(NODES, 1, (2, 4)), microfacets)
+    plan = make_plan(bare, Resolution(NODES, 1, (2, 4)), multiple)
     return _closed_form(bare, base, plan, precision(stack))
 
 
@@ -107,38 +106,38 @@ def _closed_form(bare: Stack, base: Surface, plan: Plan, dtype: Any) -> DiffuseB
 
     scattered, back = arriving(whole.transmit_down), arriving(whole.reflect_bottom)
     if whole.direct_down is None:
-        there, table = scattered, _refracted_table(bare, grid, scattered, plan)
+        incoming, table = scattered, _refracted_table(bare, grid, scattered, plan)
     else:
         ballistic = whole.direct_down[:, 0] * counted
-        there, table = scattered + ballistic, _ballistic_table(bare, base, grid, scattered)
+        incoming, table = scattered + ballistic, _ballistic_table(bare, base, grid, scattered)
     # means over diffuse light at the nodes of the solver: they know the critical angles
     inward, outward = (2.0 * region.weight / region.ior**2 for region in (bottom, top))
     returned = jnp.sum(inward * counted * back, axis=-1)
     if not isinstance(base, Lambertian):
         returned = at_most(returned, LARGEST_RETURN / at_least(albedo, 1.0))
-    leaving = jnp.sum(outward * there, axis=-1) / bottom.ior**2  # by reciprocity
+    leaving = jnp.sum(outward * incoming, axis=-1) / bottom.ior**2  # by reciprocity
     one = jnp.ones_like(returned)
     level = closed_form(one, one, returned, albedo, bottom.ior)
     return DiffuseBase(grid, table.T, level, indirect_energy(one, leaving, returned, albedo))
 
 
-def _refracted_table(bare: Stack, grid: Grid, there: Array, plan: Plan) -> Array:
+def _refracted_table(bare: Stack, grid: Grid, incoming: Array, plan: Plan) -> Array:
     """T at the points of a table, from its values at the nodes, where the first interface is rough.
 
     What becomes of the light behind that interface varies slowly: it is interpolated. What the interface lets in, which
     rises within its roughness at a critical angle, is integrated at the points themselves.
     """
     face = next(layer for layer in bare.layers if isinstance(layer, Interface))
-    normals = Normals(jnp.asarray(face.alpha, there.dtype), face.distribution)
+    normals = Normals(jnp.asarray(face.alpha, incoming.dtype), face.distribution)
     top, below = grid.regions[:2]
 
     def entering(region: Region) -> Array:
         _, passed, lost = facet_energies(region, below, normals)
-        return passed + lost if plan.microfacets == "multiple" else passed
+        return passed + lost if plan.multiple else passed
 
     at_nodes, at_points = entering(top), entering(table_region(grid, top))
-    typical = safe_div(there @ top.weight, at_nodes @ top.weight)[:, None]
-    behind = (there + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
+    typical = safe_div(incoming @ top.weight, at_nodes @ top.weight)[:, None]
+    behind = (incoming + LEAST_ENTERING * typical) / (at_nodes + LEAST_ENTERING)
     return at_table_points(grid, behind) * at_points
 
 

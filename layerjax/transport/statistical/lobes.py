@@ -16,7 +16,7 @@ from jax import Array
 from layerjax import channels, fresnel
 from layerjax._numerics import at_least, at_most, unstacked
 from layerjax.channels import Channels, each, per_channel
-from layerjax.microsurface.directional_albedo import Microfacets, is_smooth
+from layerjax.microsurface.directional_albedo import is_smooth
 from layerjax.microsurface.energy_tables import conductor_energies, interface_energies, retained_share
 from layerjax.stack import Interface, Medium, Stack, is_known
 from layerjax.surfaces import Conductor
@@ -41,7 +41,7 @@ LEAST_DEPTH = 1e-9
 class Options(NamedTuple):
     """How the statistics are taken: see `Statistical`."""
 
-    microfacets: Microfacets
+    multiple: bool
     scattering: Scattering
     angles: bool
     own_side: bool
@@ -200,29 +200,29 @@ def _dielectric(
 ) -> tuple[Array, Array]:
     """Reflected and transmitted energy of interfaces, one a row."""
     if not any(smooth):
-        return interface_energies(cosine, alpha, ior, options.microfacets)
+        return interface_energies(cosine, alpha, ior, options.multiple)
     exact = fresnel.dielectric(cosine, ior)
     rough = np.flatnonzero(~np.asarray(smooth))
     if not rough.size:
         return exact, 1.0 - exact
-    r, t = interface_energies(cosine[rough], alpha[rough], ior[rough], options.microfacets)
+    r, t = interface_energies(cosine[rough], alpha[rough], ior[rough], options.multiple)
     return exact.at[rough].set(r), (1.0 - exact).at[rough].set(t)
 
 
 def _conductor(base: Conductor, cosine: Array, index: Array, options: Options, smooth: bool) -> Element:
     alpha = jnp.asarray(base.alpha)
-    levels = metal_levels(base, cosine, index, options.microfacets, smooth)
+    levels = metal_levels(base, cosine, index, options.multiple, smooth)
     zero, one = (jnp.zeros_like(cosine),), (jnp.ones_like(cosine),)
     dark = (zero,)  # nothing passes
     return Element((levels,), dark, dark, dark, (variance(alpha) * one[0],), zero, zero, one)
 
 
-def metal_levels(base: Conductor, cosine: Array, index: Array, microfacets: Microfacets, smooth: bool) -> Channels:
+def metal_levels(base: Conductor, cosine: Array, index: Array, multiple: bool, smooth: bool) -> Channels:
     """Reflectance of a metal in a medium of this index."""
     ior, k = (tuple(x / index for x in per_channel(jnp.asarray(value))) for value in (base.ior, base.k))
     if smooth:
         return each(lambda ior, k: fresnel.conductor(cosine, ior, k), ior, k)
-    return conductor_energies(cosine, jnp.asarray(base.alpha), ior, k, microfacets)
+    return conductor_energies(cosine, jnp.asarray(base.alpha), ior, k, multiple)
 
 
 def _medium(medium: Medium, cosine: Array, options: Options) -> tuple[Element, tuple[Channels, Array] | None]:

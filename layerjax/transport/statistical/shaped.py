@@ -128,11 +128,11 @@ def unfolded(w: Vector, ratio: Array) -> Vector:
     return x, y, -jnp.where(w[2] > 0, safe_sqrt(1.0 - x * x - y * y), 0.0)
 
 
-def _returning(found: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | None]:
+def _returning(statistics: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | None]:
     """The reflected lobes by orders, and the facet that stands for one of them itself, if any does."""
     facet: Facet | None = None
     lobes = []
-    for entry in found.reflected:
+    for entry in statistics.reflected:
         for order, energy in enumerate(entry.lobe.energy):
             sigma: Channels | None = None
             if entry.facet is not None and order == 0:
@@ -143,13 +143,13 @@ def _returning(found: Statistics, cosine: Array) -> tuple[list[_Lobe], Facet | N
     return lobes, facet
 
 
-def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], Array]:
+def _passing(stack: Stack, statistics: Statistics, cosine: Array, upward: bool) -> tuple[list[_Lobe], Array]:
     """The transmitted lobes by orders, in the medium of the reference index, none over a base.
 
     Also the largest sine there that is not totally reflected on the way out. What nothing meets (no interface, no
     collision) passes and is no lobe.
     """
-    if found.transmitted is None:
+    if statistics.transmitted is None:
         return [], jnp.ones_like(cosine)
     below, reference = index_below(stack), reference_index(stack)
     enters, leaves = (below, jnp.ones_like(below)) if upward else (jnp.ones_like(below), below)
@@ -158,9 +158,9 @@ def _passing(stack: Stack, found: Statistics, cosine: Array, upward: bool) -> tu
     widening = leaves * behind / (reference * here)  # variance in the reference medium of a unit of it behind
     met = any(isinstance(layer, Interface) for layer in stack.layers)
     lobes: list[_Lobe] = []
-    for order, energy in enumerate(found.transmitted.energy):
+    for order, energy in enumerate(statistics.transmitted.energy):
         if order > 0 or met:
-            sigma = _widened(found.transmitted.variance, found.transmitted_spread, order)
+            sigma = _widened(statistics.transmitted.variance, statistics.transmitted_spread, order)
             lobes.append(_Lobe(energy, tuple(widening * part for part in sigma), here))
     return lobes, leaves / reference
 
@@ -196,7 +196,7 @@ def _widened(variance: Channels, spread: Channels | None, order: int) -> Channel
 def _of_facet(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
     """Energy that the facets of the first interface or base reflect at their first collision."""
     if isinstance(what, Conductor):
-        return metal_levels(what, cosine, relative, "single", smooth)
+        return metal_levels(what, cosine, relative, False, smooth)
     if smooth:
         return (fresnel.dielectric(cosine, relative),)
     return (single_reflectance(cosine, jnp.asarray(what.alpha), relative),)

@@ -118,7 +118,7 @@ class Meeting(NamedTuple):
     """
 
     onward: Array
-    again: Array
+    arriving_again: Array
     returned: Array
     turns: Array
 
@@ -130,9 +130,9 @@ def meeting(below: Below, bottom: Array) -> Meeting:
     if below.reflected is not None:
         turns = inverse(turns - matmul(bottom, below.reflected))
         onward = times(jnp.swapaxes(turns, -1, -2), onward)
-    again = times(jnp.swapaxes(bottom, -1, -2), onward)
+    arriving_again = times(jnp.swapaxes(bottom, -1, -2), onward)
     emitted = below.onward * below.ratio  # of diffuse light from the base, by reciprocity
-    return Meeting(onward, again, below.returned + dot(again, emitted), turns)
+    return Meeting(onward, arriving_again, below.returned + dot(arriving_again, emitted), turns)
 
 
 class Roof(NamedTuple):

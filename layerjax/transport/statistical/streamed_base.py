@@ -86,7 +86,7 @@ class StreamedBase(ClosedForm):
     ior: Array
     depth: Channels | None
     onward: Channels
-    again: Channels
+    arriving_again: Channels
     scattered: tuple[Channels, Channels] | None
     second: Second | None
 
@@ -132,13 +132,13 @@ def make_streamed(stack: Stack) -> StreamedBase:
     met = stream_layers.meeting(below, roof.bottom)
     depth = _depth(media, dtype)
     behind = streams.times(jnp.swapaxes(roof.inside, -1, -2), met.onward)
-    again, scattered = met.again, None
+    arriving_again, scattered = met.arriving_again, None
     if not all(map(absorbs, media)):
         assert depth is not None
         ballistic = stream_layers.ballistic(jnp.stack(depth))
         once = met.onward * ballistic
-        again = ballistic * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
-        down, up = (streams.by_polynomials(part) for part in (behind - once, met.again - again))
+        arriving_again = ballistic * streams.times(jnp.swapaxes(faces[0].bottom, -1, -2), once)
+        down, up = (streams.by_polynomials(part) for part in (behind - once, met.arriving_again - arriving_again))
         scattered = per_channel(down), per_channel(up)
     out = streams.times(jnp.swapaxes(faces[0].down, -1, -2), behind)
     leaving = per_channel(streams.dot(out, jnp.asarray(streams.DIFFUSE, dtype)) / indices[-1] ** 2)  # by reciprocity
@@ -148,7 +148,7 @@ def make_streamed(stack: Stack) -> StreamedBase:
         ior=indices[1],
         depth=depth,
         onward=per_channel(streams.by_polynomials(met.onward)),
-        again=per_channel(streams.by_polynomials(again)),
+        arriving_again=per_channel(streams.by_polynomials(arriving_again)),
         scattered=scattered,
         second=second,
         level=each(lambda r, rho: closed_form(one, one, r, rho, indices[-1]), returned, albedo),
@@ -167,7 +167,7 @@ def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: 
     reflectance: of that interface, from outside and, of a beam, from inside.
     """
     values = streams.polynomials(cosines)
-    found: Channels = tuple(streams.along(values, row) for row in part.onward)
+    arriving: Channels = tuple(streams.along(values, row) for row in part.onward)
     through = (jnp.ones_like(spread),) if part.depth is None else tuple(jnp.exp(-d / cosines) for d in part.depth)
     if part.second is not None:
         passed, shares = streams.entering(cosines, part.second.alpha, part.second.ior)
@@ -175,15 +175,15 @@ def _along_two(part: StreamedBase, reflectance: Array, cosines: Array, weights: 
         if part.second.onward is not None:
             once = tuple(passed * streams.along(shares, row) for row in part.second.onward)
         narrow = 1.0 / (1.0 + (spread / TURNED) ** 2)
-        back: Channels = tuple((1.0 - narrow) * streams.along(values, row) for row in part.again)
+        back: Channels = tuple((1.0 - narrow) * streams.along(values, row) for row in part.arriving_again)
         if part.scattered is not None:
             back = each(lambda b, row: b + streams.along(values, row), back, part.scattered[1])
         turns = tuple(1.0 - narrow * reflectance * (1.0 - passed) * t * t for t in through)
         beam = each(lambda o, b, turns: (o + (1.0 - passed) * b) / turns, once, back, turns)
         wide = part.second.alpha**4 / (part.second.alpha**4 + NARROW**4)
         share = tuple((1.0 - wide * t * t) / (1.0 + (spread / BEAM) ** 2) for t in through)
-        found = each(lambda f, b, s: f + s * (b - f), found, beam, share)
-    return tuple(jnp.sum(weights * f, axis=0) for f in times(found, through))
+        arriving = each(lambda f, b, s: f + s * (b - f), arriving, beam, share)
+    return tuple(jnp.sum(weights * f, axis=0) for f in times(arriving, through))
 
 
 def absorbs(layer: Interface | Medium) -> bool:

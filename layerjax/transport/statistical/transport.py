@@ -20,7 +20,6 @@ from layerjax._numerics import horizon, safe_div, safe_sqrt
 from layerjax._parameters import is_placeholder
 from layerjax.channels import Channels
 from layerjax.directions import Vector, add, dot, flip, half_vector, reflect, sanitised, select
-from layerjax.microsurface import Microfacets
 from layerjax.microsurface.energy_tables import LARGEST_INDEX
 from layerjax.normals.facets import reflection_pdf
 from layerjax.normals.ggx import ggx_area, ggx_density, ggx_sample
@@ -88,13 +87,13 @@ class Statistical(DeterministicTransport):
     Args:
         symmetric: the Symmetric model (statistics at the angle between light and half vector: reciprocal, energy only
             near 1) or the Forward model (at the angle of the light: conserves energy, not reciprocal); Sec. 6.
-        microfacets: ``"multiple"``, interfaces conserve energy (FGD-infinity of the paper, by the walk of Heitz et
-            al. 2016), or ``"single"``, Walter 2007: light that a facet sends into another is lost.
+        facet_multiple_scattering: whether interfaces conserve energy (FGD-infinity of the paper, by the walk of
+            Heitz et al. 2016); else light that a facet sends into another is lost (Walter 2007).
         scattering: ``"orders"``, lobes for 0, 1 and more collisions, or ``"single"``, one lobe and at most one
             collision a crossing, as the paper has it (Eqs. 20-24); of media alone, with neither interface nor base,
             that lobe cannot be distinguished from unscattered light, and both are omitted.
         diffuse: light that has met a diffuse base: ``"tables"``, a closed form with transmittances from tables and few
-            streams, at every texel (over a `Lambertian`, ``microfacets="multiple"``; what else there is as if
+            streams, at every texel (over a `Lambertian`, ``facet_multiple_scattering=True``; what else there is as if
             ``"exact"``); ``"exact"``, those of an adding-doubling solve for every stack; or ``"lobe"``, one GGX lobe
             from tables (2022), for interfaces and absorbing media over a `Lambertian`.
         angles: whether the width of a refracted lobe follows the angle (Eq. 10) or is that at normal incidence.
@@ -105,16 +104,16 @@ class Statistical(DeterministicTransport):
     """
 
     symmetric: bool = eqx.field(static=True, default=True)
-    microfacets: Microfacets = eqx.field(static=True, default="multiple")
+    facet_multiple_scattering: bool = eqx.field(static=True, default=True)
     scattering: Scattering = eqx.field(static=True, default="orders")
     diffuse: Diffuse = eqx.field(static=True, default="tables")
     angles: bool = eqx.field(static=True, default=False)
     own_side: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self) -> None:
-        for name in ("symmetric", "angles", "own_side"):
+        for name in ("symmetric", "facet_multiple_scattering", "angles", "own_side"):
             require_choice(f"Statistical.{name}", getattr(self, name), (True, False))
-        for name, choices in (("microfacets", Microfacets), ("scattering", Scattering), ("diffuse", Diffuse)):
+        for name, choices in (("scattering", Scattering), ("diffuse", Diffuse)):
             value = getattr(self, name)
             if value not in get_args(choices):
                 allowed = ", ".join(map(repr, get_args(choices)))
@@ -146,7 +145,7 @@ class Statistical(DeterministicTransport):
             elif self.diffuse == "lobe":
                 diffuse = make_diffuse_lobe(stack)
             elif self._solves(stack):
-                diffuse = make_diffuse(stack, stack.base, self.microfacets)
+                diffuse = make_diffuse(stack, stack.base, self.facet_multiple_scattering)
             else:
                 diffuse = _closed_form(stack)
         return Lit(stack, diffuse, index_below(stack), reference_index(stack), smooth_parts(stack))
@@ -201,10 +200,12 @@ class Statistical(DeterministicTransport):
         """Whether the diffuse part of a simplified stack needs a solve of its own."""
         if stack.base is None or not _is_diffuse(stack.base) or not stack.layers:
             return False
-        return self.diffuse != "tables" or self.microfacets == "single" or not (is_streamed(stack) or is_hazy(stack))
+        return (
+            self.diffuse != "tables" or not self.facet_multiple_scattering or not (is_streamed(stack) or is_hazy(stack))
+        )
 
     def _shaped(self, state: Lit, cosine: Array, upward: bool) -> Shaped:
-        options = Options(self.microfacets, self.scattering, self.angles, self.own_side, state.smooth)
+        options = Options(self.facet_multiple_scattering, self.scattering, self.angles, self.own_side, state.smooth)
         return shaped(state.stack, options, cosine, upward)
 
     def _lobes(self, state: Lit, wi: Vector, upward: bool) -> Shaped:

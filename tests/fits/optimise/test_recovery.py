@@ -145,7 +145,7 @@ def returned(ior, thickness, n, k):
 @pytest.mark.slow  # its derivatives compile for more than a minute
 def test_index_extinction_and_absorption_are_recovered_and_said_to_be_inseparable() -> None:
     """All six numbers free; of the metal a handbook's median with a factor of 1.6 either way is known beforehand."""
-    transport = lj.Statistical(microfacets="single")
+    transport = lj.Statistical(facet_multiple_scattering=False)
     geometry = slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     data = simulate(coat(*METAL.values()), geometry, transport=transport, noise=0.03, seed=1)
     free = coat(

@@ -13,10 +13,10 @@ from layerjax.microsurface.directional_albedo import (
 )
 from tests.helpers.metals import conductor_energy
 
-multiple = jax.jit(lambda c, a, n: interface_energies(c, a, n, "multiple"))
-single = jax.jit(lambda c, a, n: interface_energies(c, a, n, "single"))
-metal = jax.jit(lambda c, a, n, k: conductor_energy(c, a, n, k, "multiple"))
-metal_single = jax.jit(lambda c, a, n, k: conductor_energy(c, a, n, k, "single"))
+multiple = jax.jit(lambda c, a, n: interface_energies(c, a, n, True))
+single = jax.jit(lambda c, a, n: interface_energies(c, a, n, False))
+metal = jax.jit(lambda c, a, n, k: conductor_energy(c, a, n, k, True))
+metal_single = jax.jit(lambda c, a, n, k: conductor_energy(c, a, n, k, False))
 
 CASES = [(1.0, 0.1, 1.5), (0.5, 0.1, 1.5), (0.2, 0.5, 1.5), (0.05, 0.4, 2.0), (0.9, 0.5, 1 / 1.5), (0.3, 0.2, 0.5)]
 
@@ -95,7 +95,7 @@ def test_multiple_scattering_equals_walks_that_no_table_was_fitted_to():
     def walk(cosine, alpha, ior, key):
         wi = jnp.stack([jnp.sqrt(1 - cosine**2), 0.0, cosine])
         stack = lj.Stack([lj.Interface(ior=ior, alpha=alpha)])
-        gram = lj.goniophotometer(stack, wi, key=key, paths=32768, polar=1, azimuth=1, microfacets="multiple")
+        gram = lj.goniophotometer(stack, wi, key=key, paths=32768, polar=1, azimuth=1, facet_multiple_scattering=True)
         return gram.albedo[0, 0], gram.albedo_error[0, 0]
 
     for number in range(12):
@@ -138,7 +138,7 @@ def box(dtype):
 
 
 def both_kinds(cosine, alpha, ior):
-    kinds = ("single", "multiple")
+    kinds = (False, True)
     return jnp.stack([part for kind in kinds for part in interface_energies(cosine, alpha, ior, kind)])
 
 
@@ -163,7 +163,7 @@ def test_values_and_derivatives_are_finite_over_the_box(dtype):
     metals = jnp.where(ior == 0.25, 0.01, jnp.where(ior == 4.0, 10.0, ior))
     quantities = [
         (both_kinds, (cosine, alpha, ior)),
-        (lambda c, a, n, k: conductor_energy(c, a, n, k, "multiple"), (cosine, alpha, metals, k)),
+        (lambda c, a, n, k: conductor_energy(c, a, n, k, True), (cosine, alpha, metals, k)),
         (retained, (cosine, alpha, ior)),
     ]
     for function, arguments in quantities:
@@ -185,7 +185,7 @@ COSINE, ALPHA, IOR = (
     [
         (both_kinds, (COSINE, ALPHA, IOR)),
         pytest.param(
-            *(lambda c, a, n, k: conductor_energy(c, a, n, k, "multiple"), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
+            *(lambda c, a, n, k: conductor_energy(c, a, n, k, True), (COSINE, ALPHA, IOR, 2.0 + 0.0 * IOR)),
             marks=pytest.mark.slow,
         ),
         (retained, (COSINE, ALPHA, 0.6 * IOR)),

@@ -37,23 +37,23 @@ def test_mirrors_and_metals() -> None:
     near(tables.mirror_energy(cosine, alpha), by_quadrature.lobe_energy(cosine, alpha, points=24), 1e-4, 6e-4)
     rng = np.random.default_rng(2)
     ior, k = 0.02 * 500.0 ** rng.uniform(size=COUNT), 0.3 + 20.0 * rng.uniform(size=COUNT) ** 1.5
-    for microfacets, errors in (("single", (1e-3, 7e-3)), ("multiple", (2e-3, 3e-2))):
-        (found,) = tables.conductor_energies(cosine, alpha, (jnp.asarray(ior),), (jnp.asarray(k),), microfacets)
-        near(found, conductor_energy(cosine, alpha, ior, k, microfacets, points=24), *errors)
+    for multiple, errors in ((False, (1e-3, 7e-3)), (True, (2e-3, 3e-2))):
+        (found,) = tables.conductor_energies(cosine, alpha, (jnp.asarray(ior),), (jnp.asarray(k),), multiple)
+        near(found, conductor_energy(cosine, alpha, ior, k, multiple, points=24), *errors)
 
 
 @pytest.mark.parametrize("below", [False, True])
 def test_interfaces(below: bool) -> None:
     (cosine, alpha), ior = rough(), indices(below)
-    found = tables.interface_energies(cosine, alpha, ior, "single")
-    wanted = by_quadrature.interface_energies(cosine, alpha, ior, "single", points=16)
+    found = tables.interface_energies(cosine, alpha, ior, False)
+    wanted = by_quadrature.interface_energies(cosine, alpha, ior, False, points=16)
     for mine, other in zip(found, wanted, strict=True):
         near(mine, other, 2e-3, 3e-2)
     near(tables.single_reflectance(cosine, alpha, ior), wanted[0], 2e-3, 3e-2)
-    reflected, passed = tables.interface_energies(cosine, alpha, ior, "multiple")
+    reflected, passed = tables.interface_energies(cosine, alpha, ior, True)
     np.testing.assert_allclose(reflected + passed, 1.0, rtol=1e-12)
     wide = alpha > 0.01  # what walks have told of
-    wanted = by_quadrature.interface_energies(cosine, alpha, ior, "multiple", points=16)[0]
+    wanted = by_quadrature.interface_energies(cosine, alpha, ior, True, points=16)[0]
     near(reflected[wide], wanted[wide], 2e-3, 3e-2)
 
 
@@ -108,9 +108,9 @@ def test_ends_of_the_box(dtype) -> None:
     c, a, n = (jnp.asarray(axis.ravel(), dtype) for axis in axes)
 
     def energies(c, a, n):
-        metal = tables.conductor_energies(c, a, (n,), (3.0 * n,), "multiple")
-        metal += tables.conductor_energies(c, a, (n,), (0.0 * n,), "single")
-        faces = (*tables.interface_energies(c, a, n, "single"), *tables.interface_energies(c, a, n, "multiple"))
+        metal = tables.conductor_energies(c, a, (n,), (3.0 * n,), True)
+        metal += tables.conductor_energies(c, a, (n,), (0.0 * n,), False)
+        faces = (*tables.interface_energies(c, a, n, False), *tables.interface_energies(c, a, n, True))
         return jnp.stack([*metal, *faces, tables.mirror_energy(c, a), tables.retained_share(c, a, n)])
 
     found = jax.jit(jax.vmap(energies))(c, a, n)

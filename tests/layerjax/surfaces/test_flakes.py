@@ -30,8 +30,8 @@ CROSS_SECTIONS = [
 def test_cross_section_against_quadrature():
     cosine, alpha, expected = np.array(CROSS_SECTIONS).T
     seen = jax.jit(jax.vmap(areas))(split(along(np.abs(cosine), 0.8)), 2.0 / alpha**2)
-    np.testing.assert_allclose(np.where(cosine >= 0, seen.ahead, seen.behind), expected, rtol=1e-10)
-    np.testing.assert_allclose(seen.mean, 0.5 * (seen.ahead + seen.behind), rtol=1e-14)
+    np.testing.assert_allclose(np.where(cosine >= 0, seen.ahead, seen.facing_away), expected, rtol=1e-10)
+    np.testing.assert_allclose(seen.mean, 0.5 * (seen.ahead + seen.facing_away), rtol=1e-14)
 
 
 def test_cross_section_in_single_precision_and_at_its_limits():

@@ -172,12 +172,16 @@ REFUSED = {
         lj.Lambertian(0.5),
         lj.WeidlichWilkie(),
     ),
-    'AddingDoubling(microfacets="multiple") carries': (
+    "AddingDoubling(facet_multiple_scattering=True) carries": (
         [face(1.5, 5.0)],
         None,
-        lj.AddingDoubling(microfacets="multiple"),
+        lj.AddingDoubling(facet_multiple_scattering=True),
     ),
-    'RandomWalk(microfacets="multiple") carries': ([], metal(5.0), lj.RandomWalk(microfacets="multiple")),
+    "RandomWalk(facet_multiple_scattering=True) carries": (
+        [],
+        metal(5.0),
+        lj.RandomWalk(facet_multiple_scattering=True),
+    ),
     "layers[0]: SpongeCake carries no Interface": ([face(1.5, 5.0)], None, lj.SpongeCake()),
 }
 
@@ -288,7 +292,7 @@ def test_references_are_finite_over_the_box(dtype):
 
     solver = lj.AddingDoubling(nodes=4, modes=4)
     slopes = jax.jit(jax.jacfwd(lambda ior, alpha: values(ior, alpha, solver), (0, 1)))
-    walk = jax.jit(lambda ior, alpha: values(ior, alpha, lj.RandomWalk(paths=200, lanes=200), jax.random.key(2)))
+    walk = jax.jit(lambda ior, alpha: values(ior, alpha, lj.RandomWalk(paths=200, batch_size=200), jax.random.key(2)))
     for ior in (0.25, 1.5, 4.0):
         for kappas in ((1e-2, 1e8), (1e8, 1e8), (1e8, 1e-2), (5.0, 1e-2)):
             given = jnp.asarray(ior, dtype), jnp.sqrt(2.0 / jnp.asarray(kappas, dtype))

@@ -92,7 +92,7 @@ def test_lossless_media_lose_nothing(medium):
 @pytest.mark.parametrize("alpha", [0.02, 0.1, 0.5])
 def test_lossless_interfaces_lose_nothing(alpha):
     stack = Stack([Interface(1.5, alpha), Medium(1.0, phase=HenyeyGreenstein(0.3)), Interface(1.0, alpha)])
-    transport = lj.AddingDoubling(nodes=16, modes=1, microfacets="multiple")
+    transport = lj.AddingDoubling(nodes=16, modes=1, facet_multiple_scattering=True)
     reflected, transmitted = lj.albedo(stack, directions(40), transport)
     np.testing.assert_allclose(reflected + transmitted, 1.0, atol=1e-9)
 
@@ -263,7 +263,7 @@ def test_tolerance_of_a_concrete_stack_holds_within_jit():
         ({"ordinates": (4, 2000)}, "ordinates"),
         ({"tolerance": 2.0}, "tolerance"),
         ({"orders": "second"}, "orders"),
-        ({"microfacets": "none"}, "microfacets"),
+        ({"facet_multiple_scattering": "none"}, "facet_multiple_scattering"),
     ],
 )
 def test_bad_options_are_named(options, name):

@@ -115,7 +115,7 @@ def test_slope_of_the_albedo_of_a_narrow_lobe_is_that_of_a_mirror():
 def test_stack_that_absorbs_nothing_returns_all_that_meets_it():
     """Also with few nodes, which do not resolve what masking takes at grazing angles."""
     stack = lj.Stack([lj.Interface(1.5, 0.01)], None)
-    near, far = lj.albedo(stack, towards(DEGREES), transport=lj.AddingDoubling(6, 4, microfacets="multiple"))
+    near, far = lj.albedo(stack, towards(DEGREES), transport=lj.AddingDoubling(6, 4, facet_multiple_scattering=True))
     np.testing.assert_allclose(near + far, 1.0, atol=1e-9)
 
 

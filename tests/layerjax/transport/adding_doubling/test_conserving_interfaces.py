@@ -7,7 +7,7 @@ import pytest
 
 import layerjax as lj
 
-SOLVER = lj.AddingDoubling(nodes=24, modes=1, microfacets="multiple")
+SOLVER = lj.AddingDoubling(nodes=24, modes=1, facet_multiple_scattering=True)
 
 
 def test_energy_from_the_denser_side():
@@ -24,7 +24,7 @@ def test_what_crosses_is_what_the_walk_counts(ior, alpha):
     stack = lj.Stack([lj.Interface(ior, alpha)])
     wi = lj.direction(jnp.radians(jnp.array([0.0, 60.0, 85.0])), 0.0)
     seen = lj.goniophotometer(
-        stack, wi, key=jax.random.key(0), paths=1 << 16, polar=1, azimuth=1, orders=1, microfacets="multiple"
+        stack, wi, key=jax.random.key(0), paths=1 << 16, polar=1, azimuth=1, orders=1, facet_multiple_scattering=True
     )
     _, transmitted = lj.albedo(stack, wi, SOLVER)
     assert np.all(np.abs(transmitted[:, 0] - seen.albedo[:, 1, 0]) < 4 * seen.albedo_error[:, 1, 0] + 2e-3)
@@ -72,7 +72,7 @@ def test_values_hold_the_energy_that_is_told(name):
     cosine, azimuth = np.meshgrid(0.5 * (x + 1.0), (np.arange(32) + 0.5) * np.pi / 32, indexing="ij")
     weights = (weight * 0.5 * (x + 1.0))[:, None] * np.full(32, np.pi / 32)
     wi = lj.direction(1.1, 0.0)
-    prepared = lj.prepare(WHOLE[name], lj.AddingDoubling(nodes=12, modes=12, microfacets="multiple"))
+    prepared = lj.prepare(WHOLE[name], lj.AddingDoubling(nodes=12, modes=12, facet_multiple_scattering=True))
     values = lj.evaluate(prepared, wi, lj.direction(np.arccos(cosine), azimuth))[..., 0]
     reflected, _ = lj.albedo(prepared, wi)
     np.testing.assert_allclose(np.sum(weights * np.asarray(values)), reflected[0], rtol=1e-2)

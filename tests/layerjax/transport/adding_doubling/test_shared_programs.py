@@ -16,13 +16,13 @@ def operators(numbers):
     """Of two interfaces over paint."""
     layers = [lj.Interface(numbers[k], numbers[2 + k]) for k in range(2)]
     stack = lj.Stack(layers, lj.Lambertian(0.5))
-    return solve.solve(stack, solve.make_plan(stack, Resolution(2, 1, (2, 4)), "single"))[1]
+    return solve.solve(stack, solve.make_plan(stack, Resolution(2, 1, (2, 4)), False))[1]
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_thicknesses_share_a_program(dtype):
     stacks = [jax.tree.map(lambda x: jnp.asarray(x, dtype), lj.Stack([lj.Medium(tau)])) for tau in (1.0, 10.0)]
-    thin, thick = (solve.make_plan(stack, Resolution(2, 1, (2, 4)), "single") for stack in stacks)
+    thin, thick = (solve.make_plan(stack, Resolution(2, 1, (2, 4)), False) for stack in stacks)
     assert thin == thick
 
 

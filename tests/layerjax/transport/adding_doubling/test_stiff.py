@@ -9,7 +9,7 @@ import pytest
 
 import layerjax as lj
 
-SOLVER = lj.AddingDoubling(nodes=12, modes=1, microfacets="multiple")
+SOLVER = lj.AddingDoubling(nodes=12, modes=1, facet_multiple_scattering=True)
 ANGLES = jnp.concatenate([polar := jnp.linspace(0.0, 1.56, 9), np.pi - polar])
 
 
@@ -56,7 +56,7 @@ def test_twelve_layers():
             layers.append(lj.Medium(thicknesses[k], jnp.ones(()), lj.HenyeyGreenstein(peaks[k])))
         return lj.Stack(layers, lj.Lambertian(1.0))
 
-    solver = lj.AddingDoubling(nodes=6, modes=4, microfacets="multiple")
+    solver = lj.AddingDoubling(nodes=6, modes=4, facet_multiple_scattering=True)
     wi, wo = lj.direction(jnp.asarray([0.0, 0.7, 1.5]), 0.0), lj.direction(jnp.asarray([0.1, 0.7, 1.4]), 2.0)
 
     @jax.jit

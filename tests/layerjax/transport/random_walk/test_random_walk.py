@@ -9,7 +9,7 @@ import scipy.special
 import layerjax as lj
 from layerjax.directions import split
 from layerjax.surfaces.interface import interface_reflection, interface_transmission
-from layerjax.transport.random_walk.lanes import follow
+from layerjax.transport.random_walk.batches import follow
 from layerjax.transport.random_walk.random_numbers import key_words
 from layerjax.transport.random_walk.scene import Scene
 from layerjax.transport.random_walk.walk import Walk
@@ -23,7 +23,7 @@ EXTREME = flakes("surface", 1e-4, None, 1e4, 0.5, 0.0)
 
 def repeated(stack, wi, wo, **options):
     """Values and errors of many independent estimates of one value, shape (REPEATS, C)."""
-    walk = lj.RandomWalk(**{"paths": 1024, "lanes": 2048, **options})
+    walk = lj.RandomWalk(**{"paths": 1024, "batch_size": 2048, **options})
     found = lj.evaluate_with_error(stack, wi, jnp.broadcast_to(wo, (REPEATS, 3)), walk, key=KEY)
     return tuple(np.asarray(x) for x in found)
 
@@ -90,7 +90,7 @@ def test_one_interface(ior):
         (lj.Stack([haze(0.7, 2.0, 0.95), flakes("fiber", 0.3, (1.0, 0.0, 0.0), 0.5, 0.9)]), {}),
         (lj.Stack(COLORED, lj.Lambertian([0.5, 0.2, 0.1])), {}),
         pytest.param(
-            *(lj.Stack([lj.Interface(1.5, 0.4)], lj.Conductor(0.2, 3.9, 0.4)), {"microfacets": "multiple"}),
+            *(lj.Stack([lj.Interface(1.5, 0.4)], lj.Conductor(0.2, 3.9, 0.4)), {"facet_multiple_scattering": True}),
             marks=pytest.mark.slow,
         ),
         pytest.param(
@@ -113,7 +113,7 @@ def test_standard_errors_are_honest(stack, options):
 def test_reciprocity():
     # between media of different index: lit from above and seen from below the last interface, and the other way round
     stack = lj.Stack([lj.Interface(1.5, 0.3), haze(0.6, 0.7, 0.9), lj.Interface(1.3, 0.4)])
-    walk = lj.RandomWalk(paths=8000, microfacets="multiple")
+    walk = lj.RandomWalk(paths=8000, facet_multiple_scattering=True)
     wi = jnp.stack([WI, WI, BELOW])
     wo = jnp.stack([ABOVE, BELOW, lj.direction(2.2, 1.0)])
     scale = np.where(np.asarray([wi[:, 2], wo[:, 2]]) > 0, 1.0, 1.3**2)
@@ -197,7 +197,7 @@ def test_a_naive_stop_is_biased_and_this_one_is_not():
 
     zero = jnp.zeros(2, jnp.int64)
     start = (zero, zero, jnp.int32(0))
-    walk = Walk(scene, wi, None, "single")
+    walk = Walk(scene, wi, None, False)
     full, naive, _ = follow(walk, record, start, index, jnp.full(lanes, paths), words, jnp.dtype(jnp.float64))
     assert full[0] == lanes * paths  # each path that was owed, no other
     expected = transmittance_of_isotropic_slab(10.0)
@@ -213,7 +213,7 @@ def test_a_naive_stop_is_biased_and_this_one_is_not():
 def test_sums_in_single_precision_do_not_drift():
     """Every path brings the same: the mean of many is that to rounding, whose error in a plain sum is 1e-5."""
     with jax.enable_x64(False):
-        walk = lj.RandomWalk(paths=1 << 14, lanes=1)
+        walk = lj.RandomWalk(paths=1 << 14, batch_size=1)
         found, _ = lj.albedo(lj.Stack([], lj.Lambertian(0.3)), WI.astype(jnp.float32), walk, key=KEY)
     np.testing.assert_allclose(found, np.float32(0.3), rtol=1e-6)
 
@@ -258,20 +258,20 @@ def test_sides():
 
 
 @pytest.mark.parametrize(
-    ("dtype", "stack", "microfacets"),
+    ("dtype", "stack", "facet_multiple_scattering"),
     [
         (
             np.float32,
             lj.Stack([lj.Interface(4.0, 1e-4), haze(0.999, 5.0, 0.5)], lj.Conductor(0.01, 20.0, 1e-4)),
-            "single",
+            False,
         ),
-        (np.float32, lj.Stack([haze(-0.999, 1e-6), lj.Interface(1.0, 1.0), EXTREME]), "multiple"),
-        (np.float64, lj.Stack([haze(-0.999, 1e-6), lj.Interface(0.25, 1e-4), EXTREME]), "single"),
+        (np.float32, lj.Stack([haze(-0.999, 1e-6), lj.Interface(1.0, 1.0), EXTREME]), True),
+        (np.float64, lj.Stack([haze(-0.999, 1e-6), lj.Interface(0.25, 1e-4), EXTREME]), False),
     ],
 )
-def test_the_edges_of_the_box_are_finite(dtype, stack, microfacets):
+def test_the_edges_of_the_box_are_finite(dtype, stack, facet_multiple_scattering):
     grazing = lj.direction(jnp.asarray([np.pi / 2 - 1e-6, 0.0, 0.5]), 0.3).astype(dtype)
-    walk = lj.RandomWalk(paths=200, microfacets=microfacets)
+    walk = lj.RandomWalk(paths=200, facet_multiple_scattering=facet_multiple_scattering)
     for wo in (grazing, grazing * jnp.asarray([-1, -1, 1], dtype)):
         values, errors = lj.evaluate_with_error(stack, grazing, wo, walk, key=KEY)
         assert values.dtype == dtype
@@ -302,6 +302,6 @@ def test_samples_weigh_the_albedo(stack):
 
 
 def test_refusals():
-    for bad in ({"paths": 1}, {"lanes": 0}, {"microfacets": "none"}, {"orders": "second"}):
+    for bad in ({"paths": 1}, {"batch_size": 0}, {"facet_multiple_scattering": "none"}, {"orders": "second"}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             lj.RandomWalk(**bad)

@@ -110,7 +110,7 @@ PATHS = 60_000
 def walked(stack, wi, bins=64):
     """Energy that leaves on each light's own side and on the other, by its path through the coat, 1 / cosine."""
     seen = lj.goniophotometer(
-        stack, wi, key=jax.random.key(1), paths=PATHS, polar=bins, azimuth=1, orders=1, microfacets="multiple"
+        stack, wi, key=jax.random.key(1), paths=PATHS, polar=bins, azimuth=1, orders=1, facet_multiple_scattering=True
     )
     cosines = np.asarray(seen.cosines)
     return np.asarray(seen.energy)[..., 0, 0], 2 / (cosines[1:] + cosines[:-1])

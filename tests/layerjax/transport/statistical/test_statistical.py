@@ -15,7 +15,7 @@ from tests.helpers.sampling import chi_square
 ANGLES = np.radians([0.0, 30.0, 60.0, 75.0])
 LIGHT = np.asarray(lj.direction(ANGLES, np.zeros(4)))
 FORWARD, SYMMETRIC = lj.Statistical(symmetric=False), lj.Statistical()
-PAPER = Options("multiple", "orders", angles=False, own_side=False)
+PAPER = Options(True, "orders", angles=False, own_side=False)
 
 COAT = lj.Stack([lj.Interface(1.4, 0.1)], lj.Conductor(1.0, 1.0, 0.1))
 DIFFUSE = lj.Stack([lj.Interface(1.5, 0.1)], lj.Lambertian(0.9))
@@ -52,7 +52,7 @@ def test_energies_of_a_smooth_coat_on_metal():
 def test_widths_of_three_layers():
     """1.5/.2 over 2/0 over a relative .2 + 3i of .1: within 0.001 of the model's own values."""
     stack = lj.Stack([lj.Interface(1.5, 0.2), lj.Interface(2.0, 1e-4)], lj.Conductor(0.4, 6.0, 0.1))
-    found = lobes(stack, [0.0], PAPER._replace(microfacets="single"))
+    found = lobes(stack, [0.0], PAPER._replace(multiple=False))
     roughness = compiled(lobe_roughness)
     widths = [float(roughness(entry.lobe.variance[0])[0]) for entry in found]
     np.testing.assert_allclose(widths, [0.2, 0.0891, 0.25729], atol=1.5e-3)
@@ -80,7 +80,7 @@ def test_albedo_is_as_near_to_the_walk_as_the_model_can_be(name):
 def test_haze_behind_an_index_spreads_transmitted_light_alike_from_either_side():
     """A collision adds the variance of its phase function in the medium where it happens."""
     stack, cosine = lj.Stack([lj.Interface(1.5, 1e-4), lj.Medium(0.5, 1.0, lj.HenyeyGreenstein(0.9))]), jnp.ones(())
-    options = Options("multiple", "orders", angles=False, own_side=False)
+    options = Options(True, "orders", angles=False, own_side=False)
     for upward in (False, True):
         once = shaped(stack, options, cosine, upward).transmitted[1].alpha[0]
         np.testing.assert_allclose(once, roughness(phase_variance(jnp.asarray(0.9))), rtol=1e-3)
@@ -163,7 +163,7 @@ def test_closed_form_of_a_coated_diffuse_base(ior, absorbing):
     """Against the walk, away from the mirror lobe: 4 standard errors and 0.3 %."""
     layers = [lj.Interface(ior, 0.3), lj.Medium(absorbing, 0.0)] if absorbing else [lj.Interface(ior, 0.3)]
     stack = lj.Stack(layers, lj.Lambertian(0.8))
-    transport = lj.Statistical(microfacets="single")
+    transport = lj.Statistical(facet_multiple_scattering=False)
     wi = lj.direction(jnp.array([0.2, 0.6, 1.1]), 0.0)
     wo = lj.direction(jnp.array([0.5, 0.9, 0.4]), 1.4)
     values = lj.evaluate(stack, wi, wo, transport)
@@ -182,7 +182,7 @@ def test_closed_form_under_two_interfaces_and_haze():
     wi, wo = lj.direction(jnp.array([0.2, 0.9]), 0.0), lj.direction(jnp.array([0.7, 0.3]), 2.0)
     solver = lj.AddingDoubling(nodes=40, modes=32)
     truth = lj.evaluate(stack, wi, wo, solver) - lj.evaluate(bare, wi, wo, solver)
-    transport = lj.Statistical(microfacets="single")
+    transport = lj.Statistical(facet_multiple_scattering=False)
     found = lj.evaluate(stack, wi, wo, transport) - lj.evaluate(bare, wi, wo, transport)
     np.testing.assert_allclose(found, truth, rtol=3e-3)
 

@@ -71,7 +71,7 @@ def test_energies_of_smooth_interfaces(dtype):
     def energies(p):
         faces = [lj.Interface(ior, alpha) for ior in p[:2]]
         stack = lj.Stack(faces, lj.Conductor(p[2], p[3], alpha))
-        lobes = statistics(stack, cosine, Options("multiple", "orders", angles=False, own_side=False)).reflected
+        lobes = statistics(stack, cosine, Options(True, "orders", angles=False, own_side=False)).reflected
         return jnp.stack([entry.lobe.energy[0][0] for entry in lobes])
 
     axes = np.meshgrid([0.25, 0.6, 0.8, 1.0, 4.0], [0.25, 1.0, 1.5], [0.01, 0.8, 1.0], [0.0, 20.0])

@@ -36,10 +36,12 @@ def test_interfaces():
     assert program([COAT, lj.Interface(1.5, 0.1)]) == program([COAT])
 
 
-@pytest.mark.parametrize("microfacets", ["single", "multiple"])
-def test_smooth_interfaces(microfacets):
+@pytest.mark.parametrize("multiple", [False, True])
+def test_smooth_interfaces(multiple):
     """Fresnel's formulas in place of a quadrature over facets."""
-    smooth, rough = (operations([lj.Interface(1.5, alpha)], microfacets=microfacets) for alpha in (1e-4, 0.2))
+    smooth, rough = (
+        operations([lj.Interface(1.5, alpha)], facet_multiple_scattering=multiple) for alpha in (1e-4, 0.2)
+    )
     assert smooth < rough
 
 

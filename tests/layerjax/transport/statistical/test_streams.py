@@ -55,7 +55,7 @@ def test_light_from_the_base_is_as_solved(name: str) -> None:
 
     @compiled
     def values_and_albedos(wi, wo):
-        parts = made(stack), make_diffuse(stack, stack.base, "multiple")
+        parts = made(stack), make_diffuse(stack, stack.base, True)
         return [(part.value(wi, wo), part.albedo(wi)) for part in parts]
 
     (values, albedos), (solved, solved_albedos) = values_and_albedos(wi, wo)

@@ -32,7 +32,7 @@ def average(
     directions: tuple[Vector, ...],
     valid: Array,
     paths: int,
-    lanes: int,
+    batch_size: int,
     key: Array,
 ) -> tuple[Array, Array]:
     """Mean over paths of what is tallied, and its standard error, for each of n questions: shape (n, outputs) each.
@@ -43,14 +43,14 @@ def average(
         directions: what the questions ask for.
         valid: questions of which the answer is not known to be 0.
         paths: number of paths for each question.
-        lanes: number of paths under way at a time, shared among the questions.
+        batch_size: number of paths under way at a time, shared among the questions.
         key: JAX random key.
     """
     dtype, (n,) = directions[0][2].dtype, valid.shape
     if n == 0:
         return jnp.zeros((0, outputs), dtype), jnp.zeros((0, outputs), dtype)
-    width = max(1, min(paths, lanes // n))  # lanes for each question
-    together = min(n, max(1, lanes // width))  # questions at a time
+    width = max(1, min(paths, batch_size // n))  # lanes for each question
+    together = min(n, max(1, batch_size // width))  # questions at a time
     groups = math.ceil(n / together)
     padding = groups * together - n
     quota = quotas(paths, width)
@@ -79,9 +79,9 @@ def standard_error(mean: Array, squares: Array, paths: int) -> Array:
     return jnp.sqrt(jnp.maximum(squares / paths - mean * mean, 0.0) / (paths - 1))
 
 
-def quotas(paths: int, lanes: int) -> Array:
+def quotas(paths: int, batch_size: int) -> Array:
     """Paths that each lane owes, as even as can be."""
-    return jnp.asarray([paths // lanes + (j < paths % lanes) for j in range(lanes)], jnp.int32)
+    return jnp.asarray([paths // batch_size + (j < paths % batch_size) for j in range(batch_size)], jnp.int32)
 
 
 def upright(w: Vector, valid: Array) -> Vector:
