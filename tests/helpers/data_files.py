@@ -29,11 +29,6 @@ def totals(folder: Path) -> bytes:
     return b"theta_i,total_reflectance,total_reflectance_std\n8,0.31,0.01\n20,0.32,0.01\n45,0.4,0.02\n"
 
 
-def rxt(folder: Path) -> bytes:
-    header = "IAD1\n# a slab\n1.4\n1.5\n2.0\n1.0\n5\n0.98\n1\n"
-    return f"{header}200 25 12 1 0.96\n200 25 12 1 0.96\n2\n800 0.3 0.4\n810 0.2 0.5\n".encode()
-
-
 def merl(folder: Path) -> bytes:
     return np.array(SHAPE, "<i4").tobytes() + np.full((3, *SHAPE), 0.2).tobytes()
 
@@ -47,11 +42,54 @@ def exported(to: str, ending: str) -> Callable[[Path], bytes]:
     return of
 
 
-TREE = """<WindowElement><Optical><Layer><DataDefinition><IncidentDataStructure>TensorTree3</IncidentDataStructure>
-</DataDefinition><WavelengthData><Wavelength>Visible</Wavelength><WavelengthDataBlock><WavelengthDataDirection>Reflection
-Back</WavelengthDataDirection><AngleBasis>LBNL/Shirley-Chiu</AngleBasis><ScatteringData>{ {0.1} {0} {0.3} {0} {0.5} {0}
-{ 0.1 0.2 0.3 0.4 0.5 0.6 0.7 0.8 } {0} }</ScatteringData></WavelengthDataBlock></WavelengthData></Layer></Optical>
-</WindowElement>""".replace("Reflection\n", "Reflection ")
+RXT = """\
+IAD1   # first four characters
+# a slab between slides
+1.4    # index of the sample
+1.5    # of the slides
+2.0    # [mm] sample
+1.0    # [mm] slides
+5      # [mm] beam
+0.98   # standard
+{spheres}      # spheres
+200 25 12 1 0.96   # reflection sphere
+200 25 12 1 0.96   # transmission sphere
+"""
+
+ZEMAX = """\
+# comment
+Source Measured
+Symmetry PlaneSymmetrical
+SpectralContent Monochrome
+ScatterType BRDF
+SampleRotation 1
+0
+AngleOfIncidence 2
+20 60
+ScatterAzimuth 3
+0 90 180
+ScatterRadial 2
+0 25
+
+Monochrome
+DataBegin
+TIS 0.1
+1 2
+1 3
+1 4
+TIS 0.1
+5 6
+5 0
+5 8
+DataEnd
+"""
+
+TREE = "{ {0.1} {0} {0.3} {0} {0.5} {0} { 0.1 0.2 0.3 0.4 0.5 0.6 0.7 0.8 } {0} }"
+XML = """<WindowElement><Optical><Layer><DataDefinition><IncidentDataStructure>TensorTree3</IncidentDataStructure>
+</DataDefinition><WavelengthData><Wavelength>Visible</Wavelength><WavelengthDataBlock>
+<WavelengthDataDirection>Reflection Back</WavelengthDataDirection><AngleBasis>LBNL/Shirley-Chiu</AngleBasis>
+<ScatteringData>TREE</ScatteringData></WavelengthDataBlock></WavelengthData></Layer></Optical></WindowElement>
+"""
 
 ASTM = "DATE 4/8/98\nVARS theta_i,phi_i,theta_s,phi_s,R,G,B\n" + "0.5,3.1,0.25,0.1,0.1,0.2,0.3\n" * 12
 PAB = "#incident_angle 30 180\n#format: theta phi DSF\n" + "40 10 0.1\n50 20 0.2\n" * 12
@@ -78,13 +116,13 @@ def text(words: str) -> Callable[[Path], bytes]:
 FILES: dict[str, tuple[str, Callable[[Path], bytes]]] = {
     "csv": ("x.csv", csv),
     "totals": ("x.csv", totals),
-    "rxt": ("x.rxt", rxt),
+    "rxt": ("x.rxt", text(RXT.format(spheres=1) + "2\n800 0.3 0.4\n810 0.2 0.5\n")),
     "merl": ("x.binary", merl),
     "rgl": ("x.bsdf", exported("rgl", ".bsdf")),
     "zemax": ("x.bsdf", lambda folder: (COATINGS / "AnoBlackNiTEonSteel.bsdf").read_bytes()),
     "fred": ("x.txt", lambda folder: (COATINGS / "AnoBlackNiTEonSteel.txt").read_bytes()),
     "klems": ("x.xml", exported("klems", ".xml")),
-    "tensortree": ("x.xml", text(TREE)),
+    "tensortree": ("x.xml", text(XML.replace("TREE", TREE))),
     "astm": ("x.astm", text(ASTM)),
     "pab": ("x.dat", text(PAB)),
     "alta": ("x.alta", text(ALTA)),

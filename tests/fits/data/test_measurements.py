@@ -10,7 +10,7 @@ from fits.data.geometry import azimuth, direction, polar, slices
 from fits.data.measurements import Measurements, channel_names, check_quantity, to_bsdf
 
 
-def _measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes) -> Measurements:
+def measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **changes):
     count = len(theta_i)
     arguments = {
         "wi": direction(theta_i, 180.0),
@@ -23,19 +23,31 @@ def _measurements(theta_i=(30.0, 30.0, 60.0), theta_o=(30.0, 0.0, 45.0), **chang
     return Measurements(**{**arguments, **changes})
 
 
-def test_angles_follow_the_conventions():
-    data = _measurements()
-    np.testing.assert_array_equal(data.theta_i, [30, 30, 60])
-    np.testing.assert_array_equal(data.theta_o, [30, 0, 45])
-    np.testing.assert_array_equal(data.phi_i, 180)
-    np.testing.assert_array_equal(data.phi_o, 0)
+def test_directions_and_angles_follow_the_conventions():
+    np.testing.assert_allclose(direction(90, 90), [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(direction(-45, 0), [-np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-15)
+    np.testing.assert_allclose(direction(180, 0), [0, 0, -1], atol=1e-15)
+    theta, phi = np.array([0.0, 1e-7, 33.3, 89.9999999, 120.0, 180.0]), np.array([0.0, 350.0, 12.5, 180.0, 270.0, 0.0])
+    np.testing.assert_allclose(polar(direction(theta, phi)), theta, atol=1e-10)
+    np.testing.assert_allclose(azimuth(direction(theta, phi)), phi, atol=1e-6)
+    data = measurements()
+    for name, expected in (
+        ("theta_i", [30, 30, 60]),
+        ("theta_o", [30, 0, 45]),
+        ("phi_i", [180] * 3),
+        ("phi_o", [0] * 3),
+    ):
+        np.testing.assert_array_equal(getattr(data, name), expected)
     # phi_o = phi_i + pi is the mirror direction: wi + wo lies along the normal there
     np.testing.assert_allclose((data.wi + data.wo)[0], [0, 0, np.sqrt(3)], atol=1e-15)
 
 
-def test_channels_are_chosen_by_name():
+def test_channels_have_names_and_are_chosen_by_them():
+    assert channel_names(1) == ("value",)
+    assert channel_names(3) == ("red", "green", "blue")
+    assert channel_names(2) == ("channel1", "channel2")
     values = np.arange(9.0).reshape(3, 3) + 1.0
-    data = _measurements(values=values, sigma=0.1 * values, channels=("red", "green", "blue"))
+    data = measurements(values=values, sigma=0.1 * values, channels=("red", "green", "blue"))
     chosen = data.of_channels(["blue", "red"])
     assert chosen.channels == ("red", "blue")
     np.testing.assert_array_equal(chosen.values, values[:, [0, 2]])
@@ -43,15 +55,6 @@ def test_channels_are_chosen_by_name():
     assert data.of_channels(["green"]).values.shape == (3, 1)
     with pytest.raises(ValueError, match="channel uv is not in the data; there are red, green, blue"):
         data.of_channels(["red", "uv"])
-
-
-def test_direction_against_hand_written_vectors():
-    np.testing.assert_allclose(direction(90, 90), [0, 1, 0], atol=1e-15)
-    np.testing.assert_allclose(direction(-45, 0), [-np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-15)
-    np.testing.assert_allclose(direction(180, 0), [0, 0, -1], atol=1e-15)
-    theta, phi = np.array([0.0, 1e-7, 33.3, 89.9999999, 120.0, 180.0]), np.array([0.0, 350.0, 12.5, 180.0, 270.0, 0.0])
-    np.testing.assert_allclose(polar(direction(theta, phi)), theta, atol=1e-10)
-    np.testing.assert_allclose(azimuth(direction(theta, phi)), phi, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -70,17 +73,17 @@ def test_direction_against_hand_written_vectors():
 )
 def test_bad_arrays_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        _measurements(**change)
+        measurements(**change)
 
 
 def test_zero_sigma_is_allowed_where_masked():
-    data = _measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
+    data = measurements(sigma=np.array([[0.0], [0.1], [0.1]]), mask=np.array([False, True, True]))
     assert len(data.used()) == 2
 
 
 def test_arrays_are_copies_that_cannot_be_written():
     values = np.ones((3, 1))
-    data = _measurements(values=values)
+    data = measurements(values=values)
     values[:] = 7
     assert data.values.max() == 1
     with pytest.raises(ValueError, match="read-only"):
@@ -98,59 +101,40 @@ def test_conversion_by_hand():
 
 
 def test_masks_narrow_and_are_noted():
-    data = _measurements(theta_i=(30.0, 30.0, 80.0), theta_o=(30.0, -33.0, 45.0))
-    retro = data.without_retro(8)
-    np.testing.assert_array_equal(retro.mask, [True, False, True])
-    np.testing.assert_array_equal(data.without_retro(2.9).mask, [True, True, True])
-    np.testing.assert_array_equal(data.without_retro(3.1).mask, [True, False, True])
-    np.testing.assert_array_equal(retro.without_grazing(75).mask, [True, False, False])
-    assert retro.without_grazing(75).source.notes == (
+    data = measurements(theta_i=(30.0, 30.0, 80.0), theta_o=(30.0, -33.0, 45.0))
+    for degrees, near in ((2.9, True), (3.1, False), (8, False)):
+        np.testing.assert_array_equal(data.without_retro(degrees).mask, [True, near, True])
+    both = data.without_retro(8).without_grazing(75)
+    np.testing.assert_array_equal(both.mask, [True, False, False])
+    assert both.used().values.ravel().tolist() == [1]
+    assert both.source.notes == (
         "masked: within 8 degrees of retro-reflection",
         "masked: more than 75 degrees from the normal",
     )
-    assert len(retro.used()) == 2
-    assert retro.used().values.ravel().tolist() == [1, 3]
+    through = measurements(theta_i=(30.0, 30.0), theta_o=(100.0, 170.0))  # counted from the side where it leaves
+    np.testing.assert_array_equal(through.without_grazing(75).mask, [False, True])
     with pytest.raises(ValueError, match="keep has shape"):
         data.where(np.ones(2, bool))
     with pytest.raises(ValueError, match=r"degrees is 91, must be in \[0, 90\]"):
         data.without_grazing(91)
 
 
-def test_grazing_counts_transmission_from_its_own_side():
-    data = _measurements(theta_i=(30.0, 30.0), theta_o=(100.0, 170.0))
-    np.testing.assert_array_equal(data.without_grazing(75).mask, [False, True])
-
-
 def test_slices_are_where_they_say():
     geometry = slices(incidence=[10, 40], outgoing=[-20, 0, 20], azimuth=[0, 90])
-    theta_i = np.degrees(np.arccos(geometry.wi[:, 2]))
-    assert len(geometry) == 2 * 5  # the normal once for each incidence
-    np.testing.assert_allclose(theta_i, [10] * 5 + [40] * 5)
+    np.testing.assert_allclose(geometry.theta_i, [10] * 5 + [40] * 5)  # the normal once for each incidence
     sine = np.sin(np.radians(20))
     expected = [[-sine, 0], [0, 0], [sine, 0], [0, -sine], [0, sine]]
     np.testing.assert_allclose(geometry.wo[:5, :2], expected, atol=1e-15)
     assert len(slices()) == 4 * 35
     assert len(slices(10.0, [0, 180], azimuth=[0, 90])) == 2  # straight down once as well
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
+    for arguments, message in (
         ({"incidence": [200]}, r"incidence is 200, must be in \[0, 180\] degrees"),
         ({"outgoing": []}, "outgoing is empty"),
         ({"outgoing": [np.nan]}, "outgoing is nan"),
         ({"azimuth": 400}, "azimuth is 400"),
-    ],
-)
-def test_slices_refuse_bad_angles(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        slices(**arguments)
-
-
-def test_channel_names():
-    assert channel_names(1) == ("value",)
-    assert channel_names(3) == ("red", "green", "blue")
-    assert channel_names(2) == ("channel1", "channel2")
+    ):
+        with pytest.raises(ValueError, match=message):
+            slices(**arguments)
 
 
 def test_reading_needs_no_jax():

@@ -6,7 +6,6 @@ import pytest
 from scipy import special
 
 import layerjax as lj
-from fits.data.formats.rxt import read_slab
 from fits.data.spheres import Shares, Sphere, Spheres
 from fits.data.totals import Totals
 from fits.optimise.fit import fit
@@ -46,24 +45,20 @@ def detected(spheres: tuple[Sphere, Sphere | None], of: Shares) -> np.ndarray:
     return total
 
 
-def test_two_spheres_exchange_light() -> None:
-    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=True)
-    plate = Shares(0.98, 0.0, 0.98, 0.0, 0.0, 0.0)
-    passed = Shares(0.0, 1.0, 0.0, 0.0, 1.0, 1.0)
+@pytest.mark.parametrize("together", [True, False])
+def test_two_spheres_exchange_light_where_they_stand_together(together) -> None:
+    spheres = Spheres(FRONT, BEHIND, standard=0.98, together=together)
+    exchanged = float(together)
+    plate, nothing = Shares(0.98, 0.0, 0.98, 0.0, 0.0, 0.0), Shares(0.0, 1.0, 0.0, 0.0, exchanged, exchanged)
+    sample = OF if together else OF._replace(diffuse_transmitted=0.0, diffuse_transmitted_up=0.0)
     both = (FRONT, BEHIND)
-    expected = detected(both, OF) / [detected(both, plate)[0] / 0.98, detected(both, passed)[1]]
+    expected = detected(both, sample) / [detected(both, plate)[0] / 0.98, detected(both, nothing)[1]]
     np.testing.assert_allclose(spheres.measured(OF), expected, rtol=1e-12)
-
-
-def test_one_sphere_at_a_time() -> None:
-    spheres = Spheres(FRONT, BEHIND, standard=0.9)
-    plate, nothing = Shares(0.9, 0.0, 0.9, 0.0, 0.0, 0.0), Shares(0.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-    alone = OF._replace(diffuse_transmitted=0.0, diffuse_transmitted_up=0.0)
-    both = (FRONT, BEHIND)
-    expected = detected(both, alone) / [detected(both, plate)[0] / 0.9, detected(both, nothing)[1]]
-    np.testing.assert_allclose(spheres.measured(OF), expected, rtol=1e-12)
-    np.testing.assert_allclose(Spheres(FRONT, None, 0.9).measured(OF), [expected[0], OF.transmitted])
-    np.testing.assert_allclose(Spheres().measured(OF), [OF.reflected, OF.transmitted])
+    many = spheres.measured(Shares(*(jnp.full(3, share) for share in OF)))
+    np.testing.assert_allclose(many, np.tile(expected[:, None], 3), rtol=1e-12)
+    if not together:
+        np.testing.assert_allclose(Spheres(FRONT, None, 0.98).measured(OF), [expected[0], OF.transmitted])
+        np.testing.assert_allclose(Spheres().measured(OF), [OF.reflected, OF.transmitted])
 
 
 def test_an_absorbing_slab_is_seen_by_diffuse_light_through_e3() -> None:
@@ -90,15 +85,14 @@ def test_light_from_behind_meets_the_other_face() -> None:
     """A slab that is dark on one side: only the sphere there sees it."""
     grey, white = lj.Medium(0.5, 0.2), lj.Medium(Free(1.0, 0.1, 5.0), 0.999)
     solver = lj.AddingDoubling(nodes=8, modes=1)
-    readings = []
-    for layers in ([grey, white], [white, grey]):
-        totals = Totals.of(0.0, transmittance=0.5, spheres=Spheres(None, BEHIND))
-        readings.append(float(Problem(lj.Stack(layers), totals, solver).predict([1.0])[0, 0]))
-    transmitted = [
-        float(Problem(lj.Stack(layers), Totals.of(0.0, transmittance=0.5), solver).predict([1.0])[0, 0])
-        for layers in ([grey, white], [white, grey])
+
+    def predicted(layers, spheres):
+        totals = Totals.of(0.0, transmittance=0.5, spheres=spheres)
+        return float(Problem(lj.Stack(layers), totals, solver).predict([1.0])[0, 0])
+
+    gains = [
+        predicted(layers, Spheres(None, BEHIND)) / predicted(layers, None) for layers in ([grey, white], [white, grey])
     ]
-    gains = np.array(readings) / transmitted
     assert gains[0] > 1.02 * gains[1]
 
 
@@ -117,27 +111,6 @@ def test_coefficients_are_recovered_through_spheres() -> None:
     assert abs(blind.values["layers[0].mu_a"] / 0.2 - 1.0) > 0.05
 
 
-TEXT = "IAD1 1.4 1.0 1 0 5 0.98 {count} 100 30 15 10 0.95 80 30 0 12 0.97 2 0.3 0.4"
-
-
-def test_headers_say_which_spheres(tmp_path) -> None:
-    path = tmp_path / "slab.rxt"
-    front, behind = Sphere(100.0, 30.0, 15.0, 10.0, 0.95), Sphere(80.0, 30.0, 0.0, 12.0, 0.97)
-    for count, expected in ((0, None), (1, Spheres(front, behind, 0.98)), (2, Spheres(front, behind, 0.98, True))):
-        path.write_text(TEXT.format(count=count))
-        assert read_slab(path).totals.spheres == expected
-        assert read_slab(path, corrected=True).totals.spheres is None
-    path.write_text(TEXT.format(count=1).replace(" 80 30 0 12 0.97", " 0 0 0 0 0"))
-    assert read_slab(path).totals.spheres == Spheres(front, None, 0.98)
-    for bad, message in ((3, "number of spheres is 3, must be 0, 1 or 2"), (1.5, "number of spheres is 1.5")):
-        path.write_text(TEXT.format(count=bad))
-        with pytest.raises(ValueError, match=message):
-            read_slab(path)
-    path.write_text(TEXT.format(count=2).replace("100 30 15", "100 130 15"))
-    with pytest.raises(ValueError, match=r"slab.rxt: Sphere.sample is 130.0, must be in \[0, 100\) mm"):
-        read_slab(path)
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -152,9 +125,3 @@ def test_headers_say_which_spheres(tmp_path) -> None:
 def test_bad_spheres(make, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make()
-
-
-def test_readings_are_functions_of_arrays() -> None:
-    many = Shares(*(jnp.full(3, share) for share in OF))
-    found = Spheres(FRONT, BEHIND, together=True).measured(many)
-    assert [part.shape for part in found] == [(3,), (3,)]

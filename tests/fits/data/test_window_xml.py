@@ -1,12 +1,14 @@
-"""XML of WINDOW and Radiance that does not begin as XML does: known by what it holds, as for Radiance."""
+"""XML of WINDOW and Radiance: what stands before it, and trees of tensors, boxes and their order by hand.
+
+Matrices of WINDOW are read beside what is written, in `tests/fits/exports/test_klems.py`.
+"""
 
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fits.data.reading import read
+from fits.data.formats.tensor_tree import boxes, disk, look_up, parse
 
 MATRIX = """<?xml version="1.0" encoding="UTF-8"?>
 <WindowElement xmlns="http://windows.lbl.gov"><Optical><Layer><DataDefinition>
@@ -17,43 +19,115 @@ MATRIX = """<?xml version="1.0" encoding="UTF-8"?>
 <ColumnAngleBasis>two</ColumnAngleBasis><RowAngleBasis>two</RowAngleBasis><ScatteringData>0.25</ScatteringData>
 </WavelengthDataBlock></WavelengthData></Layer></Optical></WindowElement>
 """
-TREE = """<WindowElement><Optical><Layer><DataDefinition><IncidentDataStructure>TensorTree3</IncidentDataStructure>
-</DataDefinition><WavelengthData><Wavelength>Visible</Wavelength><WavelengthDataBlock>
-<WavelengthDataDirection>Reflection Back</WavelengthDataDirection><AngleBasis>LBNL/Shirley-Chiu</AngleBasis>
-<ScatteringData>{0.25}</ScatteringData></WavelengthDataBlock></WavelengthData></Layer></Optical></WindowElement>
-"""
+BLOCK = """<WavelengthData><Wavelength unit='Integral'>{colour}</Wavelength><WavelengthDataBlock>
+<WavelengthDataDirection>{side}</WavelengthDataDirection><AngleBasis>LBNL/Shirley-Chiu</AngleBasis>
+<ScatteringData>{tree}</ScatteringData></WavelengthDataBlock></WavelengthData>"""
 
 
-@pytest.mark.parametrize(
-    "before",
-    ["", "written by a laboratory\n", "# of <us>\n", "<!-- genBSDF -n 4 -->\n", "\n\n", "\ufeff", "\ufeff\n\n"],
-)
-@pytest.mark.parametrize(("kind", "text"), [("klems", MATRIX), ("tensortree", TREE)])
-def test_what_stands_before_is_no_part_of_it(tmp_path: Path, kind: str, text: str, before: str) -> None:
-    path = tmp_path / "shade.dat"
-    for encoding in ("utf-8", "utf-16"):
-        path.write_bytes((before + text).encode(encoding))
-        data = read(path)
-        assert data.source.format == kind
-        np.testing.assert_array_equal(data.values, np.full((1, 1), 0.25))
+def xml(rank, *blocks):
+    """Trees: each a tree, and of what side and colour it is, if not of the usual."""
+    head = f"<IncidentDataStructure>TensorTree{rank}</IncidentDataStructure>"
+    usual = {"colour": "Visible", "side": "Reflection Front"}
+    body = "".join(BLOCK.format(tree=tree, **usual | said) for tree, said in blocks)
+    layer = f"<Optical><Layer><DataDefinition>{head}</DataDefinition>{body}</Layer></Optical>"
+    return f"<WindowElement>{layer}</WindowElement>\n"
 
 
-def test_other_xml_says_what_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "page.xml"
-    path.write_text("<?xml version='1.0'?><html/>")
-    with pytest.raises(ValueError, match=r"page\.xml: an XML file of <html>, must be a <WindowElement>"):
-        read(path)
+@pytest.mark.parametrize(("kind", "text"), [("klems", MATRIX), ("tensortree", xml(3, ("{0.25}", {})))])
+def test_what_stands_before_is_no_part_of_it(reading, kind, text):
+    for before in ("", "written by a laboratory\n", "# of <us>\n", "<!-- genBSDF -n 4 -->\n", "\n\n", "\ufeff\n\n"):
+        for encoding in ("utf-8", "utf-16"):
+            data = reading((before + text).encode(encoding))
+            assert data.source.format == kind
+            np.testing.assert_array_equal(data.values, np.full((1, 1), 0.25))
 
 
-def test_rings_stand_for_no_more_patches_than_there_may_be(tmp_path: Path) -> None:
-    ring = MATRIX[MATRIX.index("<AngleBasisBlock>") : MATRIX.index("</AngleBasis>")].replace(
-        "<nPhis>1<", "<nPhis>2000<"
-    )
-    path = tmp_path / "rings.xml"
-    path.write_text(MATRIX.replace("<AngleBasisBlock>", 20_000 * ring + "<AngleBasisBlock>", 1))
+def test_rings_stand_for_no_more_patches_than_there_may_be(reading):
+    ring = MATRIX[MATRIX.index("<AngleBasisBlock>") : MATRIX.index("</AngleBasis>")]
+    many = 20_000 * ring.replace("<nPhis>1<", "<nPhis>2000<")
     tracemalloc.start()
-    with pytest.raises(ValueError, match=r"rings\.xml: two: 4000 patches or more, must be 2000 at most"):
-        read(path)
+    with pytest.raises(ValueError, match="two: 4000 patches or more, must be 2000 at most"):
+        reading(MATRIX.replace("<AngleBasisBlock>", f"{many}<AngleBasisBlock>", 1))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200e6  # 40 million patches would take a GB
+
+
+# ---- trees of tensors ----
+
+EIGHT = "{ {1} {2} {3} {4} {5} {6} {7} { 10 11 12 13 14 15 16 17 } }"
+
+
+def test_boxes_by_hand():
+    """The first axis is the lowest bit of a node, and the slowest of a grid."""
+    tree = parse(EIGHT, 3)
+    found = boxes(tree, 3)
+    at = {tuple(low): (edge, value) for low, edge, value in zip(found.low, found.edge, found.values, strict=True)}
+    assert len(at) == 15
+    for low, expected in (
+        ((0.5, 0.0, 0.0), (0.5, 2.0)),
+        ((0.0, 0.5, 0.0), (0.5, 3.0)),
+        ((0.0, 0.0, 0.5), (0.5, 5.0)),
+        ((0.5, 0.5, 0.75), (0.25, 11.0)),
+        ((0.75, 0.5, 0.5), (0.25, 14.0)),
+    ):
+        assert at[low] == expected
+    np.testing.assert_array_equal(look_up(tree, found.low + 0.5 * found.edge[:, None]), found.values)
+
+
+def test_nodes_of_equal_grids_become_one():
+    grid = parse("{ {1} {2} {3} {4} {5} {6} {7} {8} }", 3)
+    assert grid.shape == (2, 2, 2)
+    assert (grid[1, 0, 0], grid[0, 1, 0], grid[0, 0, 1]) == (2.0, 3.0, 5.0)
+    nodes = (" ".join(str(10 * node + place) for place in range(8)) for node in range(8))
+    twice = parse("{" + " ".join(f"{{ {node} }}" for node in nodes) + "}", 3)
+    assert twice.shape == (4, 4, 4)
+    assert twice[2, 1, 3] == 10 * 5 + 3  # node: first and last axis above the middle, 1 + 4; in it 0, 1, 1
+
+
+def test_a_million_values_in_seconds():
+    node = "{" + f"{{{' '.join(['0.123456'] * 16)}}} " * 16 + "}"
+    for _ in range(3):
+        node = "{" + node * 16 + "}"
+    assert boxes(parse(node, 4), 4).values.size == 16**5
+
+
+def test_the_disk_has_the_area_of_the_square():
+    """Points on concentric squares land on concentric circles; the map keeps areas."""
+    u, v = np.random.default_rng(0).random((2, 2000))
+    square = np.stack([u, v], axis=-1)
+    np.testing.assert_allclose(np.hypot(*disk(square).T), abs(2 * square - 1).max(axis=1), atol=1e-12)
+    step = 1e-6
+    along, across = np.array([step, 0.0]), np.array([0.0, step])
+    du = (disk(square + along) - disk(square - along)) / (2 * step)
+    dv = (disk(square + across) - disk(square - across)) / (2 * step)
+    area = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
+    assert np.median(abs(area - np.pi)) < 1e-6
+    edges = np.array([[1.0, 0.5], [0.5, 1.0], [0.0, 0.5], [0.5, 0.5]])
+    np.testing.assert_allclose(disk(edges), [[1, 0], [0, 1], [-1, 0], [0, 0]], atol=1e-12)
+
+
+def test_an_isotropic_tree_by_hand(reading):
+    """In eight boxes: light at sin theta 0.5; the upper half of the first axis is empty."""
+    data = reading(xml(3, ("{ {1} {0} {3} {0} {5} {0} {7} {0} }", {})))
+    np.testing.assert_allclose(data.theta_i, 30.0)
+    np.testing.assert_allclose(data.phi_i, 180.0)
+    # middles of the quarters of the square are half way out on the diagonals; x ahead of the light, y turned with z
+    assert dict(zip(data.values[:, 0], data.phi_o.round(), strict=True)) == {1.0: 135, 3.0: 45, 5.0: 225, 7.0: 315}
+    np.testing.assert_allclose(data.theta_o, 30.0)
+
+
+def test_sides_of_trees(reading):
+    sides = [f"{kind} {side}" for kind in ("Reflection", "Transmission") for side in ("Front", "Back")]
+    data = reading(xml(4, *(("{0.3}", {"side": side}) for side in sides)))
+    np.testing.assert_array_equal(np.sign(data.wi[:, 2]), [1, -1, 1, -1])
+    np.testing.assert_array_equal(np.sign(data.wo[:, 2]), [1, -1, -1, 1])
+    np.testing.assert_array_equal(data.mask, [True, True, False, False])  # one box: it holds what passes straight
+
+
+def test_colours_of_trees(reading):
+    """u' = 0.1978, v' = 0.4683 are D65: X and Z beside Y are those of the white point."""
+    data = reading(xml(3, (EIGHT, {}), ("{0.19784}", {"colour": "CIE-u"}), ("{0.46834}", {"colour": "CIE-v"})))
+    assert data.channels == ("X", "Y", "Z")
+    white = np.tile([0.95047, 1, 1.08883], (len(data), 1))
+    np.testing.assert_allclose(data.values / data.values[:, 1:2], white, rtol=1e-3)

@@ -1,0 +1,25 @@
+"""Texts as files, and the bytes of one file of every format."""
+
+import pytest
+
+from fits.data.reading import read
+from tests.helpers.data_files import FILES, written
+
+
+@pytest.fixture
+def reading(tmp_path):
+    """What a text, or bytes, reads as, as a file of that name."""
+    return lambda text, name="data.txt", **options: read(written(tmp_path, text, name), **options)
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory):
+    """The bytes of a file of a format, made once."""
+    folder, kept = tmp_path_factory.mktemp("files"), {}
+
+    def of(kind: str) -> bytes:
+        if kind not in kept:
+            kept[kind] = FILES[kind][1](folder)
+        return kept[kind]
+
+    return of
