@@ -81,7 +81,7 @@ def parameter(
     """A dataclass field called `name` ("Class.field"), converted to a floating array and checked against `RANGES`.
 
     Traced values are not checked (they have no value yet), placeholders pass as they are. Not `ranged`: the range
-    depends on other fields, and is checked by the class. `between`: the range of a class that is not in `RANGES`, such
+    depends on other fields, and is checked by the class. `limits`: the range of a class that is not in `RANGES`, such
     as one's own; it joins them.
     """
     if limits is not None:

@@ -30,7 +30,7 @@ class PhaseFunction(Shown):
     -wo. `pdf` and `sample` are all that a class must add; where sigma is not 1, `cross_section` too, and where p is not
     the same for all azimuths, `is_upright` and `mirrored`. All else is for speed, accuracy or further transports.
 
-    Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `between`.
+    Parameters are fields made by `layerjax._parameters.parameter`, which takes the range of a new one as `limits`.
     """
 
     uses_half_vector: ClassVar[bool] = False

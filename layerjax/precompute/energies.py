@@ -67,7 +67,7 @@ def dielectric(side: str, dense: float) -> dict[str, Values]:
     shape = SHAPES[side]
     cosine, alpha, ior = dielectric_grid(side, shape, dense)
     reflected, passed = batched(
-        lambda c, a, n: by_quadrature.interface_energies(c, a, n, False, points=POINTS), cosine, alpha, ior
+        lambda c, a, n: by_quadrature.interface_energies(c, a, n, multiple=False, points=POINTS), cosine, alpha, ior
     )
     mirror = batched(lambda c, a, n: (by_quadrature.lobe_energy(c, a, points=POINTS),), cosine, alpha, ior)[0]
     multiple = batched(all_facets, cosine, alpha, ior)[0]

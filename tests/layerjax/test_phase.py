@@ -20,7 +20,7 @@ from layerjax.phase.moments import moments_by_quadrature
 class Schlick(lj.PhaseFunction):
     """p = (1 - k^2) / (4 pi (1 - k cos)^2), cos that of deflection (Blasi, Le Saec & Schlick 1993)."""
 
-    k: jax.Array = parameter("Schlick.k", between=(-0.99, 0.99))
+    k: jax.Array = parameter("Schlick.k", limits=(-0.99, 0.99))
 
     def pdf(self, wi, wo):
         return (1.0 - self.k**2) / (4.0 * jnp.pi * (1.0 + self.k * dot(wi, wo)) ** 2)

@@ -82,7 +82,7 @@ class Grid(eqx.Module):
         return self.edges.shape[0] * self.nodes
 
     def bounds(self, panel: Array | np.ndarray, squared_index: Array) -> tuple[Array, Array]:
-        """Lower and upper end in s^2 of panels, in regions of index squared `own`.
+        """Lower and upper end in s^2 of panels, in regions of this squared index.
 
         A panel that regions share ends for each of them where its own directions do.
         """
@@ -133,7 +133,7 @@ def make_grid(indices: Sequence[Any], ranks: tuple[int, ...] | None, nodes: int,
 
 
 def _merged(edges: Array, least_width: Array) -> Array:
-    """The edges, each moved up to the next one if that is nearer than `apart`.
+    """The edges, each moved up to the next one if that is nearer than `least_width`.
 
     Between indices that nearly agree a panel of its own would hold no node that counts, and the values would change
     like the root of their difference: the derivative at equal indices would be lost.

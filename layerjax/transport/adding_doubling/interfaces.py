@@ -96,7 +96,7 @@ def interface_layer(
         requested: directions outside that stand in the place of the outer nodes. The operators are then those of light
             that comes from them, and per projected solid angle over 2 pi for light that leaves along them; what the
             interface reflects outside is omitted.
-        behind: what light that enters meets next.
+        next_event: what light that enters meets next.
     """
     near, far = (above, below) if enters else (below, above)
     if requested is None:
@@ -340,7 +340,7 @@ def _reflection(
 def _turned_back(region: Region, ratio: Array, alpha: Array, once: Array, lost: Array) -> Array:
     """Share of the energy lost to masking that is reflected, by the walk on the microsurface (Heitz et al. 2016)."""
     exists = region.exists
-    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, True)
+    level, _ = interface_energies(jnp.where(exists, region.cosine, 0.5), alpha, ratio, multiple=True)
     gain = at_least(level - once, 0.0)
     return jnp.where(exists, jnp.where(gain < lost, gain, lost), 0.0)
 

@@ -140,10 +140,10 @@ class AddingDoubling(DeterministicTransport):
             (``"multiple"``). An event is a collision, a reflection or refraction at an interface, or a reflection at
             the base.
         facet_multiple_scattering: whether light that a facet sends into another is returned diffusely, so that
-            interfaces conserve energy (after Kulla & Conty 2017); else it is lost (Walter 2007). Lossless stacks then
-            return what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within 1 % of an
-            index of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface at grazing,
-            below a cosine of 0.05, may lose or gain a quarter.
+            interfaces conserve energy (after Kulla & Conty 2017); else it is lost (Walter 2007). Lossless stacks
+            return, with it, what meets them to 1e-9 as a rule, with 6 nodes at an index of 0.25 or 1.05 to 4e-3. Within
+            1 % of an index of 1 slabs do to 4e-4 (to 1e-5 within 1e-5 of it), and light that meets a single interface
+            at grazing, below a cosine of 0.05, may lose or gain a quarter.
 
     Raises:
         ValueError: an option is out of its range; or `tolerance` cannot be reached, or the stack is traced.

@@ -188,7 +188,7 @@ def features_of_pairs(media: Numbers) -> list[Array]:
 
 
 def pair_features(media: int) -> int:
-    """How many numbers `between` makes."""
+    """How many numbers `features_of_pairs` makes."""
     return PAIR_FEATURES if media > 1 else 0
 
 

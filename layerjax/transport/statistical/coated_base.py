@@ -55,7 +55,7 @@ class CoatedBase(eqx.Module):
     def arriving(self, cosine: Array) -> Channels:
         """Share of light along a cosine that arrives at the base."""
         if self.tau is None:
-            return (interface_energies(cosine, self.alpha, self.ior, True)[1],)
+            return (interface_energies(cosine, self.alpha, self.ior, multiple=True)[1],)
         return tuple(coated_transmission(cosine, self.alpha, self.ior, tau) for tau in self.tau)
 
 

@@ -196,7 +196,7 @@ def _widened(variance: Channels, spread: Channels | None, order: int) -> Channel
 def _of_facet(what: Interface | Conductor, relative: Array, smooth: bool, cosine: Array) -> Channels:
     """Energy that the facets of the first interface or base reflect at their first collision."""
     if isinstance(what, Conductor):
-        return metal_levels(what, cosine, relative, False, smooth)
+        return metal_levels(what, cosine, relative, multiple=False, smooth=smooth)
     if smooth:
         return (fresnel.dielectric(cosine, relative),)
     return (single_reflectance(cosine, jnp.asarray(what.alpha), relative),)

@@ -113,8 +113,9 @@ def _under(below: Below, what: Face, ratio: Array) -> Below:
 class Meeting(NamedTuple):
     """What lies under a level, and what is above it and turns light back.
 
-    onward: share of each stream down there that arrives at the base, at once or later; again: of each stream up there.
-    returned: of diffuse light from the base what comes back. turns: of light down there to all that ever goes down.
+    onward: share of each stream down there that arrives at the base, at once or later. arriving_again: of each stream
+    up there. returned: of diffuse light from the base what comes back. turns: of light down there to all that ever goes
+    down.
     """
 
     onward: Array

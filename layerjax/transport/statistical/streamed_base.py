@@ -77,9 +77,9 @@ class StreamedBase(ClosedForm):
     """What becomes of light behind the first interface. (STREAMS,) by polynomials, and by channels.
 
     alpha, ior: of the interface. depth: of the media behind it, optically, but for forward peaks; None if none.
-    onward: share of the light behind these that arrives at the base. again: of light that goes up there, passes them,
-    and comes back from the interface. scattered: what of light just behind the interface arrives, and of light that
-    goes up there, if it is scattered in the media; None if it is not.
+    onward: share of the light behind these that arrives at the base. arriving_again: of light that goes up there,
+    passes them, and comes back from the interface. scattered: what of light just behind the interface arrives, and of
+    light that goes up there, if it is scattered in the media; None if it is not.
     """
 
     alpha: Array

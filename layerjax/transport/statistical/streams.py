@@ -82,7 +82,7 @@ def entering(cosine: Array, alpha: Array, ior: Array) -> tuple[Array, Array]:
     behind it, (..., STREAMS), the first of them 1.
     """
     cosine, alpha, ior = jnp.broadcast_arrays(cosine, alpha, ior)
-    passed = interface_energies(cosine, alpha, ior, True)[1]
+    passed = interface_energies(cosine, alpha, ior, multiple=True)[1]
     places, below = dielectric_places(cosine, alpha, ior), (ior < 1.0)[..., None]
     denser, thinner = ENTERING["denser"], ENTERING["thinner"]
     counts = [jnp.where(below, t, d) for d, t in zip(denser, thinner, strict=True)]
