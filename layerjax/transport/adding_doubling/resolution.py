@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from layerjax._known import known_values
@@ -145,6 +146,21 @@ def shortage(stack: Stack, followed: bool) -> str | None:
     if nodes <= SHORT * found.nodes and modes <= SHORT * found.modes:
         return None
     return f"{found.nodes} nodes and {found.modes} modes, where about {nodes:.0f} and {modes:.0f} are needed"
+
+
+def is_guessed(stack: Stack) -> bool:
+    """Whether a lobe has to be resolved of whose width nothing is known while tracing, as under ``jit``."""
+    within = False
+    for layer in stack.layers:
+        if isinstance(layer, Interface):
+            if within and known_values(layer.alpha) is None:
+                return True
+            within = True
+        elif not is_known(layer.albedo, 0.0) and any(
+            known_values(leaf) is None for leaf in jax.tree.leaves(layer.phase)
+        ):
+            return True
+    return isinstance(stack.base, Conductor) and bool(stack.layers) and known_values(stack.base.alpha) is None
 
 
 class Needed(NamedTuple):

@@ -28,6 +28,7 @@ from layerjax._shapes import channel_count, map_shape
 from layerjax.channels import Channels, pick, times, total
 from layerjax.compiling import filter_jit, is_outermost, is_traced
 from layerjax.directions import Vector, direction, split
+from layerjax.phase.henyey_greenstein import ASSUMED_BACKWARD, ASSUMED_FORWARD
 from layerjax.stack import Stack
 from layerjax.surfaces import Conductor
 from layerjax.transport.adding_doubling.ballistic import Ballistic, ballistic_paths, evaluate_ballistic
@@ -43,9 +44,11 @@ from layerjax.transport.adding_doubling.moments import scaled
 from layerjax.transport.adding_doubling.proposals import proposal_density, propose
 from layerjax.transport.adding_doubling.requested import RequestedValues, read_requested, requested_values
 from layerjax.transport.adding_doubling.resolution import (
+    ASSUMED_WIDTH,
     ORDINATES_LADDER,
     Resolution,
     chosen,
+    is_guessed,
     is_tilted,
     modes_for,
     rungs,
@@ -87,7 +90,8 @@ PROBED = 8
 
 
 class ResolutionWarning(UserWarning):
-    """A stack is solved less finely than an error of 1e-3 needs, as it would not fit into memory."""
+    """A stack is solved less finely than an error of 1e-3 needs, as it would not fit into memory; or it may be, as
+    under ``jit`` the widths of its lobes are not known."""
 
 
 class Solved(eqx.Module):
@@ -129,7 +133,8 @@ class AddingDoubling(DeterministicTransport):
         nodes: cosines a hemisphere (and for each range of angles between critical angles), 2 to 1024. None: as many as
             give errors of about 1e-3, by the structure of the stack and what is known of it (see `resolution.chosen`).
             Under `jit` no roughness is known, and lobes of 0.05 are expected: `choose_transport` outside of it knows
-            better, and what it returns costs less inside. A `ResolutionWarning` says where memory allows fewer.
+            better, and what it returns costs less inside. A `ResolutionWarning` says where that is guessed, and where
+            memory allows fewer.
         modes: Fourier modes in azimuth, 1 to 1024, where every medium is symmetric about the normal. None: as many as
             suit the nodes.
         ordinates: (cosines, azimuths) a hemisphere where some medium is not, up to 1024 each; azimuths even. None:
@@ -190,14 +195,19 @@ class AddingDoubling(DeterministicTransport):
                     "give nodes and modes"
                 )
             return self._climbed(stack, directions)
-        short = shortage(stack, directions is not None) if self._leaves_open(stack) else None
-        if short is not None:
-            warnings.warn(
-                f"AddingDoubling: the lobes of this stack are too narrow for an error of 1e-3: {short}; "
-                "evaluate_with_error tells the error, and a resolution can be given",
-                ResolutionWarning,
-                stacklevel=_frames_inside(),
-            )
+        if self._leaves_open(stack):
+            short = shortage(stack, directions is not None)
+            if short is not None:
+                _warn(
+                    f"AddingDoubling: the lobes of this stack are too narrow for an error of 1e-3: {short}; "
+                    "evaluate_with_error tells the error, and a resolution can be given"
+                )
+            elif is_guessed(stack):
+                _warn(
+                    f"AddingDoubling: under jit no lobe is taken to be narrower than {ASSUMED_WIDTH}, nor g above "
+                    f"{ASSUMED_FORWARD} or below {-ASSUMED_BACKWARD}; transport=lj.choose_transport(stack, wi, wo), "
+                    "called outside of jit, goes by the numbers"
+                )
         return self._at(self._resolution(stack, directions is not None))
 
     def prepare(self, stack: Stack) -> Solved:
@@ -424,6 +434,10 @@ def _ballistic(state: Solved, wi: Vector, wo: Vector, side: Side) -> list[Channe
     if state.ballistic is None or side == "reflection":
         return []
     return [evaluate_ballistic(state.ballistic, wi, wo)]
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, ResolutionWarning, stacklevel=_frames_inside())
 
 
 def _frames_inside() -> int:
