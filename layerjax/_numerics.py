@@ -87,6 +87,12 @@ def at_most(x: Array, high: Array | float) -> Array:
     return jnp.where(x <= high, x, high)
 
 
+def smooth_step(x: Array) -> Array:
+    """0 up to -1, 1 from 1 on, 1/2 at 0, twice differentiable."""
+    t = jnp.clip(0.5 * (x + 1.0), 0.0, 1.0)
+    return t * t * t * (10.0 + t * (6.0 * t - 15.0))
+
+
 def horner(coefficients: Array | Sequence[Any], x: Array) -> Array:
     """Polynomial in x, from the coefficients of its powers: numbers, or arrays that broadcast with x."""
     return functools.reduce(lambda total, coefficient: coefficient + x * total, coefficients[::-1])

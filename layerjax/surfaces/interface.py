@@ -51,14 +51,24 @@ def refraction_lobe(
 
     The first is 0 where no facet whose normal lies on the +z side does; wo.z < 0 is not checked.
     """
+    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution)
+    return jnp.where(height > 0, lobe, 0.0), transmitted
+
+
+def continued_lobe(
+    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution
+) -> tuple[Array, Array, Array]:
+    """`refraction_lobe` with facets that face down as well, D being even; and z of wi + ior wo, signed as the normal's.
+
+    Where z passes through 0, at facets that stand upright, the lobe itself ends with a step.
+    """
     v = combine(1.0, wi, ior, wo)  # along the facet normal; its length cancels from the result
     total = add(wi, wo)
     squared = dot(total, total)
     step = ior - 1.0
     # (wi.v, wo.v) as sums that keep their digits where wo is near -wi
     towards_i, towards_o = 0.5 * ior * squared - step, 0.5 * squared + step
-    exists = (towards_i * towards_o < 0) & (towards_i * v[2] > 0)
-    exists = exists & ~is_index_matched(ior)
+    exists = (towards_i * towards_o < 0) & ~is_index_matched(ior)
     a = jnp.where(exists, jnp.abs(towards_i), 1.0)
     b = jnp.where(exists, jnp.abs(towards_o), 1.0)
     x, y, z = jnp.where(exists, v[0], 0.0), jnp.where(exists, v[1], 0.0), jnp.where(exists, v[2], 1.0)
@@ -71,7 +81,7 @@ def refraction_lobe(
         inverse = 1.0 / jnp.sqrt(x * x + y * y + z * z)
         gain = (ior * a * inverse) * inverse * (ior * b * inverse) * inverse
         lobe = facets.density((x * inverse, y * inverse, jnp.abs(z) * inverse), alpha, distribution) * gain
-    return jnp.where(exists, lobe, 0.0), transmitted
+    return jnp.where(exists, lobe, 0.0), transmitted, jnp.where(towards_i > 0, v[2], -v[2])
 
 
 def is_index_matched(ior: Array) -> Array:

@@ -7,6 +7,7 @@ are integrated over along the facets that either side sees, and the two sums wei
 
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,18 +15,23 @@ import jax.numpy as jnp
 from jax import Array
 
 from layerjax._batching import by_rows
-from layerjax._numerics import horizon, safe_sqrt
+from layerjax._numerics import horizon, safe_sqrt, smooth_step
 from layerjax.channels import Channels, each, total
 from layerjax.directions import Vector, flip, sanitised, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces.interface import interface_transmission, is_index_matched
-from layerjax.transport.adding_doubling.facet_light import Normals, refracted_rays
+from layerjax.surfaces.interface import continued_lobe, is_index_matched
+from layerjax.surfaces.microfacet import visibility
+from layerjax.transport.adding_doubling.facet_light import Normals, facet_spacing, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
 from layerjax.transport.adding_doubling.requested import requested_region, turn
 from layerjax.transport.adding_doubling.resolution import is_tilted
 
 POINTS = (16, 12)
 """Points a panel, and in azimuth, of the facets of either side."""
+
+EDGE = 7.5
+"""Times the distance between rays: half the width over which the end of a lobe is rounded off, at facets that stand
+upright. Else values would change by steps of up to 3e-4 as an index moves rays across it."""
 
 AT_ONCE = 1 << 17
 """Rays that are followed together."""
@@ -40,6 +46,13 @@ class Ballistic(eqx.Module):
     upper: Interface
     lower: Interface
     media: tuple[tuple[Medium, ...], tuple[Medium, ...], tuple[Medium, ...]]
+
+
+class Lobe(NamedTuple):
+    """A BTDF, continued beyond the facets that stand upright, and ended there: only the first has smooth weights."""
+
+    continued: Array
+    ended: Array
 
 
 def ballistic_paths(stack: Stack) -> Ballistic | None:
@@ -143,26 +156,41 @@ def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) 
     over: Vector = (-sine_i[:, None], jnp.zeros_like(cos_phi), -cosine_i[:, None])
     under: Vector = (sine_o[:, None] * cos_phi, sine_o[:, None] * sin_phi, -cosine_o[:, None])
 
-    def parts(x: Array, y: Array, z: Array) -> tuple[Array, Array, Channels]:
+    ratios = 1.0 / inner, below / inner
+    edges = [
+        EDGE * facet_spacing(POINTS[0], facets) * jnp.abs(1.0 - n) for n, facets in zip(ratios, faces, strict=True)
+    ]
+
+    def parts(x: Array, y: Array, z: Array) -> tuple[Lobe, Lobe, Channels]:
         """g_i, g_o / n_below^2 and what media pass, of travel along (x, y, -z) between the interfaces."""
         middle: Vector = (-x, -y, z)
-        g_i = interface_transmission((x, y, z), over, 1.0 / inner, *faces[0])
-        g_o = interface_transmission(middle, under, below / inner, *faces[1])
+        g_i = _lobe((x, y, z), over, ratios[0], faces[0], edges[1])
+        g_o = _lobe(middle, under, ratios[1], faces[1], edges[0])
         depths = total([*optical_depths(state.media[1], middle), (jnp.zeros_like(z),)])
-        return g_i, g_o / below**2, tuple(jnp.exp(-depth) for depth in depths)
+        return g_i, Lobe(*(part / below**2 for part in g_o)), tuple(jnp.exp(-depth) for depth in depths)
 
     # a BTDF at equal indices is a delta: then the rays of that side are the whole
     delta_i, delta_o = is_index_matched(inner), is_index_matched(inner / below)
     (x, y, z), share = _rays(cosine_i, inner, faces[0])
     g_i, g_o, passed = parts(x, y, z)
-    counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, g_i / (g_i + g_o + TINY)))
-    from_above = [jnp.sum(share * below**2 * g_o * counted * level, axis=-1) for level in passed]
+    counted = jnp.where(delta_i, 1.0, jnp.where(delta_o, 0.0, _weight(g_i, g_o)))
+    from_above = [jnp.sum(share * below**2 * g_o.ended * counted * level, axis=-1) for level in passed]
     (x, y, z), share = _rays(cosine_o, inner / below, faces[1])
     # followed backwards, from where it leaves
     g_i, g_o, passed = parts(x * cos_phi - y * sin_phi, x * sin_phi + y * cos_phi, z)
-    counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, g_o / (g_i + g_o + TINY)))
-    from_below = [jnp.sum(share * below**2 * g_i * counted * level, axis=-1) for level in passed]
+    counted = jnp.where(delta_i, 0.0, jnp.where(delta_o, 1.0, _weight(g_o, g_i)))
+    from_below = [jnp.sum(share * below**2 * g_i.ended * counted * level, axis=-1) for level in passed]
     return total([from_above, from_below])
+
+
+def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> Lobe:
+    lobe, transmitted, height = continued_lobe(wi, wo, ratio, *facets)
+    value = 4.0 * visibility(wi[2], wi, -wo[2], wo, *facets) * lobe * transmitted
+    return Lobe(value, value * smooth_step(height / (edge + TINY)))
+
+
+def _weight(one: Lobe, other: Lobe) -> Array:
+    return one.continued / (one.continued + other.continued + TINY)
 
 
 def _rays(cosine: Array, ratio: Array, normals: Normals) -> tuple[Vector, Array]:

@@ -111,13 +111,15 @@ def refracted_densely(grid: Grid, near: Region, far: Region, normals: Normals, m
     m, weight, wi = _ggx_normals(grid, near, normals.alpha, modes)
     # the squared cosine of refraction changes by so much with the angle at the facet where it is 0
     steepness = 2.0 * safe_sqrt((1.0 - ratio) * (1.0 + ratio)) / ratio
-    return _through(wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(grid, normals) * steepness)
+    return _through(
+        wi, m, dot(wi, m), weight, ratio, normals, CRITICAL * facet_spacing(polar_count(grid), normals) * steepness
+    )
 
 
-def facet_spacing(grid: Grid, normals: Normals) -> Array:
-    """Angle between facets of the dense quadrature, about."""
+def facet_spacing(points: int, normals: Normals) -> Array:
+    """Angle between facets of so many points from pole to rim, about."""
     alpha = jnp.asarray(normals.alpha)
-    return alpha / (1.0 + 2.0 * alpha) / polar_count(grid)
+    return alpha / (1.0 + 2.0 * alpha) / points
 
 
 def polar_count(grid: Grid) -> int:

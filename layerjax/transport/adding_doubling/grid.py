@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from layerjax._numerics import at_least, at_most, horner, safe_sqrt
+from layerjax._numerics import at_least, at_most, horner, safe_sqrt, smooth_step
 from layerjax.quadrature import gauss_legendre
 from layerjax.transport.adding_doubling.interpolate import cubic
 
@@ -194,8 +194,7 @@ def _around(grid: Grid, squared_index: Array, k: int, blur: Array) -> Array:
 def _step(distance: Array, around: Array, inner: Array) -> Array:
     """How much of a direction lies beyond an edge: 0 to 1 over what is around it."""
     wide = around > 0
-    t = jnp.clip(0.5 * (distance / jnp.where(wide, around, 1.0) + 1.0), 0.0, 1.0)
-    smooth = t * t * t * (10.0 + t * (6.0 * t - 15.0))
+    smooth = smooth_step(distance / jnp.where(wide, around, 1.0))
     return jnp.where(inner, jnp.where(wide, smooth, distance >= 0), 0.0)
 
 

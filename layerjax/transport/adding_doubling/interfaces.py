@@ -23,6 +23,7 @@ from layerjax.transport.adding_doubling.facet_light import (
     Normals,
     facet_energies,
     facet_spacing,
+    polar_count,
     reflected_energy,
     refracted_densely,
     refracted_rays,
@@ -67,11 +68,11 @@ index 1.26 to 1.9: values off by up to 1e-3, and 3e-4 with it.
 LEAK = 16.0
 """Times the precision: of light that is totally reflected what is lost at least."""
 
-LITTLE, RIDGE, TINY = 0.1, 1e-8, 1e-18
-"""Of a typical flux, what counts as none of it: a flux changes its sign with the index over as much, and with a tenth
-of it slopes of what is read off tables have bumps of 0.1 of |f|, 1e-4 of it wide; of an energy, what may be missing
-where nothing can be put right (in single precision the root of its epsilon); and what keeps quotients finite, whose
-square is not 0 there either."""
+LITTLE, RIDGE, TINY = 1.0, 1e-8, 1e-18
+"""Of a typical flux, what counts as little: a flux changes its sign with the index over as much. With a tenth of it
+values change by 1e-8 over 4e-5 of the index, which are bumps of the slope of 4e-4 of |f|, with a hundredth of it 0.1;
+of an energy, what may be missing where nothing can be put right (in single precision the root of its epsilon); and
+what keeps quotients finite, whose square is not 0 there either."""
 
 
 def interface_layer(
@@ -200,7 +201,7 @@ def _blur(grid: Grid, near: Region, far: Region, normals: Normals) -> Array:
     Between several interfaces no wider than rays are apart: light that is kept there by total reflection meets the edge
     again and again. As wide as for a single one, a clear slab of index 1.2 and alpha 0.5 would be off by 4e-3.
     """
-    apart = facet_spacing(grid, normals) * (1.0 - _unsampled_share(grid, normals))
+    apart = facet_spacing(polar_count(grid), normals) * (1.0 - _unsampled_share(grid, normals))
     if grid.interfaces == 1:
         return BLUR * apart * jnp.ones_like(grid.edges)
     steepness = 2.0 * safe_sqrt(grid.edges * (far.ior * far.ior - grid.edges))
