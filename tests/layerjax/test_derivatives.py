@@ -54,6 +54,7 @@ JITTERY = {
     ("Statistical", "hazy coat on metal"),
     ("Statistical", "plate"),
     ("Statistical", "clear plate"),
+    ("Statistical, single", "two coats on paint"),
     ("Statistical, forward", "hazy varnish"),
     ("Statistical, forward", "plate"),
 }
@@ -149,7 +150,8 @@ def wrong_in_double(slopes, vector, point, same, compared):
         yield "not finite"
         return
     ahead = float(slopes.weight @ slope)
-    if abs(back - ahead) > same * float(slopes.weight @ np.abs(slope)) + 1e-12:
+    rounding = 64 * np.finfo(float).eps * max(1.0, float(slopes.weight @ np.abs(slopes.values(vector)))) / point.length
+    if abs(back - ahead) > same * float(slopes.weight @ np.abs(slope)) + 1e-12 + rounding:
         yield f"reverse {back:.6g}, forward {ahead:.6g}"
     if compared:
         good = agrees(slope, slopes.values, vector, point)
