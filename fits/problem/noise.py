@@ -23,7 +23,7 @@ from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short
+from layerjax._checks import in_short, require_choice
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -67,6 +67,7 @@ class Noise:
                     _check_range(f"{field}.{end}", float(value), least, LEVELS[1])
             elif level is not None and not (isinstance(level, int | float) and level == 0):
                 _check_range(field, level, least, LEVELS[1])
+        require_choice("Noise.use_sigma", self.use_sigma, (True, False))
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)

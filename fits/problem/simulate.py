@@ -10,7 +10,7 @@ from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
-from layerjax._checks import in_short, require_kind
+from layerjax._checks import in_short, require_kind, require_seed
 from layerjax.compiling import programs_kept
 from layerjax.mixture import stacks_of
 
@@ -47,6 +47,7 @@ def simulate(
         if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
             raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
     require_kind("geometry", geometry, Geometry, Measurements)
+    require_seed(seed)
     require_visible("simulate", stack, light=geometry.wi)
     # evaluate picks the precision of the directions: float64 if the session has it turned on
     exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)

@@ -28,7 +28,16 @@ from fits.data import geometry
 from fits.data.formats._cells import Table, delimiter_of, named
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import LARGEST, SMALLEST_SIGMA, Measurements, Source, channel_names, check_quantity, to_bsdf
+from fits.data.measurements import (
+    LARGEST,
+    SMALLEST_SIGMA,
+    TO_HAVE_THEM,
+    Measurements,
+    Source,
+    channel_names,
+    check_quantity,
+    to_bsdf,
+)
 from fits.data.totals import Totals
 from fits.names import QUANTITIES, Quantity
 
@@ -129,6 +138,8 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
             column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one; or
             these are `Totals`.
     """
+    if not isinstance(measurements, Measurements):
+        raise ValueError(f"measurements: {measurements!r:.60} is not a Measurements; {TO_HAVE_THEM}")
     if isinstance(measurements, Totals):
         raise ValueError(f"{path}: totals are no BSDF values, which is what these columns hold")
     write_text(path, csv_text(measurements), force)
