@@ -31,7 +31,7 @@ def simulate(
         geometry: N pairs of directions, from `slices` say.
         transport: as in `Problem`: a layerjax transport that is not random, "auto", or any callable
             (stack, wi, wo) -> values.
-        noise: relative, unitless, >= 0.
+        noise: relative, in [0, 1] (0.05 is 5 %).
         floor: in 1/sr, >= 0.
         seed: of the noise.
 
@@ -46,6 +46,8 @@ def simulate(
     for name, level in (("noise", noise), ("floor", floor)):
         if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
             raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
+    if noise > 1.0:
+        raise ValueError(f"noise is {noise:g}, must be at most 1 (0.05 is 5 %)")
     require_kind("geometry", geometry, Geometry, Measurements)
     require_seed(seed)
     require_visible("simulate", stack, light=geometry.wi)
