@@ -198,7 +198,9 @@ def fit_files(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file, must be a directory")
     if holds_other_files(out, STORE):
-        raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
+        raise ValueError(
+            f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs): choose another directory"
+        )
     # what is done, and what is left
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
