@@ -19,6 +19,13 @@ _UMASK = os.umask(0)  # it can only be read by setting it: once, before other th
 os.umask(_UMASK)
 
 
+def given_path(name: str, path: object) -> Path:
+    """The path that an argument is. ValueError for one that is none."""
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{name}: {' '.join(repr(path).split()):.60} is not the path of a file or directory")
+    return Path(path)
+
+
 def require_file(path: Path) -> None:
     """FileNotFoundError if it does not exist, ValueError if it is no file: pipes cannot be read more than once."""
     require_there(path)
@@ -44,7 +51,7 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
 
     durable: the content has reached the disk before it replaces an existing file. An OSError names the file.
     """
-    path = Path(path)
+    path = given_path("path", path)
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     if not path.parent.is_dir():

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fits._files import write_text
-from fits.data.measurements import Measurements
+from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.maps.report import page
 from fits.maps.store import FittedMap
 from fits.optimise.result import Fit
@@ -44,6 +44,10 @@ def report(
             several measurements (see `Fit.part`); or a part of a map is damaged.
     """
     require_kind("fit", fit, Fit, FittedMap)
+    require_kind("posterior", posterior, Posterior, None)
+    require_kind("others", others, Mapping, None)
+    require_kind("held_out", held_out, Measurements, None, fix=TO_HAVE_THEM)
+    require_kind("options", options, ReportOptions)
     if isinstance(fit, FittedMap):
         if posterior is not None or others or held_out is not None:
             raise ValueError("posterior, others, held_out: a map has none; it is reported by itself")

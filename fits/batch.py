@@ -12,13 +12,13 @@ import io
 import math
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from fits._files import named, read_json, require_there, text_checksum, write_text
+from fits._files import given_path, named, read_json, require_there, text_checksum, write_text
 from fits.data.formats import sniff
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
@@ -33,7 +33,7 @@ from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import make_room
 from fits.problem.problem import Problem
 from fits.problem.stack_file import ProblemFile, read_problem
-from fits.progress import Progress, silent
+from fits.progress import Progress, given_progress, silent
 from fits.reports import results, tables
 from fits.reports.html import FitReport
 from fits.reports.pages import document, section, sentences
@@ -41,6 +41,7 @@ from fits.reports.verdicts import listed
 from fits.store import Store, another, differences, fingerprint, holds_other_files
 from fits.structure_search import search as run_search
 from fits.structure_search import write_report as write_search
+from layerjax._checks import require_count, require_kind, require_seed
 
 TABLE, PAGE, STORE, SEARCH, STACKS = "table.csv", "report.html", "batch.store", "search", "search-stacks"
 
@@ -176,9 +177,15 @@ def fit_files(
             `force`; a directory in use, or that holds something else; as `fits.engines.run`.
     """
     # what is fitted by what
-    read_options, out, progress = read_options or ReadOptions(), Path(out), progress or silent
-    paths, skipped = _measurement_files(_several(files), read_options.format)
-    stack_files = _by_name([(path, path.stem) for path in map(Path, _several(stacks))], (SEARCH, STACKS))
+    require_kind("read_options", read_options, ReadOptions, None)
+    require_kind("search", search, bool, Mapping)
+    require_count("starts", starts, 1)
+    require_seed(seed)
+    require_count("processes", processes, 1)
+    files, stacks = _several("files", files), _several("stacks", stacks)
+    read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
+    paths, skipped = _measurement_files(files, read_options.format)
+    stack_files = _by_name([(path, path.stem) for path in stacks], (SEARCH, STACKS))
     given = {name: read_problem(path) for name, path in stack_files.items()}
     if not given and search is False:
         raise ValueError("neither a stack nor a search is given; there must be one of them")
@@ -191,7 +198,9 @@ def fit_files(
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out}: is a file, must be a directory")
     if holds_other_files(out, STORE):
-        raise ValueError(f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs)")
+        raise ValueError(
+            f"{out}: is not empty, and holds no fits of files (no {STORE} of theirs): choose another directory"
+        )
     # what is done, and what is left
     done = Store.read(out / STORE) if (out / STORE).is_file() else None
     # workers of a cluster have another working directory
@@ -223,8 +232,9 @@ def fit_files(
     return result
 
 
-def _several(items: str | Path | Sequence[str | Path]) -> list[str | Path]:
-    return [items] if isinstance(items, str | Path) else list(items)
+def _several(name: str, items: str | Path | Sequence[str | Path]) -> list[Path]:
+    many = [items] if isinstance(items, str | Path) or not isinstance(items, Iterable) else items
+    return [given_path(name, item) for item in many]
 
 
 def _measurement_files(places: Sequence[str | Path], format: str | None) -> tuple[dict[str, Path], tuple[str, ...]]:

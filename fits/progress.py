@@ -19,6 +19,13 @@ def silent(stage: str, done: int, total: int | None = None, info: str = "") -> N
     """Show nothing."""
 
 
+def given_progress(progress: Progress | None) -> Progress:
+    """The callback that an argument is; None shows nothing. ValueError for what cannot be called."""
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress: {progress!r:.60} is not a function, such as progress(stage, done, total, note)")
+    return progress or silent
+
+
 def named(name: str, progress: Progress) -> Progress:
     """The same progress, with a name before each stage."""
 

@@ -355,6 +355,8 @@ def _errors_of(path: Path) -> Iterator[None]:
         code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
         if code in _NO_ROOM:
             raise OSError(errno.ENOSPC, "No space left on device, or more than a quota allows", str(path)) from None
+        if code == sqlite3.SQLITE_READONLY_DBMOVED:
+            raise OSError(errno.ENOENT, "Removed, or replaced, while it was written", str(path)) from None
         if code & 0xFF in _NO_ACCESS:
             raise OSError(errno.EACCES, "Permission denied", str(path)) from None
         if code & 0xFF == sqlite3.SQLITE_IOERR:

@@ -17,15 +17,16 @@ from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 import layerjax as lj
+from fits._files import given_path, write_text
 from fits._files import named as errors_named
-from fits._files import write_text
-from fits.data.measurements import Measurements
+from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.optimise.fit import fit as run_fit
 from fits.optimise.fit import fit_with_discrepancy, needs_discrepancy, undecided, without_discrepancy
 from fits.optimise.options import DEFAULT, FitOptions
@@ -39,14 +40,14 @@ from fits.problem.noise import Noise
 from fits.problem.parameters import Free, LogUniform
 from fits.problem.problem import Problem
 from fits.problem.stack_file import check_keys, read_tables, require_table, stack_from_dict
-from fits.progress import Progress, silent
+from fits.progress import Progress, given_progress
 from fits.reports.html import source_name
 from fits.reports.pages import Table, document, section
 from fits.reports.results import load_fit, save_fit
 from fits.reports.tables import parameter_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, holds_other_files
-from layerjax._checks import in_short, require_kind
+from layerjax._checks import in_short, require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 STORE, PAGE = "search.store", "search.html"
@@ -97,6 +98,7 @@ def default_library(channels: int = 1) -> Library:
 
     channels: of the data; what has a colour has a value for each.
     """
+    require_count("channels", channels, 1)
 
     def coloured(start: float) -> Free:
         return (
@@ -131,7 +133,7 @@ def read_library(path: str | Path) -> Library:
         FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file and the place in it.
     """
-    _, tables = read_tables(Path(path))
+    _, tables = read_tables(given_path("path", path))
 
     def part(place: str, table: Any) -> lj.Stack:
         try:
@@ -190,7 +192,9 @@ class SearchOptions:
                 raise ValueError(f"{name} is {in_short(number)}; it must be a whole number in [{low}, {high}]")
         for name in ("bic_gain", "budget"):
             number = getattr(self, name)
-            if number is not None and not 0.0 <= number < math.inf:
+            if (name, number) != ("budget", None) and not (
+                isinstance(number, Real) and 0.0 <= float(number) < math.inf
+            ):
                 raise ValueError(f"{name} is {in_short(number)}; it must be a finite number of at least 0")
         require_kind("fit", self.fit, FitOptions)
 
@@ -295,13 +299,14 @@ def search(
         ("options", options, SearchOptions),
     ):
         require_kind(name, value, kind, None)
-    require_kind("data", data, Measurements)
+    require_kind("data", data, Measurements, fix=TO_HAVE_THEM)
+    require_seed(seed)
     library, options = library or default_library(len(data.channels)), options or SearchOptions()
     settings = {"transport": transport, "noise": noise or Noise(), "scale": scale, "instrument": instrument}
     until = math.inf if options.budget is None else time.monotonic() + 60.0 * options.budget
     store: Any = nullcontext()
     if directory is not None:
-        directory, used = Path(directory), data.used()
+        directory, used = given_path("directory", directory), data.used()
         if holds_other_files(directory, STORE):
             raise ValueError(f"{directory}: is not empty, and holds no search")
         with errors_named(directory):
@@ -311,7 +316,7 @@ def search(
         numbers = [used.wi, used.wo, used.values, used.sigma]
         store = Store.open(directory / STORE, fingerprint(data=numbers, library=library, **settings, **starting))
     with store as opened:
-        work = _Work(data, library, settings, options, seed, opened, until, progress or silent)
+        work = _Work(data, library, settings, options, seed, opened, until, given_progress(progress))
         coarse: dict[Structure, Fit] = {}
         full: dict[Structure, _CrossValidated] = {}
         level: list[Structure] = [(base,) for base in library.bases]

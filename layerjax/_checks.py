@@ -1,6 +1,8 @@
 """Arguments of a wrong kind are refused in one line, which names the argument and what it should be."""
 
+import math
 from collections.abc import Iterable
+from numbers import Real
 from typing import Any
 
 import jax
@@ -16,17 +18,30 @@ def in_short(value: object) -> str:
     return f"{' '.join(repr(value).split()):.{MOST_LETTERS}}"
 
 
-def require_kind(name: str, value: object, *kinds: type | None) -> None:
-    """Refuse what is of none of these types; None among them: it may be None."""
+def require_kind(name: str, value: object, *kinds: type | None, fix: str = "") -> None:
+    """Refuse what is of none of these types, and say what to do; None among them: it may be None."""
     if not isinstance(value, tuple(kind for kind in kinds if kind is not None)) and not (value is None in kinds):
         words = " or ".join("None" if kind is None else f"a {kind.__name__}" for kind in kinds)
-        raise ValueError(f"{name}: {in_short(value)} is not {words}")
+        raise ValueError(f"{name}: {in_short(value)} is not {words}{f'; {fix}' if fix else ''}")
 
 
-def require_count(name: str, value: object, least: int) -> None:
-    """Refuse what is not a whole number of at least `least`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise ValueError(f"{name}: {in_short(value)} is not a whole number of at least {least}")
+def require_count(name: str, value: object, least: int, most: int | None = None) -> None:
+    """Refuse what is not a whole number of at least `least`, and at most `most`."""
+    above = most is not None and isinstance(value, int | np.integer) and value > most
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least or above:
+        words = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise ValueError(f"{name}: {in_short(value)} is not a whole number {words}")
+
+
+def require_seed(seed: object) -> None:
+    """Refuse what is not a seed that every random generator takes."""
+    require_count("seed", seed, 0, 2**32 - 1)
+
+
+def require_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> None:
+    """Refuse what is not a real number in a closed range."""
+    if isinstance(value, bool) or not (isinstance(value, Real) and low <= float(value) <= high):
+        raise ValueError(f"{name} is {in_short(value)}; it must be a number from {low:g} to {high:g}")
 
 
 def require_choice(name: str, value: object, allowed: Iterable[Any]) -> None:

@@ -27,8 +27,13 @@ from layerjax._parameters import floating
 Vector = tuple[Array, Array, Array]
 Factor = Array | float
 
-POLAR_SLACK = 1e-5
-"""By which a polar angle may pass half a turn: rounding in single precision, of degrees as well."""
+ANGLE_SLACK = 1e-5
+"""By which an angle may pass its limit: rounding in single precision, of degrees as well."""
+
+MOST_AZIMUTH = 3.0 * np.pi
+"""Size of an azimuth in radians: that of a mirror direction, half a turn from an azimuth of up to a whole one."""
+
+IN_DEGREES = "of angles in degrees say direction(..., degrees=True)"
 
 UNIT_SLACK = 2e-3
 """What the squared length of a direction may differ from 1: directions come rounded from files."""
@@ -46,12 +51,17 @@ def direction(theta: ArrayLike, phi: ArrayLike, *, degrees: bool = False) -> Arr
         Shape ``broadcast(theta, phi) + (3,)``.
 
     Raises:
-        ValueError: a polar angle that is known lies outside [-pi, pi], as one in degrees would.
+        ValueError: a polar angle that is known lies outside [-pi, pi], or an azimuth in radians outside
+            [-3 pi, 3 pi], as those in degrees would.
     """
     require_choice("degrees", degrees, (True, False))
     with jax.ensure_compile_time_eval():  # known angles give known directions, under jit too
         polar, azimuth = floating("theta", theta), floating("phi", phi)
-        _require_polar(theta, degrees)
+        if (size := _size(theta)) > (180.0 if degrees else np.pi) + ANGLE_SLACK:
+            limit = " degrees is outside [-180, 180]" if degrees else f" is outside [-pi, pi]; {IN_DEGREES}"
+            raise ValueError(f"theta: {size:g}{limit}")
+        if not degrees and (size := _size(phi)) > MOST_AZIMUTH + ANGLE_SLACK:
+            raise ValueError(f"phi: {size:g} is outside [-3 pi, 3 pi]; {IN_DEGREES}")
         if degrees:
             polar, azimuth = jnp.deg2rad(polar), jnp.deg2rad(azimuth)
         theta, phi = jnp.broadcast_arrays(polar, azimuth)
@@ -59,15 +69,11 @@ def direction(theta: ArrayLike, phi: ArrayLike, *, degrees: bool = False) -> Arr
         return jnp.stack([sin_theta * jnp.cos(phi), sin_theta * jnp.sin(phi), jnp.cos(theta)], axis=-1)
 
 
-def _require_polar(theta: ArrayLike, degrees: bool) -> None:
-    """Refuse polar angles beyond half a turn, which are degrees given for radians."""
-    if any(isinstance(one, jax.core.Tracer) for one in jax.tree.leaves(theta)):
-        return
-    size = np.max(np.abs(np.asarray(theta, float)), initial=0.0)
-    if degrees and size > 180.0 + POLAR_SLACK:
-        raise ValueError(f"theta: {size:g} degrees is outside [-180, 180]")
-    if not degrees and size > np.pi + POLAR_SLACK:
-        raise ValueError(f"theta: {size:g} is outside [-pi, pi]; of angles in degrees say direction(..., degrees=True)")
+def _size(angles: ArrayLike) -> float:
+    """The largest absolute value; 0 for angles that are not known."""
+    if any(isinstance(one, jax.core.Tracer) for one in jax.tree.leaves(angles)):
+        return 0.0
+    return float(np.max(np.abs(np.asarray(angles, float)), initial=0.0))
 
 
 def angles(w: ArrayLike) -> tuple[Array, Array]:

@@ -85,7 +85,9 @@ OPTIONS: dict[str, Settings] = {
         "hold these data out of the fit and score their prediction, such as incidence=30,70", "DATA"
     ),
     "--library": _one("layers and bases to choose from (default: built in)", "TOML"),
-    "--noise": _one("relative noise beside the file's sigma (default: 0.05 without one)", "REL", type=level),
+    "--noise": _one(
+        "relative noise beside the file's sigma (default: 0.05 without one)", "REL", type=_number(float, 0.0, 1.0)
+    ),
     "--scale-sd": _one("relative standard deviation of the global scale (default: 0)", "SD", type=level),
     "--processes": _one("worker processes (default: one a core)", "N", type=count),
     "--scheduler": _one(

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import TextIOWrapper
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         from fits.cli.commands import COMMANDS
 
-        with raised_again():
+        with raised_again(), warnings_in_one_line():
             code = COMMANDS[arguments.command](arguments)
         sys.stdout.flush()  # while an error can still be reported
         return code
@@ -65,6 +66,26 @@ def _end_output() -> None:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def warnings_in_one_line() -> Iterator[None]:
+    """Within it, a warning that is meant for users is a line on stderr, once; others name the line of the program."""
+    usual, shown = warnings.showwarning, set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        words = " ".join(str(message).split())
+        if not issubclass(category, UserWarning):
+            usual(message, category, *where, **more)
+        elif words not in shown:
+            shown.add(words)
+            print(f"layerjax: warning: {words}", file=sys.stderr)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
 
 
 @contextmanager

@@ -54,6 +54,11 @@ class Geometry(Pairs):
     wi: Floats
     wo: Floats
 
+    def __post_init__(self) -> None:
+        for name in ("wi", "wo"):
+            if np.shape(w := getattr(self, name))[-1:] != (3,):
+                raise ValueError(f"{name} has shape {np.shape(w)}, must be (N, 3)")
+
     def __repr__(self) -> str:
         return f"<Geometry: {len(self):,} pairs of directions>"
 

@@ -36,6 +36,10 @@ class Source:
     attribution: str = ""
 
 
+TO_HAVE_THEM = "fits.read(path) reads a file, fits.Measurements(wi, wo, values, ...) holds arrays"
+"""What to do where something else is given for `Measurements`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Measurements(Pairs):
     """N samples of a BSDF in C channels.
@@ -63,6 +67,7 @@ class Measurements(Pairs):
     source: Source = field(default=Source(path="", format="memory"))
 
     def __post_init__(self) -> None:
+        _require_arrays(self)
         count, channels = len(self.values), len(self.channels)
         shapes = {"wi": (count, 3), "wo": (count, 3), "values": (count, channels), "mask": (count,)}
         if self.sigma is not None:
@@ -257,6 +262,13 @@ def channel_names(count: int) -> tuple[str, ...]:
     """Names for channels that have none: value, or red, green, blue, or channel1, channel2, ..."""
     known: dict[int, Sequence[str]] = {1: ("value",), 3: ("red", "green", "blue")}
     return tuple(known.get(count, [f"channel{number}" for number in range(1, count + 1)]))
+
+
+def _require_arrays(data: Measurements) -> None:
+    if np.ndim(data.values) == 0:
+        raise ValueError(f"values is {data.values!r:.60}, must be an array (N, C)")
+    if isinstance(data.channels, str) or not isinstance(data.channels, Sequence):
+        raise ValueError(f"channels is {data.channels!r:.60}, must be C names")
 
 
 def _check_angle(degrees: float, high: float) -> None:

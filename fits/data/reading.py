@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
+from fits._files import given_path
 from fits.data.formats import FileOptions, read_file
 from fits.data.measurements import Measurements
 from fits.data.selection import select
@@ -63,6 +65,16 @@ class ReadOptions(FileOptions):
     select: Sequence[str] = ()
     hold_out: Sequence[str] = ()
 
+    def __post_init__(self) -> None:
+        for name, high in (("min_retro_angle", 180.0), ("max_polar_angle", 90.0)):
+            if not (
+                (angle := getattr(self, name)) is None or (isinstance(angle, Real) and 0.0 <= float(angle) <= high)
+            ):
+                raise ValueError(f"{name} is {angle!r:.60}, must be in [0, {high:g}] degrees")
+        for name in ("select", "hold_out"):
+            if not isinstance(words := getattr(self, name), list | tuple):
+                raise ValueError(f"{name} is {words!r:.60}, must be a list of selections, such as ['incidence=10,50']")
+
     @classmethod
     def parse(cls, words: Sequence[str], **more: Any) -> Self:
         """Options from words such as ``format=merl`` and ``bins=5000``; more: further fields.
@@ -90,7 +102,7 @@ class ReadOptions(FileOptions):
 
     def split(self, path: str | Path) -> tuple[Measurements, Measurements | None]:
         """What of a file is fitted, and what is held out; None if nothing is. ValueError as `fits.read`."""
-        data = self._masked(Path(path))
+        data = self._masked(given_path("path", path))
         if isinstance(data, Totals):
             return data, None
         kept = [select(data, words) for words in self.select if not words.startswith(CHANNEL)]

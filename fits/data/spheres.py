@@ -15,7 +15,8 @@ the edges of the sample is neglected.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, NamedTuple
 
 
@@ -32,6 +33,9 @@ class Sphere:
     detector_reflectance: float = 0.0
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            if not isinstance(value := getattr(self, field.name), Real):
+                raise ValueError(f"Sphere.{field.name} is {value!r:.60}, must be a number")
         if not (math.isfinite(self.diameter) and self.diameter > 0.0):
             raise ValueError(f"Sphere.diameter is {self.diameter}, must be above 0")
         for name in ("sample", "entrance", "detector"):
@@ -90,7 +94,10 @@ class Spheres:
     together: bool = False
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.standard <= 1.0:
+        for name in ("reflection", "transmission"):
+            if not isinstance(one := getattr(self, name), Sphere | None):
+                raise ValueError(f"Spheres.{name} is {one!r:.60}, must be a Sphere or None")
+        if not (isinstance(self.standard, Real) and 0.0 < float(self.standard) <= 1.0):
             raise ValueError(f"Spheres.standard is {self.standard}, must be in (0, 1]")
         if self.together and (self.reflection is None or self.transmission is None):
             raise ValueError("Spheres.together: there is only one sphere")

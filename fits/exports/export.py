@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import layerjax as lj
-from fits._files import write_bytes
+from fits._files import given_path, write_bytes
 from fits.data.geometry import Floats
 from fits.exports import klems, merl, rgl, slices, zemax
 from fits.exports.contents import Contents
@@ -17,7 +17,7 @@ from fits.exports.material import Material, material_of
 from fits.exports.openpbr import document as openpbr
 from fits.names import EXPORTS, To
 from fits.optimise.result import Fit
-from fits.progress import Progress, silent
+from fits.progress import Progress, given_progress
 from layerjax._checks import in_short
 from layerjax.compiling import programs_kept
 
@@ -83,13 +83,13 @@ def export(
     """
     if not isinstance(to, str) or to not in EXPORTS:
         raise ValueError(f"to is {in_short(to)}, must be one of {', '.join(EXPORTS)}")
-    path = Path(path)
+    path = given_path("path", path)
     if path.suffix.lower() != ENDINGS[to]:
         raise ValueError(f"{path}: the name of a file for {to!r} must end in {ENDINGS[to]}")
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     stack, chosen = _stack_and_transport(material, transport)
-    prepared = material_of(stack, chosen, name or path.stem, progress or silent)
+    prepared = material_of(stack, chosen, name or path.stem, given_progress(progress))
     written = _WRITERS[to](prepared, _checked(wavelengths, to, prepared.channels))
     write_bytes(path, written.content, force)
     return ExportReport(path, to, written.notes)

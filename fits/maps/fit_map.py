@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import layerjax as lj
-from fits._files import locked
+from fits._files import given_path, locked
 from fits.data.geometry import direction
 from fits.engines import Failure, connected, run
 from fits.engines.processes import end_repeated_script
@@ -76,6 +76,7 @@ def fit_map(
             that could not be read or done: all others are.
         OSError: of the store, such as a full disk: chunks that are in it stay.
     """
+    require_kind("options", options, MapOptions)
     if options.processes > 1 and client is None:
         end_repeated_script()
     data = map_data(values, geometry, sigma, mask)
@@ -85,7 +86,8 @@ def fit_map(
     if noise is not None and not noise.use_sigma:
         data = replace(data, sigma=None)
     size = min(options.chunk_size, max(MapOptions.chunk_size, math.prod(data.shape)))  # no program for a million texels
-    path = Path(out).resolve() if Path(out).is_symlink() else Path(out)  # one lock for all links to a store
+    out = given_path("out", out)
+    path = out.resolve() if out.is_symlink() else out  # one lock for all links to a store
     if not path.resolve().parent.is_dir():
         raise ValueError(f"{path}: there is no directory {path.parent}")
     with locked(Path(f"{path}.lock"), str(path)), connected(client) as connection:

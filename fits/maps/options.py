@@ -131,6 +131,7 @@ class MapOptions:
             _require_number(name, getattr(self, name), 0.0, math.inf)
         for name in ("poor_probability", "pilot_quantile", "converged_share", "flagged_share"):
             _require_number(name, getattr(self, name), 0.0, 1.0)
+        require_choice("emulator", self.emulator, (None, True, False))
         require_kind("spatial_prior", self.spatial_prior, SpatialPrior, None)
 
     @property

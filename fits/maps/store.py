@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from zarr.codecs import Crc32cCodec
 from zarr.core.sync import sync
 
-from fits._files import named, plain, require_there
+from fits._files import given_path, named, plain, require_there
 from fits._lazy import shown_by
 from fits.engines.failures import one_line
 from fits.maps.inputs import UNREADABLE, Block
@@ -102,7 +102,8 @@ class FittedMap:
     """
 
     def __init__(self, path: str | Path, mode: Any = "r"):
-        self.path, self.attributes = Path(path), _attributes(Path(path))
+        self.path = given_path("path", path)
+        self.attributes = _attributes(self.path)
         about = self.attributes
         if about.get("format") != FORMAT:
             raise ValueError(f"{path}: is version {about.get('format')} of the format, must be {FORMAT}")

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from fits._files import given_path
 from fits.data.measurements import Measurements
 from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
@@ -41,8 +42,8 @@ from fits.problem.model import Transport
 from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
-from fits.progress import Progress, silent
-from layerjax._checks import require_kind
+from fits.progress import Progress, given_progress, silent
+from layerjax._checks import require_choice, require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 Floats = NDArray[np.float64]
@@ -104,16 +105,24 @@ def fit(
             if given is not None:
                 raise ValueError(f"{name} is given beside a {type(stack).__name__}, which says it all")
         problem = stack
-    elif data is None:
-        raise ValueError("data is None; it must be the measurements that the stack should explain")
     else:
-        problem = Problem(stack, data, transport, Noise() if noise is None else noise, scale, objective, instrument)
-    if starts < 1:
-        raise ValueError(f"starts is {starts}; it must be at least 1")
+        problem = Problem(
+            stack,
+            cast(Measurements, data),
+            transport,
+            Noise() if noise is None else noise,
+            scale,
+            objective,
+            instrument,
+        )
+    require_count("starts", starts, 1)
+    require_seed(seed)
+    require_choice("screen", screen, (False, True))
+    checkpoint = None if checkpoint is None else given_path("checkpoint", checkpoint)
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")
     require_kind("options", options, FitOptions)
-    run = _Run(starts, seed, solver, options, progress or silent, checkpoint, screen)
+    run = _Run(starts, seed, solver, options, given_progress(progress), checkpoint, screen)
     independent = _fit_from(problem, start_points(problem, starts, seed), run)
     before = {
         name: found

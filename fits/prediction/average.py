@@ -13,6 +13,7 @@ from fits.prediction.options import ComparisonOptions
 from fits.prediction.predict import DRAWS, LEVELS, Prediction, predict
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
+from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
 LINEAR = 1e6
@@ -85,6 +86,8 @@ def average(
         ValueError: no candidate; weights that are missing, negative or all 0; or as `cross_validate`.
     """
     require_fits(candidates)
+    require_kind("weights", weights, Mapping, None)
+    require_kind("options", options, ComparisonOptions, None)
     if not candidates:
         raise ValueError("average: there is no fit to average")
     if weights is None:

@@ -14,6 +14,7 @@ from fits.prediction.cross_validation import ModelScore, model_scores
 from fits.prediction.options import ComparisonOptions
 from fits.progress import Progress
 from fits.sampling.posterior import Posterior, require_fits
+from layerjax._checks import require_kind
 from layerjax.compiling import programs_kept
 
 
@@ -91,6 +92,7 @@ def compare(
             compared, but not with `refit`.
     """
     require_fits(candidates)
+    require_kind("options", options, ComparisonOptions, None)
     if len(candidates) < 2:
         raise ValueError(f"compare: {len(candidates)} candidate(s) given; at least 2 are needed")
     fits = {name: entry.fit if isinstance(entry, Posterior) else entry for name, entry in candidates.items()}

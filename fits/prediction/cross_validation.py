@@ -26,9 +26,9 @@ from fits.prediction.predict import posterior_predictive
 from fits.problem.discrepancy import size
 from fits.problem.noise import total_sigma
 from fits.problem.problem import Problem
-from fits.progress import Progress, named, silent
+from fits.progress import Progress, given_progress, named
 from fits.sampling.initial import other_minima, vector_of
-from layerjax._checks import require_kind
+from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 DRAWS = 128
@@ -105,6 +105,8 @@ def cross_validate(
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
     """
+    require_count("draws", draws, 2)
+    require_seed(seed)
     options = options or ComparisonOptions()
     groups, data = require_groups(fit, options), fit.problem.data.used()
     proposal = None if posterior is None else posterior.proposal(np.random.RandomState(seed), 2 * draws)
@@ -137,6 +139,7 @@ def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[s
         ValueError: as `cross_validate`.
     """
     require_kind("fit", fit, Fit)
+    require_kind("options", options, ComparisonOptions, None)
     if not fit.is_posterior:
         raise ValueError(
             f"cross_validate: a fit of {fit.problem.objective!r} has no noise model and predicts no measurements"
@@ -216,7 +219,8 @@ def model_scores(
 ) -> dict[str, ModelScore]:
     """Score fits of the same data, by name; each is fitted again without each incidence (see `cross_validate`)."""
     results = {
-        name: out_of_sample(fit, named(name, progress or silent), options=options) for name, fit in candidates.items()
+        name: out_of_sample(fit, named(name, given_progress(progress)), options=options)
+        for name, fit in candidates.items()
     }
     return rank_models(
         {name: held_out for name, (held_out, _) in results.items()},

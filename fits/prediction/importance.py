@@ -19,7 +19,7 @@ from fits.prediction.options import ComparisonOptions
 from fits.problem.compilation import in_shares
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.proposals import Density, FittedProposal
-from layerjax._checks import require_kind
+from layerjax._checks import require_count, require_kind, require_seed
 
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 """Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
@@ -198,6 +198,8 @@ def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
         ValueError: a fit of a named objective, or a part of a joint fit.
     """
     require_kind("fit", fit, Fit)
+    require_count("draws", draws, 2)
+    require_seed(seed)
     if not fit.is_posterior:
         raise ValueError(f"evidence: a fit of {fit.problem.objective!r} has none, it minimised no likelihood")
     fit.require_alone("evidence")

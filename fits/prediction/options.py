@@ -1,6 +1,9 @@
 """Thresholds of the verdicts of a model comparison."""
 
 from dataclasses import dataclass, fields
+from numbers import Real
+
+from layerjax._checks import in_short, require_count
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ class ComparisonOptions:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            if not getattr(self, field.name) > 0:
-                raise ValueError(f"{field.name} is {getattr(self, field.name)}; it must be above 0")
-        if self.scan_parts < 2:
-            raise ValueError(f"scan_parts is {self.scan_parts}; it must be at least 2")
+            value = getattr(self, field.name)
+            if not (isinstance(value, Real) and float(value) > 0.0):
+                raise ValueError(f"{field.name} is {in_short(value)}; it must be a number above 0")
+        for name, least in (("min_incidences", 1), ("scan_parts", 2), ("most_draws", 1)):
+            require_count(name, getattr(self, name), least)

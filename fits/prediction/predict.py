@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import TYPE_CHECKING, Protocol
 
 import jax
@@ -20,7 +21,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from fits.data.geometry import Geometry
-from fits.data.measurements import Measurements, Source
+from fits.data.measurements import TO_HAVE_THEM, Measurements, Source
 from fits.data.totals import Totals
 from fits.optimise.result import Fit
 from fits.prediction.importance import MAX_PARETO_K, importance_draws
@@ -32,7 +33,7 @@ from fits.problem.problem import polar_angles
 from fits.problem.simulate import require_visible
 from fits.sampling.initial import normal_draws
 from fits.sampling.posterior import Posterior
-from layerjax._checks import in_short, require_kind
+from layerjax._checks import in_short, require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 if TYPE_CHECKING:
@@ -235,6 +236,8 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     Raises:
         ValueError: no measurement to score, or other directions than those that were predicted.
     """
+    require_kind("prediction", prediction, Prediction)
+    require_kind("measurements", measurements, Measurements, fix=TO_HAVE_THEM)
     used = measurements.used()
     if used.wi.shape != prediction.wi.shape or not np.allclose(used.wo, prediction.wo) & np.allclose(
         used.wi, prediction.wi
@@ -257,9 +260,9 @@ def scores(prediction: Prediction, measurements: Measurements, rows: NDArray[np.
     )
 
 
-def require_level(level: float) -> None:
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level is {level}; it must be in (0, 1)")
+def require_level(level: float, name: str = "level") -> None:
+    if not (isinstance(level, Real) and 0.0 < float(level) < 1.0):
+        raise ValueError(f"{name} is {in_short(level)}; it must be in (0, 1)")
 
 
 class Predictor(Protocol):
@@ -296,11 +299,12 @@ def predict(
         ValueError: a level or number of draws out of range, a fit of a named objective, measurements in other channels,
             directions below an opaque stack, or directions that the transport does not support.
     """
-    for level in levels:
-        require_level(level)
-    if draws < 2:
-        raise ValueError(f"draws is {draws}; it must be at least 2")
-    require_kind("at", at, Geometry, Measurements)
+    require_kind("levels", levels, tuple, list, np.ndarray)
+    for place, level in enumerate(levels):
+        require_level(level, f"levels[{place}]")
+    require_count("draws", draws, 2)
+    require_seed(seed)
+    require_kind("at", at, Geometry, Measurements, fix=TO_HAVE_THEM)
     if not isinstance(fitted, Fit | Posterior):
         if isinstance(fitted, type) or not hasattr(fitted, "predict"):
             raise ValueError(f"fitted: {in_short(fitted)} is not a Fit, a Posterior or an Average")

@@ -23,7 +23,7 @@ from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short
+from layerjax._checks import in_short, require_choice
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -37,7 +37,8 @@ DEGREES_OF_FREEDOM = (0.01, 1e6)  # above, a Student-t is a Gaussian, and the te
 class Noise:
     """How a datum scatters about the model: variance = sigma^2 + (relative f)^2 + floor^2, with f the model's value.
 
-    relative: unitless, in [0, 1e100], or `Free`. floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
+    relative: a share of f, in [0, 1] (0.05 is 5 %), or `Free`.
+    floor: 1/sr, 0 or in [1e-100, 1e100], or `Free` with low > 0.
     use_sigma: take the measurement's own sigma where it has one.
     tails: "gaussian", or "student" with `degrees_of_freedom` in [0.01, 1e6], whose scale (not standard deviation) is
     then sigma.
@@ -58,15 +59,16 @@ class Noise:
     discrepancy: Discrepancy | bool | None = None
 
     def __post_init__(self) -> None:
-        for field, least in (("relative", 0.0), ("floor", LEVELS[0])):
+        for field, (least, most) in (("relative", (0.0, 1.0)), ("floor", LEVELS)):
             level = getattr(self, field)
             if isinstance(level, Free):
                 if level.shape != ():
                     raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
                 for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
-                    _check_range(f"{field}.{end}", float(value), least, LEVELS[1])
+                    _check_range(f"{field}.{end}", float(value), least, most)
             elif level is not None and not (isinstance(level, int | float) and level == 0):
-                _check_range(field, level, least, LEVELS[1])
+                _check_range(field, level, least, most)
+        require_choice("Noise.use_sigma", self.use_sigma, (True, False))
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
@@ -82,7 +84,8 @@ class Noise:
 
 def _check_range(field: str, value: Any, low: float, high: float) -> None:
     if not (isinstance(value, int | float) and low <= value <= high):
-        raise ValueError(f"Noise.{field} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]")
+        share = " (0.05 is 5 %)" if field.startswith("relative") else ""
+        raise ValueError(f"Noise.{field} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]{share}")
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:

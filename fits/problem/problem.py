@@ -20,7 +20,7 @@ from jax import Array
 from numpy.typing import ArrayLike, NDArray
 
 import layerjax as lj
-from fits.data.measurements import Measurements
+from fits.data.measurements import TO_HAVE_THEM, Measurements
 from fits.data.scans import groups
 from fits.data.totals import Totals
 from fits.names import Objective
@@ -308,6 +308,7 @@ class Joint(FittingProblem):
     objective: Objective = "likelihood"
 
     def __init__(self, parts: Mapping[str, Problem], shared: Sequence[str] = ()):
+        require_kind("parts", parts, Mapping)
         self.parts, self.shared = dict(parts), tuple([shared] if isinstance(shared, str) else shared)
         if len(self.parts) < 2:
             raise ValueError(f"Joint.parts is {list(self.parts)}; it must name at least two problems")
@@ -464,7 +465,7 @@ def _require_kinds(problem: Problem) -> None:
         require_material(problem.stack)
     elif not callable(problem.transport):  # a function takes any stack
         raise ValueError(f'transport: {in_short(problem.transport)} is not a Transport or "auto", nor a function')
-    require_kind("data", problem.data, Measurements)
+    require_kind("data", problem.data, Measurements, fix=TO_HAVE_THEM)
     require_kind("noise", problem.noise, Noise)
     require_kind("instrument", problem.instrument, Instrument, None)
     if problem.objective not in get_args(Objective):

@@ -10,7 +10,7 @@ from fits.data.geometry import Geometry as Geometry
 from fits.data.geometry import slices as slices
 from fits.data.measurements import SMALLEST_SIGMA, Measurements, Source, channel_names
 from fits.problem.model import Transport, forward
-from layerjax._checks import in_short, require_kind
+from layerjax._checks import in_short, require_kind, require_seed
 from layerjax.compiling import programs_kept
 from layerjax.mixture import stacks_of
 
@@ -31,7 +31,7 @@ def simulate(
         geometry: N pairs of directions, from `slices` say.
         transport: as in `Problem`: a layerjax transport that is not random, "auto", or any callable
             (stack, wi, wo) -> values.
-        noise: relative, unitless, >= 0.
+        noise: relative, in [0, 1] (0.05 is 5 %).
         floor: in 1/sr, >= 0.
         seed: of the noise.
 
@@ -46,7 +46,10 @@ def simulate(
     for name, level in (("noise", noise), ("floor", floor)):
         if not (isinstance(level, int | float | np.number) and math.isfinite(level) and level >= 0):
             raise ValueError(f"{name} is {in_short(level)}, must be finite and >= 0")
+    if noise > 1.0:
+        raise ValueError(f"noise is {noise:g}, must be at most 1 (0.05 is 5 %)")
     require_kind("geometry", geometry, Geometry, Measurements)
+    require_seed(seed)
     require_visible("simulate", stack, light=geometry.wi)
     # evaluate picks the precision of the directions: float64 if the session has it turned on
     exact = np.asarray(forward(stack, geometry.wi, geometry.wo, transport), dtype=np.float64)

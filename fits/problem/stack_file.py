@@ -45,15 +45,16 @@ import numpy as np
 import tomli_w
 
 import layerjax as lj
-from fits._files import require_file, write_text
+from fits._files import given_path, require_file, write_text
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy
 from fits.problem.instrument import Instrument
 from fits.problem.noise import LEVELS, Noise
 from fits.problem.parameters import Free, LogNormal, LogUniform, Normal, PowerLaw, Prior, Uniform
 from layerjax import gallery
-from layerjax._checks import in_short
+from layerjax._checks import in_short, require_kind
 from layerjax._shapes import require_single
+from layerjax.mixture import require_material
 
 Range = tuple[float, float]
 ANY: Range = (-math.inf, math.inf)
@@ -99,7 +100,7 @@ def read_problem(path: str | Path) -> ProblemFile:
         FileNotFoundError: there is no such file.
         ValueError: on one line, which names the file, the place in it and what may stand there.
     """
-    path = Path(path)
+    path = given_path("path", path)
     text, tables = read_tables(path)
     try:
         known = ("about", "transport", "objective", *MATERIAL, "noise", "scale", "instrument", "options")
@@ -156,6 +157,11 @@ def write_problem(
     Raises:
         ValueError: the file exists and `force` is False; or a part is of a class of one's own, which no file names.
     """
+    require_material(stack)
+    require_kind("transport", transport, lj.Transport, str)
+    for name, value, kind in (("noise", noise, Noise), ("scale", scale, Free), ("instrument", instrument, Instrument)):
+        require_kind(name, value, kind, None)
+    choice("objective", objective, get_args(Objective))
     tables: dict[str, Any] = {}
     if not isinstance(transport, str):
         tables["transport"] = transport_to_dict(transport)

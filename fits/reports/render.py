@@ -14,7 +14,8 @@ from scipy.interpolate import RegularGridInterpolator
 
 import layerjax as lj
 from fits.reports.plots.data import CYCLE, STYLE
-from layerjax.mixture import stacks_of
+from layerjax._checks import in_short
+from layerjax.mixture import require_material, stacks_of
 
 Prepared = lj.Prepared | lj.Mixture
 
@@ -59,8 +60,9 @@ def render(
         ValueError: the size is out of range, the stack ends in another index than that of air, or the transport is
             random or does not carry the stack.
     """
-    if not 16 <= size <= 1024:  # more take several GB, and the whole picture has no more across
-        raise ValueError(f"size is {size}, must be in [16, 1024] pixels")
+    require_material(stack)
+    if not (isinstance(size, int) and 16 <= size <= 1024):  # more take several GB, and the picture has no more across
+        raise ValueError(f"size is {in_short(size)}, must be in [16, 1024] pixels")
     for part in stacks_of(stack):
         indices = [float(layer.ior) for layer in part.layers if isinstance(layer, lj.Interface)]
         if part.base is None and indices and indices[-1] != 1.0:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fits._files import locked, read_json, require_there, text_checksum, write_json, write_text
+from fits._files import given_path, locked, read_json, require_there, text_checksum, write_json, write_text
 from fits.data.formats import totals_csv
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements, Source
@@ -118,7 +118,7 @@ def load_fit(directory: str | Path) -> "Fit":
     from fits.optimise.result import Fit, Minimum, WithoutDiscrepancy
     from fits.optimise.uncertainty import Direction
 
-    directory = Path(directory)
+    directory = given_path("directory", directory)
     content = _content(directory)
     try:
         problem = _problem(directory, content)
@@ -218,7 +218,7 @@ def load_posterior(directory: str | Path) -> "Posterior | None":
     """
     from fits.sampling.sample import NoSteps, load
 
-    directory = Path(directory)
+    directory = given_path("directory", directory)
     require_there(directory, "no such directory")
     if not (directory / CHAIN).is_file():
         return None
@@ -288,7 +288,7 @@ def writing(directory: str | Path, force: bool = False) -> Iterator[Path]:
     Raises:
         ValueError: another process writes it; or it is not empty, unless `force` is given and it is an earlier result.
     """
-    directory = Path(directory)
+    directory = given_path("directory", directory)
     check_directory(directory, force)
     target = directory.resolve()
     folder, old = target.with_name(f".{target.name}.layerjax-new"), target.with_name(f".{target.name}.layerjax-old")

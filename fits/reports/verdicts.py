@@ -8,7 +8,7 @@ by the fitted covariance.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from fits.optimise.uncertainty import UNCONSTRAINED_BEYOND, UNIDENTIFIED_BEYOND,
 from fits.problem.model import Model
 from fits.problem.noise import DEFAULT_RELATIVE
 from fits.reports.diagnostics import standardised
+from layerjax._checks import require_number
 
 if TYPE_CHECKING:
     from fits.optimise.result import Fit
@@ -49,6 +50,10 @@ class ReportOptions:
 
     peak_points: int = 3
     """Measurements above half the height of a peak from which its width is called sampled."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            require_number(f"ReportOptions.{field.name}", getattr(self, field.name), 0.0)
 
 
 DEFAULT = ReportOptions()

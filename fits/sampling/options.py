@@ -1,6 +1,8 @@
 """What decides how a posterior is sampled, and when its chain is long enough."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from layerjax._checks import require_count, require_number
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,13 @@ class SamplerOptions:
     """Local minima whose mass, by Laplace's approximation, is below this share of the largest are no modes."""
 
     def __post_init__(self) -> None:
-        for name in ("ess", "autocorrelation_times", "warm_up"):
+        for field in fields(self):
+            if not (field.name == "walkers" and self.walkers is None):
+                require_number(field.name, getattr(self, field.name))
+        for name, least in (("walkers", 1), ("warm_up", 1), ("max_steps", FIRST_CHECK)):
+            if not (name == "walkers" and self.walkers is None):
+                require_count(name, getattr(self, name), least)
+        for name in ("ess", "autocorrelation_times"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be above 0")
         if not 0.0 <= self.independent < 1.0:
@@ -49,8 +57,6 @@ class SamplerOptions:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be between 0 and 1")
         if not self.r_hat > 1.0:
             raise ValueError(f"r_hat is {self.r_hat}; it must be above 1")
-        if self.max_steps < FIRST_CHECK:
-            raise ValueError(f"max_steps is {self.max_steps}; it must be at least {FIRST_CHECK}")
 
 
 FIRST_CHECK = 100

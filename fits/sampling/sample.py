@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import logit
 from scipy.stats import qmc
 
+from fits._files import given_path
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -23,7 +24,7 @@ from fits.sampling.nuts import CHAINS, Nuts, require_blackjax
 from fits.sampling.options import SamplerOptions
 from fits.sampling.posterior import Posterior, posterior_of
 from fits.store import Store, another, differences, fingerprint
-from layerjax._checks import require_kind
+from layerjax._checks import require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 WALKERS = 32
@@ -75,7 +76,8 @@ def sample(
     if not fit.is_posterior:
         raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
     fit.require_alone("sample")
-    if path is not None and not Path(path).parent.is_dir():
+    require_seed(seed)
+    if path is not None and not given_path("path", path).parent.is_dir():
         raise ValueError(f"{path}: there is no directory {Path(path).parent}")
     count = len(fit.problem.names)
     options = settings(count, sampler, options, ess=ess, walkers=walkers, max_steps=max_steps)

@@ -195,6 +195,9 @@ def test_a_result_that_is_removed_during_the_run_is_not_counted(
     monkeypatch.setattr(batch, "fit_one", fit_one)
     assert fits.fit_files(["scans/coated.csv", "scans/paint.csv"], STACKS, "out", **FEW).complete
     assert len(counted) == 4 + len(gone)
+    (folder / "out" / batch.STORE).unlink()
+    with pytest.raises(ValueError, match=r"no batch\.store of theirs\): choose another directory"):
+        fits.fit_files("scans/paint.csv", STACKS, "out", **FEW)
 
 
 @pytest.mark.slow

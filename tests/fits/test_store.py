@@ -172,6 +172,19 @@ def test_a_small_disk_that_is_given_more_room(tmp_path: Path) -> None:
         assert steps_of(Store.read(tmp_path / "store")) == 60
 
 
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_store_that_is_removed_while_it_is_written_is_said_to_be(tmp_path: Path, replaced: bool) -> None:
+    path = tmp_path / "a.store"
+    with Store.open(path, fingerprint(of="a")) as store:
+        store.put("one", 1)
+        path.unlink()
+        if replaced:
+            path.touch()
+        with pytest.raises(FileNotFoundError, match="Removed, or replaced, while it was written") as caught:
+            store.put("two", 2)
+    assert caught.value.filename == str(path)
+
+
 def test_damage_is_reported_and_never_read(tmp_path: Path) -> None:
     path = tmp_path / "store"
     with Store.open(path, WHOSE) as store:

@@ -1,6 +1,8 @@
 """Arguments of a wrong kind are refused in one line that names them, and files that are missing as such."""
 
+import dataclasses
 import importlib
+import math
 import pkgutil
 
 import numpy as np
@@ -65,6 +67,85 @@ def test_it_is_refused_by_name(name, argument, kind, tmp_path, monkeypatch):
     assert "\n" not in message
     assert len(message) < 300
     assert not list(tmp_path.iterdir())
+
+
+KEYWORDS = {
+    "fit": (FUNCTIONS["fit"], "starts seed progress* checkpoint* screen"),
+    "read": ({}, "path"),
+    "ReadOptions": ({}, "min_retro_angle* max_polar_angle* select hold_out"),
+    **{name: ({}, "path") for name in ("read_slab", "read_problem", "read_library", "open_map")},
+    **{name: ({}, "directory") for name in ("load_fit", "load_posterior")},
+    "write_csv": ({"measurements": DATA, "path": "there.csv"}, "measurements path"),
+    "write_problem": (
+        {"path": "there.toml", "stack": STACK},
+        "path stack transport noise* scale* objective instrument*",
+    ),
+    "save_fit": ({"fit": FIT}, "directory"),
+    "export": ({"material": FIT, "path": "there.csv", "to": "csv"}, "path to progress*"),
+    "report": ({"fit": FIT, "path": "there.html"}, "path posterior* others* held_out* options"),
+    "search": ({"data": DATA}, "seed options* directory* progress*"),
+    "simulate": (FUNCTIONS["simulate"], "noise floor seed"),
+    "predict": (FUNCTIONS["predict"], "levels draws seed"),
+    "scores": ({"prediction": None, "measurements": DATA}, "prediction"),
+    "sample": ({"fit": FIT}, "ess* sampler walkers* max_steps* options* seed path*"),
+    "evidence": ({"fit": FIT}, "draws seed"),
+    "cross_validate": ({"fit": FIT}, "draws seed options*"),
+    "compare": (FUNCTIONS["compare"], "options*"),
+    "average": (FUNCTIONS["average"], "weights* options*"),
+    "default_library": ({}, "channels"),
+    "render": ({"stack": PLAIN}, "stack size"),
+    "fit_files": (
+        {"files": "a.csv", "stacks": "a.toml", "out": "there"},
+        "files stacks out processes search read_options* starts seed progress*",
+    ),
+    "fit_map": ({"stack": STACK, "geometry": VIEW, "values": DATA.values[None], "out": "there.zarr"}, "out options"),
+    "Joint": ({}, "parts"),
+    "Noise": ({}, "use_sigma"),
+    "Sphere": ({"diameter": 100.0, "sample": 10.0}, "diameter sample entrance detector wall detector_reflectance"),
+    "Spheres": ({}, "reflection* transmission* standard"),
+    "Measurements": ({one.name: getattr(DATA, one.name) for one in dataclasses.fields(DATA)}, "values channels"),
+    "Geometry": ({"wi": VIEW.wi, "wo": VIEW.wo}, "wi wo"),
+    "SamplerOptions": (
+        {},
+        "ess autocorrelation_times r_hat max_steps walkers* burn_in independent warm_up smallest_mode",
+    ),
+    "ComparisonOptions": ({}, " ".join(one.name for one in dataclasses.fields(fits.ComparisonOptions))),
+    "ReportOptions": ({}, " ".join(one.name for one in dataclasses.fields(fits.ReportOptions))),
+    "SearchOptions": ({}, "layers starts beam cross_validated bic_gain budget* fit"),
+    "MapOptions": ({}, "starts seed emulator* processes"),
+}
+"""By function: what is given besides, and the arguments that are wrong; * after those which may be None."""
+
+UNFIT = {"a number as a word": "8", "None": None, "below 0": -1, "not a number": math.nan}
+PATHS = ("path", "directory", "checkpoint", "out", "files", "stacks")
+
+UNFIT_CASES = [
+    (name, argument.rstrip("*"), kind)
+    for name, (_, arguments) in KEYWORDS.items()
+    for argument in arguments.split()
+    for kind in UNFIT
+    if not (kind == "None" and argument.endswith("*"))
+    and not (kind == "a number as a word" and argument.rstrip("*") in PATHS)
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "kind"), UNFIT_CASES)
+def test_unfit_arguments_are_refused_by_name(name, argument, kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=argument) as caught:
+        getattr(fits, name)(**KEYWORDS[name][0] | {argument: UNFIT[kind]})
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("given", [np.ones((3, 3)), "data.csv", None])
+def test_what_is_no_measurements_is_told_how_to_read_them(given):
+    for call in (lambda: fits.fit(STACK, given), lambda: fits.search(given), lambda: fits.predict(FIT, given)):
+        with pytest.raises(
+            ValueError, match=r"is not a .*Measurements; fits\.read\(path\) reads a file, fits\.Measurements\("
+        ):
+            call()
 
 
 READERS = ("read", "read_slab", "read_problem", "read_library", "load_fit", "load_posterior", "open_map")

@@ -151,6 +151,8 @@ FIXES = {
     "degrees": (lambda: lj.direction(30.0, 0), "direction(..., degrees=True)"),
     "degrees among others": (lambda: lj.direction(np.array([0.0, 10.0]), 0.0), "direction(..., degrees=True)"),
     "degrees in a list": (lambda: lj.direction([0, 60], 0.0), "direction(..., degrees=True)"),
+    "azimuth in degrees": (lambda: lj.direction(0.5, 45), "phi: 45 is outside [-3 pi, 3 pi]; of angles in degrees say"),
+    "azimuths in degrees": (lambda: lj.direction(0.5, np.arange(-90.0, 10.0)), "direction(..., degrees=True)"),
     "more than half a turn": (lambda: lj.direction(190.0, 0.0, degrees=True), "190 degrees is outside [-180, 180]"),
 }
 
@@ -184,3 +186,13 @@ def test_directions_in_degrees(theta):
 def test_angles_that_are_not_known_are_taken_as_they_are():
     found = jax.jit(lambda theta: lj.direction(theta, 0.0))(7.0)
     np.testing.assert_allclose(found, lj.direction(7.0 - 2 * np.pi, 0.0), atol=1e-14)
+    found = jax.jit(lambda phi: lj.direction(0.5, phi))(45.0)
+    np.testing.assert_allclose(found, lj.direction(0.5, 45.0 % (2 * np.pi)), atol=1e-14)
+
+
+def test_an_azimuth_may_be_that_of_a_mirror_direction():
+    whole = np.linspace(-2 * np.pi, 2 * np.pi, 9, dtype=np.float32)
+    np.testing.assert_allclose(
+        lj.direction(0.5, whole + np.float32(np.pi)), lj.direction(0.5, np.pi + whole), atol=1e-6
+    )
+    lj.direction(30.0, 900.0, degrees=True)

@@ -1,12 +1,15 @@
 """The cells of a CSV, below a line that names its columns."""
 
 import csv
+from collections.abc import Iterable
 
 import numpy as np
 
 from fits.data.formats._text import ANY_NUMBER, Line, plural
 from fits.data.geometry import Floats
 
+SUFFIXES = ("_std", "_sigma")
+_PLAIN = ("theta_i", "phi_i", "theta_o", "phi_o", "used")
 MISSING = ("", "nan", "-nan", "na", "n/a", "null")
 """Cells of values that were not measured, in lower case, as programs write them."""
 
@@ -14,10 +17,10 @@ MISSING = ("", "nan", "-nan", "na", "n/a", "null")
 class Table:
     """The cells below a header line; columns are parsed on request, so that unused ones may hold anything."""
 
-    def __init__(self, header: Line, body: list[Line]) -> None:
+    def __init__(self, header: Line, body: list[Line], quantities: Iterable[str]) -> None:
         self.header, self.body = header, body
         delimiter = delimiter_of(header.text)
-        self.names = [name.strip() for name in _cells(header, delimiter)]
+        self.names = [in_known_case(name.strip(), quantities) for name in _cells(header, delimiter)]
         for position, name in enumerate(self.names):
             if name in self.names[:position]:
                 raise header.error("this column appears twice, each may appear once", name)
@@ -66,6 +69,21 @@ def _cells(line: Line, delimiter: str) -> list[str]:
 def delimiter_of(header: str) -> str:
     """The delimiter of the cells of a header line."""
     return max(",;\t", key=header.count)
+
+
+def in_known_case(name: str, quantities: Iterable[str]) -> str:
+    """The name of a column with angle, quantity and deviation in lower case; the name of a channel stays as it is."""
+    lower = name.lower()
+    known = [one for one in quantities if lower == one or lower.startswith(f"{one}_")]
+    if not known:
+        return lower if lower in _PLAIN else name
+    quantity, suffix = max(known, key=len), next((one for one in SUFFIXES if lower.endswith(one)), "")
+    return f"{quantity}{name[len(quantity) : len(name) - len(suffix)]}{suffix}"
+
+
+def names_in(header: str) -> list[str]:
+    """The names of a header line, in lower case."""
+    return [name.strip().strip('"').lower() for name in header.split(delimiter_of(header))]
 
 
 def named(columns: list[str]) -> str:

@@ -67,7 +67,14 @@ def read_lines(path: Path, encoding: str = "utf-8") -> list[Line]:
     try:
         text = raw.decode(encoding)
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
+        try:  # comments may be of Windows, with a degree sign or an umlaut
+            lines = ((line, line.lstrip().startswith(b"#")) for line in raw.splitlines())
+            text = "\n".join(
+                line.decode("cp1252" if comment else encoding, "replace" if comment else "strict")
+                for line, comment in lines
+            )
+        except UnicodeDecodeError:
+            raise ValueError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from None
     if "\0" in text:
         raise ValueError(f"{path}: not a text file (it holds a zero byte at {text.index(chr(0))})")
     return [Line(path, number, line) for number, line in enumerate(text.splitlines(), start=1)]

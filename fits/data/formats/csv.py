@@ -14,7 +14,8 @@ used                         1 or 0 (optional): whether the sample takes part in
 
 A row without a value (an empty cell, nan or NA in a value column) is skipped, and a note says how many were. Other
 columns are skipped and noted. Lines that start with # are comments; `write_csv` keeps the source in some of
-them. The delimiter is a comma, semicolon or tab.
+them. The delimiter is a comma, semicolon or tab. Capitals in names of columns are as good, but for channels, which keep
+them. Comments may be of Windows (Latin-1), all else is UTF-8.
 """
 
 import csv
@@ -25,16 +26,24 @@ import numpy as np
 
 from fits._files import write_text
 from fits.data import geometry
-from fits.data.formats._cells import Table, delimiter_of, named
+from fits.data.formats._cells import SUFFIXES, Table, in_known_case, named, names_in
 from fits.data.formats._text import Line, content, plural, read_lines
 from fits.data.geometry import Floats, Geometry
-from fits.data.measurements import LARGEST, SMALLEST_SIGMA, Measurements, Source, channel_names, check_quantity, to_bsdf
+from fits.data.measurements import (
+    LARGEST,
+    SMALLEST_SIGMA,
+    TO_HAVE_THEM,
+    Measurements,
+    Source,
+    channel_names,
+    check_quantity,
+    to_bsdf,
+)
 from fits.data.totals import Totals
 from fits.names import QUANTITIES, Quantity
 
 _ABOVE, _BELOW_TOO, _SIGNED, _PHI = (0.0, 90.0), (0.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)
 _NOT_NEGATIVE = (0.0, LARGEST)
-SUFFIXES = ("_std", "_sigma")
 _QUANTITY_OF: dict[str, Quantity] = {  # by how the name of a value column begins
     **{quantity: quantity for quantity in QUANTITIES},
     "bsdf": "brdf",
@@ -52,7 +61,7 @@ _FIRST_LINE = "# layerjax measurements"
 
 def recognises(first_line: str) -> bool:
     """Whether the first line that is no comment names the columns we need."""
-    return {"theta_i", "theta_o"} <= {name.strip().strip('"') for name in first_line.split(delimiter_of(first_line))}
+    return {"theta_i", "theta_o"} <= set(names_in(first_line))
 
 
 def read(path: Path, quantity: Quantity | None = None) -> Measurements:
@@ -67,7 +76,7 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     if not rows:
         raise ValueError(f"{path}: the file holds only comments, must have a header line")
     header, body = rows[0], rows[1:]
-    table = Table(header, body)
+    table = Table(header, body, _QUANTITY_OF)
     kind, channels = _value_columns(header, table.names, quantity)
     chosen = _QUANTITY_OF[kind]
     empty = table.skip_missing(list(channels.values()))
@@ -109,7 +118,7 @@ def read_directions(path: Path) -> Geometry:
     rows = content(lines)
     if not rows:
         raise ValueError(f"{path}: the file holds only comments, must have a header line")
-    wi, wo, _ = _directions(Table(rows[0], rows[1:]), lines[0].text == _FIRST_LINE)
+    wi, wo, _ = _directions(Table(rows[0], rows[1:], _QUANTITY_OF), lines[0].text == _FIRST_LINE)
     return Geometry(wi, wo)
 
 
@@ -129,6 +138,8 @@ def write_csv(measurements: Measurements, path: str | Path, force: bool = False)
             column brdf_cos holds products with the cosine), one that ends in "_std" or "_sigma", an empty one; or
             these are `Totals`.
     """
+    if not isinstance(measurements, Measurements):
+        raise ValueError(f"measurements: {measurements!r:.60} is not a Measurements; {TO_HAVE_THEM}")
     if isinstance(measurements, Totals):
         raise ValueError(f"{path}: totals are no BSDF values, which is what these columns hold")
     write_text(path, csv_text(measurements), force)
@@ -209,6 +220,7 @@ def _value_columns(header: Line, names: list[str], wanted: Quantity | None) -> t
 
 def _kind_and_channel(column: str) -> tuple[str | None, str]:
     """Prefix of a column's name, one of `_QUANTITY_OF` or None for another column, and the channel that it names."""
+    column = in_known_case(column, _QUANTITY_OF)
     longest_first = sorted(_QUANTITY_OF, key=len, reverse=True)  # in brdf_cos, "cos" is no channel of brdf
     kind = next((known for known in longest_first if column == known or column.startswith(f"{known}_")), None)
     return kind, column.removeprefix(kind or "").removeprefix("_") or channel_names(1)[0]

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._files import require_file
+from fits._files import given_path, require_file
 from fits.data.formats._text import Line, plural, read_lines
 from fits.data.geometry import Floats
 from fits.data.measurements import Source
@@ -139,7 +139,7 @@ def read_slab(
         FileNotFoundError: there is no such file.
         ValueError: on one line: another format, or numbers that are missing or out of range.
     """
-    path = Path(path)
+    path = given_path("path", path)
     require_file(path)
     lines = read_lines(path)
     words = [word for line in lines for word in _words(line)]

@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits._files import write_text
-from fits.data.formats._cells import Table, delimiter_of
+from fits.data.formats._cells import SUFFIXES, Table, names_in
 from fits.data.formats._text import content, read_lines
-from fits.data.formats.csv import SUFFIXES
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
 from fits.data.measurements import Source, channel_names
 from fits.data.totals import KINDS, Kind, Totals
@@ -39,7 +38,7 @@ _SHARE, _ANGLE, _POSITIVE = (0.0, np.inf), (0.0, np.nextafter(90.0, 0.0)), (np.n
 
 def recognises(first_line: str) -> bool:
     """Whether the first line that is no comment names a column of totals, and no viewer."""
-    names = [name.strip().strip('"') for name in first_line.split(delimiter_of(first_line))]
+    names = names_in(first_line)
     return "theta_o" not in names and any(name.startswith(tuple(COLUMNS.values())) for name in names)
 
 
@@ -53,7 +52,7 @@ def read(path: Path) -> Totals:
     if not lines:
         raise ValueError(f"{path}: the file holds only comments, must have a header line")
     header, body = lines[0], lines[1:]
-    table = Table(header, body)
+    table = Table(header, body, COLUMNS.values())
     angles = table.column("theta_i", _ANGLE)
     light = direction(angles, np.full(len(angles), LIGHT_AZIMUTH))
     named = {kind: columns for kind in KINDS if (columns := _channels(table.names, COLUMNS[kind]))}
@@ -105,7 +104,7 @@ def write(totals: Totals, path: str | Path, force: bool = False) -> None:
             angle, or the name of a channel would not come back.
     """
     for name in totals.channels:
-        if not name or name != name.strip() or name.endswith(SUFFIXES) or "," in name:
+        if not name or name != name.strip() or name.lower().endswith(SUFFIXES) or "," in name:
             raise ValueError(f"{path}: the name {name!r} of a channel would not come back")
     if not totals.mask.all():
         raise ValueError(f"{path}: rows that are not used cannot be written")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from fits.maps.store import FLAGS, FittedMap
 from fits.reports.pages import Table, html_table
@@ -121,19 +122,14 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     which = f" ({', '.join(f'{name} in {share(count, fitted)}' for count, name in most)})" if most else ""
     bounded = f"At a bound: {share(counts['at_bound'], fitted)} of the fitted texels{which}."
     words.append(bounded if counts["at_bound"] else "No texel is at a bound.")
-    limit = f"above {map.attributes['pilot']['poor_above']:.3g}, "
-    if counts["poor"]:
-        poor = share(counts["poor"], fitted)
-        words.append(f"Poor: {poor} of the fitted texels: chi-square is {limit}more than noise and the pilot explain.")
-    elif not explained and median > 1.0:  # nor then does the model explain the pilot, by which the flag is set
-        words.append(f"No texel stands out: chi-square is nowhere {limit}more than in the pilot.")
-    else:
-        words.append("No texel is poor: chi-square is nowhere above what noise and the pilot explain.")
+    most_of_noise = float(chi2.isf(option("poor_probability"), max(freedom, 1.0))) / max(freedom, 1.0)
+    pilot_is_explained = map.attributes["pilot"]["poor_above"] <= option("pilot_factor") * most_of_noise
+    words += _of_poor_texels(summary, map, pilot_is_explained and not median > 1.0 + far)
     if counts["unidentified"]:
         unidentified = share(counts["unidentified"], fitted)
         words.append(f"In {unidentified} of the fitted texels the data leave a parameter unidentified.")
     flagged = max(counts[flag] for flag in ("at_bound", "poor", "unidentified"))
-    sound &= explained and flagged <= option("flagged_share") * fitted
+    sound &= explained and pilot_is_explained and flagged <= option("flagged_share") * fitted
 
     # the pilot
     common = map.attributes["common"]
@@ -149,6 +145,20 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
         words.append(f"The numerical error of the model is at most {error:.2g} standard deviations in the pilot{but}.")
         sound &= small
     return words, sound
+
+
+def _of_poor_texels(summary: Summary, map: FittedMap, explained: bool) -> list[str]:
+    """A sentence on the texels with a large chi-square; explained: whether noise explains the others and the pilot."""
+    counts, limit = summary.counts, f"above {map.attributes['pilot']['poor_above']:.3g}, "
+    if counts["poor"]:
+        poor = share(counts["poor"], summary.fitted)
+        return [f"Poor: {poor} of the fitted texels: chi-square is {limit}more than noise and the pilot explain."]
+    if math.isnan(summary.quartiles["reduced_chi_square"][1]):
+        return []
+    who = "texel" if counts["converged"] == summary.fitted else "converged texel"  # of others nothing is flagged
+    if not explained:  # nor then does the model explain the pilot, by which the flag is set
+        return [f"No {who} stands out: chi-square is nowhere {limit}more than in the pilot."]
+    return [f"No {who} is poor: chi-square is nowhere above what noise and the pilot explain."]
 
 
 def fragment(map: FittedMap) -> str:

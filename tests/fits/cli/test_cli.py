@@ -9,12 +9,15 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import layerjax as lj
+from fits.cli import commands
 from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main, raised_again
 from fits.data.measurements import Measurements
@@ -247,6 +250,21 @@ def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
             collect_and_wait()
     finally:
         signal.signal(signal.SIGINT, ours)
+
+
+def test_a_warning_for_users_is_one_line_and_shown_once(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warned(_: object) -> int:
+        for words in ("too narrow", "too narrow", "another"):
+            warnings.warn(words, lj.ResolutionWarning, stacklevel=1)
+        warnings.warn("of the program", RuntimeWarning, stacklevel=1)
+        return 0
+
+    monkeypatch.setitem(commands.COMMANDS, "info", warned)
+    with pytest.warns(RuntimeWarning, match="of the program"):
+        assert main(["info", "data.csv"]) == 0
+    assert capsys.readouterr().err == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
 
 
 SLOW = """

@@ -1,6 +1,7 @@
 """CSV: what its columns mean, what is estimated and left out, and that what is written comes back."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,6 +28,29 @@ def test_a_real_file_against_numpy():
     assert data.mask.all()
     assert (data.channels, data.source.quantity) == (("value",), "brdf")
     assert data.source.notes == ("columns not used: n",)
+
+
+def test_capitals_in_names_of_columns_are_as_good(reading, tmp_path):
+    data = reading("Theta_I,PHI_I,theta_O,Phi_o,BRDF_Red,BRDF_Red_STD,Used\n10,180,20,0,0.5,0.1,1\n")
+    assert (data.channels, data.source.notes) == (("Red",), ())
+    np.testing.assert_array_equal([data.values, data.sigma], [[[0.5]], [[0.1]]])
+    write_csv(data, tmp_path / "again.csv")
+    assert read(tmp_path / "again.csv").channels == ("Red",)
+    assert reading("THETA_I,THETA_O,BRDF\n10,20,0.5\n").channels == ("value",)
+    totals = reading("Theta_i,Total_Reflectance\n0,0.3\n")
+    np.testing.assert_array_equal(totals.values, [[0.3]])
+    for channel in ("Cos", "STD"):
+        with pytest.raises(ValueError, match=f"channel '{channel}' cannot be written"):
+            write_csv(replace(data, channels=(channel,)), tmp_path / "other.csv")
+
+
+def test_comments_may_be_of_windows(tmp_path):
+    path = tmp_path / "windows.csv"
+    text = f"# attribution: Prüfstand, 20 °C … Nr. 7\n{HEADER}\n10,180,20,0,0.5\n"
+    path.write_bytes(text.encode("cp1252"))
+    data = read(path)
+    assert data.source.attribution == "Prüfstand, 20 °C … Nr. 7"
+    assert len(data) == 1
 
 
 COSINE = 1 / np.cos(np.radians(60))

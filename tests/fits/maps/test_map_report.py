@@ -17,7 +17,7 @@ from fits.maps.report import page, summary
 from fits.maps.report.summary import summarise, verdict
 from fits.maps.store import FLAGS, Store
 from tests.helpers.commands import refused
-from tests.helpers.painted_maps import FREEDOM, GOOD, NAMES, bounded, numbers, stored, without
+from tests.helpers.painted_maps import ATTRIBUTES, FREEDOM, GOOD, NAMES, bounded, numbers, stored, without
 
 SHAPE, CHUNK = (20, 30), (10, 10)
 FULL = 9
@@ -94,6 +94,13 @@ def scaled(factor):
     return changed(reduced_chi_square=factor * numbers(SHAPE)["reduced_chi_square"])
 
 
+def few(ratio, flags=GOOD):
+    """A sixth of the texels with this chi-square and these flags."""
+    some = np.arange(600).reshape(SHAPE) < 100
+    ratios = np.where(some, ratio, numbers(SHAPE)["reduced_chi_square"])
+    return changed(reduced_chi_square=ratios, flags=np.where(some, flags, GOOD))
+
+
 def unidentified(texels):
     return changed(flags=np.where(np.arange(600).reshape(SHAPE) < texels, GOOD | FLAGS["unidentified"], GOOD))
 
@@ -157,6 +164,28 @@ def test_nearly_all_is_not_written_as_all_and_the_worst_texels_come_first(map, p
     assert [row[0] for row in table.rows] == ["[0, 0]", "[0, 1]", "[1, 0]"]
     assert [row[-1] for row in table.rows] == ["not converged, poor, a parameter is unidentified", "at a bound", ""]
     assert "±" not in table.rows[1][4]
+
+
+POOR_PILOT = {"pilot": ATTRIBUTES["pilot"] | {"poor_above": 1.5e8}}
+
+
+@pytest.mark.parametrize(
+    ("arrays", "more", "sentence"),
+    [
+        (scaled(1e8), {}, "No texel stands out: chi-square is nowhere above 1.6, more than in the pilot."),
+        (scaled(1e8), POOR_PILOT, "No texel stands out: chi-square is nowhere above 1.5e+08, more than in the pilot."),
+        (few(1e8), POOR_PILOT, "No texel stands out: chi-square is nowhere above 1.5e+08, more than in the pilot."),
+        (few(1e8, GOOD | FLAGS["poor"]), {}, "Poor: 16.66 % of the fitted texels"),
+        (few(1e8, FLAGS["fitted"]), {}, "No converged texel is poor"),
+        (changed(reduced_chi_square=np.nan), {}, "No texel has a chi-square"),
+    ],
+)
+def test_no_texel_is_poor_does_not_stand_beside_a_chi_square_that_nothing_explains(arrays, more, sentence, tmp_path):
+    map = stored(tmp_path / "a.zarr", arrays, CHUNK, **more)
+    words, sound = verdict(summarise(map), map)
+    assert sentence in " ".join(words)
+    assert "No texel is poor" not in " ".join(words)
+    assert not sound
 
 
 # ---- the page ----

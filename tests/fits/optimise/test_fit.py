@@ -312,9 +312,9 @@ def test_a_stack_file_sets_thresholds(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: fit(LINE, line_data(), transport=line, starts=0), "starts is 0; it must be at least 1"),
+        (lambda: fit(LINE, line_data(), transport=line, starts=0), "starts: 0 is not a whole number of at least 1"),
         (lambda: fit(LINE, line_data(), transport=line, solver="newton"), "solver is 'newton'"),
-        (lambda: fit(LINE), "data is None"),
+        (lambda: fit(LINE, transport=line), "data: None is not a Measurements"),
         (lambda: FitOptions(same_cost=0.0), r"FitOptions.same_cost is 0.0; it must be a number above 0"),
         (lambda: FitOptions(numerical_error="small"), r"FitOptions.numerical_error is 'small'; it must be a number"),
         (lambda: FitOptions(autocorrelation=np.inf), r"FitOptions.autocorrelation is inf"),

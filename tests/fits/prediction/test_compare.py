@@ -119,6 +119,6 @@ def test_thresholds_are_options(fits: dict) -> None:
     assert "line and flat are statistically indistinguishable" in comparison.verdict[0]
     assert comparison.options.slight_difference == 1e6
     assert len(groups_of(DATA, ComparisonOptions(min_incidences=10**6, scan_parts=2))) <= 2
-    for bad, message in (({"clear_difference": 0.0}, "must be above 0"), ({"scan_parts": 1}, "must be at least 2")):
-        with pytest.raises(ValueError, match=rf"{next(iter(bad))} is .*; it {message}"):
+    for bad, message in (({"clear_difference": 0.0}, "must be a number above 0"), ({"scan_parts": 1}, "of at least 2")):
+        with pytest.raises(ValueError, match=rf"{next(iter(bad))}.* is .*{message}"):
             ComparisonOptions(**bad)

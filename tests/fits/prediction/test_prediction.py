@@ -178,7 +178,7 @@ def test_noise_elsewhere_is_that_of_what_was_fitted() -> None:
 
 def test_bad_requests_are_refused() -> None:
     found = line_fit()
-    with pytest.raises(ValueError, match=r"level is 1.0; it must be in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"levels\[1\] is 1.0; it must be in \(0, 1\)"):
         predict(found, found.problem.data, levels=(0.5, 1.0))
     directions = predict(found, slices([30.0]), draws=2)
     for quantile in (directions.quantile, directions.predictive_quantile):
@@ -186,7 +186,7 @@ def test_bad_requests_are_refused() -> None:
             quantile(0.0)
     with pytest.raises(ValueError, match="a Geometry was predicted"):
         _ = directions.scores
-    with pytest.raises(ValueError, match=r"draws is 1; it must be at least 2"):
+    with pytest.raises(ValueError, match=r"draws: 1 is not a whole number of at least 2"):
         predict(found, found.problem.data, draws=1)
     named = fit(STACK, found.problem.data, transport=line, objective="cube_root", starts=1)
     with pytest.raises(ValueError, match=r"a fit of 'cube_root' has no noise model"):

@@ -37,3 +37,5 @@ def test_seeds_repeat_and_samples_without_light_are_masked():
 def test_bad_noise_is_refused(name, level):
     with pytest.raises(ValueError, match=f"{name} is {level}, must be finite and >= 0"):
         simulate(PAINT, slices(), **{name: level})
+    with pytest.raises(ValueError, match="noise is 5, must be at most 1"):
+        simulate(PAINT, slices(), noise=5)

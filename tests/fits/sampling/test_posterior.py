@@ -265,7 +265,7 @@ def test_free_student_noise_is_sampled() -> None:
         ({"walkers": 4}, "walkers is 4; it must be even and at least 6"),
         ({"walkers": 17}, "walkers is 17"),
         ({"ess": 0.0}, "ess is 0.0; it must be above 0"),
-        ({"max_steps": 10}, "max_steps is 10; it must be at least 100"),
+        ({"max_steps": 10}, "max_steps: 10 is not a whole number of at least 100"),
     ],
 )
 def test_refused(result: Fit, options: dict, message: str) -> None:
