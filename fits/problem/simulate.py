@@ -69,14 +69,14 @@ def simulate(
     )
 
 
-def require_visible(of: str, material: object, **directions: Floats) -> None:
-    """Refuse directions in or below the surface of an opaque stack, whose BSDF is 0 there; `of` says whose they are."""
+def require_visible(subject: str, material: object, **directions: Floats) -> None:
+    """Refuse directions of the subject in or below the surface of an opaque stack, whose BSDF is 0 there."""
     if not isinstance(material, lj.Stack | lj.Mixture) or any(one.base is None for one in stacks_of(material)):
         return
     for name, w in directions.items():
         lowest = float(polar(w).max(initial=0.0))
         if lowest >= 90.0:
             raise ValueError(
-                f"{of}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
+                f"{subject}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
                 "[0, 90) degrees"
             )
