@@ -282,8 +282,8 @@ def search(
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit and cross-validation as it is finished: a search that was killed, or whose
-            budget ended it, is resumed there. The fits are result directories.
+        directory: keeps every fit, and every incidence of a cross-validation, as it is finished: a search that was
+            killed, or whose budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
@@ -391,10 +391,18 @@ class _Work(NamedTuple):
             checked = record["cross-validation"]
             checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
             return _CrossValidated(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
-        result = _CrossValidated(fit, *out_of_sample(fit))
+        result = _CrossValidated(fit, *out_of_sample(fit, checkpoint=partial(self._by_incidence, key)))
         if self.store is not None:
             self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
         return result
+
+    def _by_incidence(self, structure: str, incidence: str, compute: Callable[[], Any]) -> Any:
+        """The record of a held-out incidence, from the store if it is there."""
+        if self.store is None:
+            return compute()
+        if (record := self.store.get(key := f"{structure}, without {incidence}")) is None:
+            self.store.put(key, record := compute())
+        return record
 
     def _problem(self, structure: Structure, independent: bool = False) -> Problem:
         problem = Problem(self.library.stack(structure), self.data, **self.settings)
