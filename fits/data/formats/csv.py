@@ -91,7 +91,7 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
 
     spread = [_spread_column(table.names, name) for name in channels.values()]
     if len(spread) == 1 and spread[0] is None and (alone := {"std", "sigma"} & set(table.names)):
-        spread = sorted(alone)[-1:]
+        spread[0] = max(alone)
         notes.append(f"column {spread[0]} taken for the standard deviation of {next(iter(channels.values()))}")
     sigma = _sigma(table, spread, used, notes)
     if sigma is not None:
