@@ -47,6 +47,7 @@ from fits.reports.tables import parameter_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, holds_other_files
 from layerjax._checks import in_short, require_kind
+from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
 
 STORE, PAGE = "search.store", "search.html"
@@ -437,7 +438,7 @@ class _Work(NamedTuple):
                     break
                 make_room()
                 some = structures[first : first + several]
-                for structure, result in zip(some, pool.map(call, some), strict=True):
+                for structure, result in zip(some, pool.map(broadcasting(call), some), strict=True):
                     results[structure] = result
                     self.progress(stage, len(results), len(structures), named(structure))
         return results
