@@ -48,6 +48,7 @@ from fits.reports.tables import parameter_table
 from fits.reports.verdicts import listed, verdict
 from fits.store import Store, fingerprint, holds_other_files
 from layerjax._checks import in_short, require_count, require_kind, require_seed
+from layerjax._numerics import broadcasting
 from layerjax.compiling import programs_kept
 
 STORE, PAGE = "search.store", "search.html"
@@ -286,8 +287,8 @@ def search(
         transport, noise, scale, instrument: see `Problem`; "auto" carries all orders of scattering.
         seed: of the starts, see `fit`.
         options: how far the search goes.
-        directory: keeps every fit and cross-validation as it is finished: a search that was killed, or whose
-            budget ended it, is resumed there. The fits are result directories.
+        directory: keeps every fit, and every incidence of a cross-validation, as it is finished: a search that was
+            killed, or whose budget ended it, is resumed there. The fits are result directories.
         progress: called with (what is done, structures done, structures of this level, note).
 
     Raises:
@@ -396,10 +397,18 @@ class _Work(NamedTuple):
             checked = record["cross-validation"]
             checked |= {"groups": tuple(checked["groups"]), "rows": tuple(checked["rows"])}
             return _CrossValidated(fit, CrossValidation(**checked), Evidence(**record["evidence"]))
-        result = _CrossValidated(fit, *out_of_sample(fit))
+        result = _CrossValidated(fit, *out_of_sample(fit, checkpoint=partial(self._by_incidence, key)))
         if self.store is not None:
             self.store.put(key, {"cross-validation": vars(result.checked), "evidence": vars(result.evidence)})
         return result
+
+    def _by_incidence(self, structure: str, incidence: str, compute: Callable[[], Any]) -> Any:
+        """The record of a held-out incidence, from the store if it is there."""
+        if self.store is None:
+            return compute()
+        if (record := self.store.get(key := f"{structure}, without {incidence}")) is None:
+            self.store.put(key, record := compute())
+        return record
 
     def _problem(self, structure: Structure, independent: bool = False) -> Problem:
         problem = Problem(self.library.stack(structure), self.data, **self.settings)
@@ -434,7 +443,7 @@ class _Work(NamedTuple):
                     break
                 make_room()
                 some = structures[first : first + several]
-                for structure, result in zip(some, pool.map(call, some), strict=True):
+                for structure, result in zip(some, pool.map(broadcasting(call), some), strict=True):
                     results[structure] = result
                     self.progress(stage, len(results), len(structures), named(structure))
         return results

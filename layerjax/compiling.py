@@ -113,15 +113,17 @@ def keep_programs() -> str | None:
 
 @contextmanager
 def programs_kept() -> Iterator[None]:
-    """`keep_programs` within the block alone."""
+    """`keep_programs` within the block alone; arrays of different ranks broadcast in it (see `broadcasting`)."""
     from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
     before = {name: jax.config.values[name] for name in (FOLDER, LEAST)}
     if before[FOLDER] or not keep_programs():
-        yield
+        with jax.numpy_rank_promotion("allow"):
+            yield
         return
     try:
-        yield
+        with jax.numpy_rank_promotion("allow"):
+            yield
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

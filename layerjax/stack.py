@@ -40,7 +40,7 @@ class Interface(Shown):
                         "vmf"              ``facet_multiple_scattering=False``, `AddingDoubling`, `RandomWalk`)
     ============ ====== ========== ======= ==========================================================================
 
-    Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1 + 1e-9
+    Light that the masking of Walter et al. 2007 blocks is lost, also where the index hardly changes: with ior 1.001
     and alpha 0.3 a passage at 75 degrees loses 20 %, and a base that is lit and seen at 75 degrees is 36 % darker.
     Transports with ``facet_multiple_scattering=True`` carry on what facets block; where the index does not change, omit
     the interface (one of exactly the index above it is omitted automatically).

@@ -69,7 +69,7 @@ def fit_map(arguments: Namespace) -> int:
     show(summary.count_table(found), summary.quartile_table(found, map), *([common] if common.rows else []))
     if prior is not None:
         show(summary.smoothing_words(map))
-    show(f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
+    show(*summary.noise_words(map), f"Store: {arguments.out}. For the report: layerjax report {arguments.out}")
     whole = found.done == found.texels and found.fitted > 0
     return DONE if whole and found.converged >= map.option("converged_share") else DOUBTFUL
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from fits.engines.failures import Failure as Failure
 from fits.engines.failures import attempt
+from layerjax._numerics import broadcasting
 
 Work = Callable[[Any, Any], Any]
 
@@ -90,7 +91,7 @@ def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None)
     try:
         while True:
             for index, task in islice(pending, most - len(running)):
-                running[pool.submit(attempt, work, shared, task)] = index
+                running[pool.submit(broadcasting(attempt), work, shared, task)] = index
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:

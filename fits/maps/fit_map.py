@@ -28,7 +28,7 @@ from fits.maps.spatial import smooth_map
 from fits.maps.store import FLAGS, PILOT, FittedMap, Store, arrays_of, blocks_of, create, open_map, resume
 from fits.maps.texels import standard_errors
 from fits.problem.model import Transport
-from fits.problem.noise import Noise
+from fits.problem.noise import Noise, is_assumed
 from fits.problem.parameters import is_free, with_values
 from fits.problem.problem import with_floor
 from fits.store import fingerprint, portable_repr
@@ -115,6 +115,8 @@ def _fit(
             about |= {"names": names, "units": {name: problem.units[name] for name in names}, "shape": data.shape}
             about |= {"chunk": tile(data.shape, options.chunk_size), "options": options.numbers(), "stack": repr(stack)}
             about |= {"samples": data.samples, "channels": list(problem.data.channels), "version": lj.__version__}
+            assumed = problem.objective == "likelihood" and is_assumed(noise or Noise(), problem.data)
+            about |= {"noise_assumed": assumed}
             store = create(path, about | {"fingerprints": identity, "measurements": measurements})
         store.save_group(PILOT, arrays, {})
         kept = store.load_group(PILOT)

@@ -145,7 +145,10 @@ class FittedMap:
     @property
     def smoothing(self) -> dict[str, Any] | None:
         """How the map was smoothed: its prior, rounds, largest moves, whether it settled; None if it was not."""
-        about: Any = self.root[SMOOTHED].attrs[KEY] if SMOOTHED in self.root else {}
+        try:
+            about: Any = self.root[SMOOTHED].attrs[KEY] if SMOOTHED in self.root else {}
+        except ValueError as error:
+            raise ValueError(f"{self.path}/{SMOOTHED}: damaged, {one_line(error)}") from None
         return about["smoothing"] if about.get("finished") else None
 
     @property
@@ -209,9 +212,10 @@ class FittedMap:
 
     def read(self, path: str) -> Any:
         """A whole array. ValueError, on one line, that names it: a chunk is damaged."""
-        array = self[path]
         try:
-            return np.asarray(array[...])
+            return np.asarray(self[path][...])
+        except KeyError:  # says what there is
+            raise
         except Exception as error:  # codecs raise what they like
             raise ValueError(f"{self.path}/{path}: damaged, {one_line(error)}") from None
 

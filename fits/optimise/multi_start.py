@@ -27,6 +27,7 @@ from fits.problem.model import Density, Model, half_squares
 from fits.problem.problem import FittingProblem
 from fits.progress import Progress
 from fits.store import Store, fingerprint
+from layerjax._numerics import broadcasting
 
 Solver = Literal["least_squares", "bounded"]
 Floats = NDArray[np.float64]
@@ -89,7 +90,7 @@ def multi_start(
         ended(index, solve(problem, points[index]))
     pool = ThreadPoolExecutor(cores())
     try:
-        running = {pool.submit(solve, problem, points[index]): index for index in left[1:]}
+        running = {pool.submit(broadcasting(solve), problem, points[index]): index for index in left[1:]}
         for future in as_completed(running):
             ended(running[future], future.result())
     finally:

@@ -7,8 +7,9 @@ whatever the stack. Groups are therefore whole incidences; of fewer than three, 
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +32,9 @@ from fits.sampling.initial import other_minima, vector_of
 from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
+if TYPE_CHECKING:
+    from fits.sampling.proposals import Density
+
 DRAWS = 128
 """Draws of the posterior that held-out data are predicted with at a time, see `ComparisonOptions`."""
 
@@ -41,6 +45,9 @@ LARGEST_LOG_RATIO = 30.0
 """Bound of the logarithms of ratios of stacking weights."""
 
 Floats = NDArray[np.float64]
+
+Checkpoint = Callable[[str, Callable[[], Any]], Any]
+"""Gives the record of this name: what the call computes, or what an earlier run has kept of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +96,7 @@ def cross_validate(
     options: ComparisonOptions | None = None,
     progress: Progress | None = None,
     posterior: ImportanceDraws | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> CrossValidation:
     """Fit again without each incidence, starting from the best values, and predict its measurements.
 
@@ -101,6 +109,7 @@ def cross_validate(
         options: `min_incidences` and `scan_parts` decide what is held out together.
         progress: called with ("cross-validation", groups done, groups, name).
         posterior: draws of the fit's posterior; those without a group are sought about them.
+        checkpoint: called with (name of a group, what computes its record), gives the record: from where it is kept.
 
     Raises:
         ValueError: a fit of a named objective, data of a single group, or a joint fit or a part of one.
@@ -115,21 +124,41 @@ def cross_validate(
     for number, (name, rows) in enumerate(groups.items()):
         if progress is not None:
             progress("cross-validation", number, len(groups), name)
-        held_out = np.zeros(len(data), bool)
-        held_out[rows] = True
-        rest = refit(without(fit.problem, held_out), *starts)
-        each, effective = np.empty((0, *density[rows].shape)), 0.0
-        while not len(each) or (errors[number] > options.monte_carlo_error and len(each) < options.most_draws):
-            prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
-            each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
-            effective += prediction.effective_draws
-            density[rows] = logsumexp(each, axis=0) - math.log(len(each))
-            # how much each draw adds to the elpd, to first order
-            errors[number] = np.std(np.sum(np.exp(each - density[rows]), axis=(1, 2))) / math.sqrt(effective)
-        converged &= rest.converged
+
+        def held_out(rows: NDArray[np.int64] = rows) -> dict[str, Any]:
+            return _held_out(fit, data, rows, starts, draws, seed, options, proposal)
+
+        record = held_out() if checkpoint is None else checkpoint(name, held_out)
+        density[rows], errors[number] = record["log_density"], record["error"]
+        converged &= record["converged"]
     if progress is not None:
         progress("cross-validation", len(groups), len(groups), "")
     return CrossValidation(tuple(groups), tuple(groups.values()), density, converged, errors)
+
+
+def _held_out(
+    fit: Fit,
+    data: Measurements,
+    rows: NDArray[np.int64],
+    starts: list[Floats],
+    draws: int,
+    seed: int,
+    options: ComparisonOptions,
+    proposal: "Density | None",
+) -> dict[str, Any]:
+    """Log predictive density of these measurements by a fit without them, its error, and whether that converged."""
+    held_out = np.zeros(len(data), bool)
+    held_out[rows] = True
+    rest = refit(without(fit.problem, held_out), *starts)
+    each, effective, error = np.empty((0, *data.values[rows].shape)), 0.0, math.inf
+    while not len(each) or (error > options.monte_carlo_error and len(each) < options.most_draws):
+        prediction = posterior_predictive(rest, data, draws=draws, seed=seed + len(each), proposal=proposal)
+        each = np.concatenate([each, prediction.log_densities(data.values)[:, rows]])
+        effective += prediction.effective_draws
+        density = logsumexp(each, axis=0) - math.log(len(each))
+        # how much each draw adds to the elpd, to first order
+        error = float(np.std(np.sum(np.exp(each - density), axis=(1, 2))) / math.sqrt(effective))
+    return {"log_density": density, "error": error, "converged": rest.converged}
 
 
 def require_groups(fit: Fit, options: ComparisonOptions | None = None) -> dict[str, NDArray[np.int64]]:
@@ -230,12 +259,16 @@ def model_scores(
 
 
 def out_of_sample(
-    fit: Fit, progress: Progress | None = None, options: ComparisonOptions | None = None
+    fit: Fit,
+    progress: Progress | None = None,
+    options: ComparisonOptions | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[CrossValidation, Evidence]:
     """Cross-validation and evidence of a fit, both by draws of its posterior."""
     require_groups(fit, options)
     draws = posterior_draws(fit)
-    return cross_validate(fit, options=options, progress=progress, posterior=draws), evidence_of(draws)
+    held_out = cross_validate(fit, options=options, progress=progress, posterior=draws, checkpoint=checkpoint)
+    return held_out, evidence_of(draws)
 
 
 def rank_models(

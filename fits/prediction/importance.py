@@ -20,6 +20,7 @@ from fits.problem.compilation import in_shares
 from fits.sampling.initial import initial_mixture, log_posteriors
 from fits.sampling.proposals import Density, FittedProposal
 from layerjax._checks import require_count, require_kind, require_seed
+from layerjax._numerics import broadcasting
 
 MAX_PARETO_K = ComparisonOptions().max_pareto_k
 """Pareto k above which a part of the posterior may be missing; below it the draws suffice."""
@@ -184,6 +185,7 @@ class Evidence:
         return self.pareto_k < MAX_PARETO_K
 
 
+@broadcasting
 def evidence(fit: Fit, *, draws: int = DRAWS, seed: int = 0) -> Evidence:
     """The marginal likelihood of a fitted stack, under the priors of its parameters within their bounds.
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
+from layerjax._numerics import broadcasting
 from layerjax.compiling import compiler_options, is_outermost
 
 FULL = 0.5
@@ -35,6 +36,7 @@ class Static:
         return isinstance(other, Static) and self.key == other.key
 
 
+@broadcasting
 def run(function: Callable[..., Any], split_model: tuple[Any, Static], *arguments: Any) -> Any:
     """`function(model, *arguments)` compiled, and done; see `Problem.call`."""
     with one_thread():
@@ -141,5 +143,5 @@ def in_shares(
 
     firsts = range(0, len(rows), share)
     alone = 0 if compiled else 1
-    parts = [*map(of, firsts[:alone]), *_threads().map(of, firsts[alone:])]
+    parts = [*map(of, firsts[:alone]), *_threads().map(broadcasting(of), firsts[alone:])]
     return [np.concatenate(results) for results in zip(*parts, strict=True)]

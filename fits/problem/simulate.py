@@ -77,6 +77,6 @@ def require_visible(subject: str, material: object, **directions: Floats) -> Non
         lowest = float(polar(w).max(initial=0.0))
         if lowest >= 90.0:
             raise ValueError(
-                f"{subject}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; its polar angle must be in "
-                "[0, 90) degrees"
+                f"{subject}: a {name} at {lowest:g} degrees sees nothing of an opaque stack; "
+                "its polar angle must be in [0, 90) degrees"
             )

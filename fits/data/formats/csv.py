@@ -9,7 +9,8 @@ brdf | brdf_cos | reflectance_factor
                              f in 1/sr | f |cos theta_o| | pi f. For several channels one column each: brdf_red, ...
 bsdf | bsdf_cos | brf, reflectance
                              other names for the same; a note says what they were taken for
-<that column>_std | _sigma   its standard deviation (optional); an empty cell or nan means unknown
+<that column>_std | _sigma   its standard deviation (optional); an empty cell or nan means unknown.
+                             Beside a single value column, std or sigma alone is taken for it, and noted
 used                         1 or 0 (optional): whether the sample takes part in fits
 
 A row without a value (an empty cell, nan or NA in a value column) is skipped, and a note says how many were. Other
@@ -98,6 +99,9 @@ def read(path: Path, quantity: Quantity | None = None) -> Measurements:
     used &= ~tangent
 
     spread = [_spread_column(table.names, name) for name in channels.values()]
+    if len(spread) == 1 and spread[0] is None and (alone := {"std", "sigma"} & set(table.names)):
+        spread[0] = max(alone)
+        notes.append(f"column {spread[0]} taken for the standard deviation of {next(iter(channels.values()))}")
     sigma = _sigma(table, spread, used, notes)
     if sigma is not None:
         sigma = to_bsdf(sigma, wo, chosen)

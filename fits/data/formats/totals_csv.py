@@ -8,7 +8,7 @@ unscattered_transmittance    of this, what no medium has scattered
 <that column>_std | _sigma   its standard deviation (all of a kind, or none)
 
 One to three of the kinds; for several channels one column each: total_reflectance_red, ... An empty cell was not read;
-of several channels all are empty then.
+of several channels all are empty then. A note says how many rows hold no value at all.
 """
 
 import csv
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fits._files import write_text
 from fits.data.formats._cells import SUFFIXES, Table, names_in
-from fits.data.formats._text import content, read_lines
+from fits.data.formats._text import content, plural, read_lines
 from fits.data.geometry import LIGHT_AZIMUTH, Floats, direction
 from fits.data.measurements import Source, channel_names
 from fits.data.totals import KINDS, Kind, Totals
@@ -60,7 +60,7 @@ def read(path: Path) -> Totals:
         raise header.error(f"no column of {', '.join(COLUMNS.values())}")
     channels = tuple(next(iter(named.values())))
     wi, wo, values, sigma, kinds = [], [], [], [], []
-    known = {"theta_i"}
+    known, rows = {"theta_i"}, np.zeros(len(angles), bool)
     for kind, columns in named.items():
         if tuple(columns) != channels:
             raise header.error(f"channels {', '.join(columns)}: every kind must have the same, {', '.join(channels)}")
@@ -76,6 +76,7 @@ def read(path: Path) -> Totals:
         values.append(part[measured])
         kinds += [kind] * int(measured.sum())
         known |= {*columns.values(), *spreads}
+        rows |= measured
     if sigma and len(sigma) != len(named):
         raise header.error("only some kinds have standard deviations: all must, or none")
     if not kinds:
@@ -91,6 +92,8 @@ def read(path: Path) -> Totals:
         kinds=tuple(kinds),
     )
     notes = [f"columns not used: {', '.join(ignored)}"] if ignored else []
+    if empty := int(np.count_nonzero(~rows)):
+        notes.append(f"skipped: {plural(empty, 'row')} without a value (an empty cell, or nan)")
     return replace(totals, source=Source(str(path), "csv", notes=(*notes, *totals.energy_violations())))
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from fits.maps.store import FLAGS, FittedMap
+from fits.problem.noise import DEFAULT_RELATIVE
 from fits.reports.pages import Table, html_table
 from fits.reports.tables import with_error
 from fits.reports.verdicts import listed
@@ -82,6 +83,14 @@ def summarise(map: FittedMap) -> Summary:
 # ---- the verdict ----
 
 
+def noise_words(map: FittedMap) -> list[str]:
+    """That a noise was assumed, where nothing says how large it is."""
+    if not map.attributes.get("noise_assumed"):
+        return []
+    level = f"{100.0 * DEFAULT_RELATIVE:g} %"
+    return [f"No noise is stated: {level} of the model's value is assumed. State it as `relative`, or by `--noise`."]
+
+
 def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     """How far the map can be relied on, in a few sentences, and whether they are without reservation."""
     counts, fitted, option = summary.counts, summary.fitted, map.option
@@ -100,6 +109,8 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
     words.append(f"{share(counts['converged'], fitted)} of the fitted texels converged.")
 
     # chi-square beside what noise makes of it
+    words += (assumed := noise_words(map))
+    stated = "assumed" if assumed else "stated"
     low, median, high = summary.quartiles["reduced_chi_square"]
     freedom = degrees_of_freedom(summary.quartiles["measurements"][1], map)
     spread = math.sqrt(2.0 / freedom) if freedom > 0 else math.inf
@@ -112,7 +123,7 @@ def verdict(summary: Summary, map: FittedMap) -> tuple[list[str], bool]:
         if median > 1.0 + far:
             words.append("The model does not explain the data to within their noise: the errors are too small.")
         if median < 1.0 - far:
-            words.append("The data scatter less than the stated noise: the errors are too large.")
+            words.append(f"The data scatter less than the {stated} noise: the errors are too large.")
     else:
         words.append("No texel has a chi-square: there are no more measurements than parameters.")
     explained = abs(median - 1.0) <= far  # not so for NaN

@@ -143,7 +143,7 @@ def _points(axes: Axes, fit: "Fit", rows: np.ndarray, coloured: bool) -> None:
     data, what, sigma = fit.problem.data, "data", None
     if fit.is_posterior:
         assumed = np.asarray(fit.problem.call(Model.sigma_at, fit.vector, fit.predicted))
-        what, sigma = r"data and assumed $\sigma$", over_all_rows(fit, assumed)
+        what, sigma = r"data and $\sigma$ of the noise model", over_all_rows(fit, assumed)
     used = data.mask[rows]
     for channel, name in enumerate(data.channels):
         colour = channel_colour(name, channel) if coloured else INK

@@ -107,6 +107,19 @@ def test_missing_spread_is_estimated_and_noted(reading):
     assert "sigma is unknown" in empty.source.notes[0]
 
 
+@pytest.mark.parametrize("column", ["std", "sigma"])
+def test_a_spread_beside_a_single_value_column_is_taken_for_its_own(reading, column):
+    """A noise of 5 % was assumed where a file said in a column `sigma` what it is."""
+    data = reading(f"{HEADER},{column}\n10,180,0,0,2.0,0.1\n10,180,60,0,4.0,0.3\n")
+    np.testing.assert_allclose(data.sigma[:, 0], [0.1, 0.3])
+    assert data.source.notes == (f"column {column} taken for the standard deviation of brdf",)
+    factor = reading(f"theta_i,theta_o,brdf_cos,{column}\n10,60,2.0,0.1\n")
+    np.testing.assert_allclose(factor.sigma[:, 0], [0.2])
+    colours = reading(f"theta_i,theta_o,brdf_red,brdf_blue,{column}\n10,20,1,2,0.1\n")
+    assert colours.sigma is None
+    assert colours.source.notes[-1] == f"columns not used: {column}"
+
+
 @pytest.mark.parametrize("missing", ["", " ", "nan", "NaN", "-nan", "NA", "null"])
 def test_what_was_not_measured_is_left_out_and_counted(reading, missing):
     rows = f"10,180,20,0,1,0.1,7\n10,180,25,0,{missing},0.1,8\n10,180,30,0,3,{missing},{missing}\n"

@@ -25,6 +25,14 @@ def test_every_cell_is_a_reading(reading):
     assert "1.2 together" in reading(f"{HEADER}\n0,0.7,0.01,0.5,0.02\n").source.notes[0]  # more than all the light
 
 
+@pytest.mark.parametrize("missing", ["", "nan", "NA"])
+def test_rows_without_any_value_are_counted(reading, missing):
+    head = "theta_i,total_reflectance,total_transmittance\n"
+    found = reading(f"{head}0,0.3,0.5\n10,{missing},{missing}\n20,0.3,{missing}\n30,{missing},{missing}\n")
+    np.testing.assert_allclose(found.values[:, 0], [0.3, 0.3, 0.5])
+    assert found.source.notes == ("skipped: 2 rows without a value (an empty cell, or nan)",)
+
+
 def test_more_than_all_the_light_is_noted_of_a_file_and_warned_of_by_hand(reading):
     said = "reflectance at 0 degrees, value, is 1.3: more than 1 by more than 3 standard deviations"
     found = reading("theta_i,total_reflectance,total_reflectance_std\n0,1.3,0.01\n")

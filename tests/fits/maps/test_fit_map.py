@@ -16,6 +16,7 @@ from fits.data.geometry import Geometry
 from fits.data.measurements import Measurements
 from fits.maps.fit_map import tile
 from fits.maps.options import MapOptions
+from fits.maps.report.summary import summarise, verdict
 from tests.helpers import quick_maps
 from tests.helpers.quick_maps import FREE, NAMES, NOISE, TRANSPORT, assert_same, fitted, full_disk
 
@@ -71,6 +72,12 @@ def test_every_texel_ends_where_scipy_does_and_others_are_flagged(partial, geome
     assert partial.has("fitted").sum() == partial.has("converged").sum() == 61
 
 
+def test_a_noise_that_was_assumed_is_kept_and_told(tmp_path, measured):
+    map = fitted(tmp_path / "map.zarr", measured[3:4, :2], noise=None)
+    assert map.attributes["noise_assumed"] is True
+    assert "No noise is stated: 5 % of the model's value is assumed." in " ".join(verdict(summarise(map), map)[0])
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -92,6 +99,7 @@ def test_errors_and_chi_square_are_those_of_a_fit(tmp_path, geometry, measured, 
             assert abs(map.values[name][0, 5] - one.values[name]) < CLOSE * one.standard_errors[name]
     if options["noise"] is not None:
         assert map.reduced_chi_square[0, 5] == pytest.approx(one.reduced_chi_square, rel=1e-6)
+    assert map.attributes["noise_assumed"] is False
     assert (map.numerical_error is not None) == ("instrument" in options)
     if "instrument" in options:
         assert map.attributes["pilot"]["rings"] == one.problem.instrument.rings == 1

@@ -123,6 +123,12 @@ LEAVE = "of the fitted texels the data leave a parameter unidentified"
         # sqrt(2 / 61) is 0.18: 1.7 and 0.3 are four of them away
         (scaled(1.7), {}, False, ["does not explain the data to within their noise", "No texel stands out"]),
         (scaled(0.3), {}, False, ["scatter less than the stated noise", "No texel is poor"]),
+        (
+            scaled(0.3),
+            {"noise_assumed": True},
+            False,
+            ["No noise is stated: 5 %", "less than the assumed noise"],
+        ),
         (scaled(1.7), {"options": {"chi_square_sigmas": 5.0}}, True, ["No texel is poor"]),
         (unidentified(30), {}, True, [LEAVE]),
         (unidentified(31), {}, False, [LEAVE]),

@@ -16,7 +16,7 @@ import zarr
 import fits
 import layerjax as lj
 from fits.engines.processes import SCRIPT_REPEATED
-from fits.maps.store import FLAGS, NO_START, PARTIAL, Store, arrays_of, blocks_of, create, open_map
+from fits.maps.store import FLAGS, NO_START, PARTIAL, SMOOTHED, Store, arrays_of, blocks_of, create, open_map
 from tests.helpers.files import contents
 from tests.helpers.painted_maps import ATTRIBUTES, NAMES, UNITS, numbers, stored
 from tests.helpers.quick_maps import assert_same, coat, fitted, full_disk
@@ -127,6 +127,19 @@ def test_a_damaged_chunk_is_named_and_unfinished(damage, tmp_path):
     assert store.unfinished() == [BLOCKS[3]]
     write(store, BLOCKS[3])
     assert store.unfinished() == []
+
+
+def test_damaged_descriptions_of_a_smoothed_map_are_named(tmp_path):
+    """The words of the JSON reader had stood alone."""
+    map = stored(tmp_path / "a.zarr", numbers(SHAPE), CHUNK)
+    arrays = {f"{part}/{name}": np.zeros(SHAPE) for part in ("values", "errors") for name in NAMES}
+    Store(map.path).save_group(SMOOTHED, arrays, {"finished": True, "smoothing": {}})
+    (map.path / SMOOTHED / "values" / NAMES[0] / "zarr.json").write_text("{,")
+    with pytest.raises(ValueError, match=r"a\.zarr/smoothed/values/layers.0..thickness: damaged, "):
+        open_map(map.path).smoothed[NAMES[0]]
+    (map.path / SMOOTHED / "zarr.json").write_text("{,")
+    with pytest.raises(ValueError, match=r"a\.zarr/smoothed: damaged, "):
+        _ = open_map(map.path).smoothed
 
 
 def test_groups_and_stores_are_there_whole_or_not_at_all(tmp_path, monkeypatch):
