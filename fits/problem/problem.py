@@ -6,6 +6,7 @@
 import abc
 import math
 import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -452,7 +453,9 @@ def _assemble(problem: Problem) -> Assembled:
     material = model.build(jnp.asarray(start)).stack
     if isinstance(material, lj.Stack | lj.Mixture):
         channel_count(material)
-    shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lj.ResolutionWarning)  # nothing is solved here
+        shape = eqx.filter_eval_shape(model.predict, jnp.asarray(start)).shape
     if shape[-1] not in (1, used.values.shape[-1]):
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
