@@ -1,4 +1,4 @@
-"""List words in names, messages, docstrings and comments of a package that its field has better ones for.
+"""List words in names, messages, docstrings and comments of a package, and on pages, that its field has better ones for.
 
 `python -m tools.check_words [FOLDER_OR_FILE ...]` prints file:line: word -> the field's word, and the count by room.
 
@@ -84,6 +84,15 @@ def findings(path: Path) -> Iterator[Finding]:
             yield from _in_sentence(token.start[0], token.string)
 
 
+def on_page(path: Path) -> Iterator[Finding]:
+    """The same of a page in Markdown; what stands in backticks is code, and the table of changed names holds old ones."""
+    yield from _in_sentence(1, re.sub(r"```.*?```|`[^`]*`", _blank, path.read_text(), flags=re.DOTALL))
+
+
+def _blank(code: re.Match[str]) -> str:
+    return re.sub(r"[^\n]", "_", code.group())
+
+
 def _in_sentence(line: int, sentence: str) -> Iterator[Finding]:
     for expression, better in SENTENCES.items():
         for match in re.finditer(rf"\b(?:{expression})\b", re.sub(r"\s", " ", sentence), re.IGNORECASE):
@@ -114,8 +123,9 @@ def main(folders: list[str]) -> None:
     """Print what is listed in these folders and files."""
     count: Counter[str] = Counter()
     for folder in map(Path, folders):
-        for path in sorted(folder.rglob("*.py")) if folder.is_dir() else [folder]:
-            for line, word, better in sorted(set(findings(path))):
+        files = [path for kind in ("*.py", "*.md") for path in folder.rglob(kind)] if folder.is_dir() else [folder]
+        for path in sorted(files):
+            for line, word, better in sorted(set(on_page(path) if path.suffix == ".md" else findings(path))):
                 print(f"{path}:{line}: {word} -> {better}")
                 count["/".join(path.parts[:2])] += 1
     for room, number in count.most_common():
