@@ -1,4 +1,4 @@
-"""List words in names, messages, docstrings and comments of a package, and on pages, that its field has better ones for.
+"""List words in names, messages, docstrings and comments, and on pages, that the field has better ones for.
 
 `python -m tools.check_words [FOLDER_OR_FILE ...]` prints file:line: word -> the field's word, and the count by room.
 
@@ -85,7 +85,7 @@ def findings(path: Path) -> Iterator[Finding]:
 
 
 def on_page(path: Path) -> Iterator[Finding]:
-    """The same of a page in Markdown; what stands in backticks is code, and the table of changed names holds old ones."""
+    """The same of a page in Markdown; what stands in backticks is code."""
     yield from _in_sentence(1, re.sub(r"```.*?```|`[^`]*`", _blank, path.read_text(), flags=re.DOTALL))
 
 

@@ -4,6 +4,7 @@ Inputs are checked, and outputs refused, before any work begins. Numbers go to s
 """
 
 import os
+import warnings
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
@@ -34,10 +35,13 @@ def fit(arguments: Namespace) -> int:
     from fits.batch import fit_file
     from fits.problem.stack_file import read_problem
     from fits.reports import results, tables, verdicts
+    from fits.reports.data_summary import doubtful_angles
 
     directory, force = Path(arguments.out), arguments.force
     results.check_directory(directory, force)
     data, held_out = read_options(arguments).split(arguments.data)
+    for doubt in doubtful_angles(data):
+        warnings.warn(doubt, stacklevel=1)
     given, how = read_problem(arguments.stack), {"starts": arguments.starts, "seed": arguments.seed}
     resume = f"{directory} was not written; the same command resumes with the starts that are done"
     with show_progress() as progress, hint(resume):

@@ -12,7 +12,6 @@ from typing import Any
 
 from fits.engines.failures import Failure as Failure
 from fits.engines.failures import attempt
-from layerjax._numerics import broadcasting
 
 Work = Callable[[Any, Any], Any]
 
@@ -81,6 +80,7 @@ def run(
 def _run_threads(work: Work, shared: Any, tasks: list[Any], threads: int | None) -> Iterator[tuple[int, Any]]:
     """Threads of JAX run beside each other, for they leave Python while they compute."""
     from fits.problem.compilation import cores
+    from layerjax._numerics import broadcasting
 
     pending, most = iter(enumerate(tasks)), threads or cores()
     # the first by itself: it compiles the program, which keeps one core busy

@@ -86,20 +86,25 @@ def data_table(data: Measurements) -> Table:
     return Table("Angles, and BRDF in 1/sr", names, shortened(rows), keys=2)
 
 
+def doubtful_angles(data: Measurements) -> list[str]:
+    """Sentences on angles that were probably meant otherwise: radians, azimuths from the mirror direction."""
+    total = isinstance(data, Totals)
+    largest = np.max(data.theta_i if total else np.concatenate([data.theta_i, data.theta_o]), initial=0.0)
+    words = [] if total else _brighter_side(sides(data))
+    if 0.0 < largest < 1.6:  # a little more than a right angle in radians
+        words.insert(0, f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees.")
+    return words
+
+
 def data_statements(data: Measurements, options: ReportOptions = DEFAULT) -> list[str]:
     """Sentences on angles that look wrong, reciprocity, energy, symmetry, sampling and repeats of the used data; of
     totals on angles only."""
-    angles = data.theta_i if isinstance(data, Totals) else np.concatenate([data.theta_i, data.theta_o])
-    largest, words = np.max(angles, initial=0.0), []
-    if 0.0 < largest < 1.6:  # a little more than a right angle in radians
-        words = [f"Angles: none is above {largest:.4g}°: are they radians? They were read as degrees."]
     if isinstance(data, Totals):
-        return words
+        return doubtful_angles(data)
     repeated = repeats(data)
     noise = "" if repeated is None else f", a noise of about {100.0 * repeated.noise:.2g} %"
     return [
-        *words,
-        *_brighter_side(sides(data)),
+        *doubtful_angles(data),
         f"Reciprocity: {_agreement('with light and viewer exchanged', reciprocity(data))}.",
         _energy(energies(data)),
         f"Symmetry: {_agreement('on either side of the plane of incidence', symmetry(data))}.",

@@ -267,6 +267,17 @@ def test_a_warning_for_users_is_one_line_and_shown_once(
     assert capsys.readouterr().err == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
 
 
+def test_a_fit_of_angles_in_radians_is_doubted(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("data.csv").write_text("theta_i,phi_i,theta_o,phi_o,brdf\n0.5,0,0.3,180,0.1\n0.5,0,0.4,180,0.1\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["fit", "data.csv", "--stack", "missing.toml", "--out", "result"]) != 0
+    assert "layerjax: warning: Angles: none is above 0.5°: are they radians?" in capsys.readouterr().err
+
+
 SLOW = """
 import sys
 import numpy as np
