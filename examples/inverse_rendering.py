@@ -5,7 +5,7 @@
 Needs `pip install "layerjax[mitsuba]"`. Mitsuba renders a sphere in the light of a lamp, its material evaluated by
 `RandomWalk`: light is followed through the layers, and the picture has the noise of that. From another material on,
 Mitsuba's own optimiser then follows derivatives of the picture, the material evaluated by `AddingDoubling`, which has
-derivatives and no noise. Prints a table of what was found, and draws the pictures.
+derivatives and no noise. Prints the recovered values beside the truth, and draws the pictures.
 """
 
 import argparse
@@ -30,7 +30,7 @@ PATHS = 2000
 SOLVER = lj.AddingDoubling(nodes=10, modes=12)
 BALL = "ball.bsdf."
 FREE = {"layers[0].alpha": (0.05, 1.0), "layers[1].thickness": (0.01, 4.0), "base.albedo": (0.01, 0.99)}
-"""What is looked for, and the box that it is kept in."""
+"""Free parameters and their bounds."""
 
 
 def coat(alpha, thickness, albedo):
@@ -61,19 +61,19 @@ def scene_of(stack, transport):
     )
 
 
-def recover(scene, seen):
+def recover(scene, target):
     """Follow derivatives of the picture; the losses on the way."""
     numbers = mi.traverse(scene)
     optimiser = mi.ad.Adam(lr=RATE[0])
     for name in FREE:
         optimiser[BALL + name] = numbers[BALL + name]
     numbers.update(optimiser)
-    scale = dr.mean(seen, axis=None)
+    scale = dr.mean(target, axis=None)
     losses = []
     for step in range(STEPS):
         picture = mi.render(scene, numbers, spp=SAMPLES, seed=2 * step + 1, seed_grad=2 * step + 2)
         # relative where it is bright, so that a highlight does not outweigh the rest
-        loss = dr.mean(dr.square((picture - seen) / (seen + 0.1 * scale)), axis=None)
+        loss = dr.mean(dr.square((picture - target) / (target + 0.1 * scale)), axis=None)
         dr.backward(loss)
         optimiser.set_learning_rate(RATE[0] * (RATE[1] / RATE[0]) ** (step / STEPS))
         optimiser.step()
@@ -87,7 +87,7 @@ def recover(scene, seen):
 
 
 def values_of(scene):
-    """What is looked for, by name."""
+    """Values of the free parameters, by name."""
     numbers = mi.traverse(scene)
     return {name: np.ravel(np.array(numbers[BALL + name])) for name in FREE}
 
@@ -116,17 +116,17 @@ def main():
     arguments.out.mkdir(parents=True, exist_ok=True)
     truth = scene_of(TRUTH, lj.RandomWalk(paths=PATHS))
     print("the picture, by following light through the layers")
-    seen = mi.render(truth, spp=SAMPLES, seed=0)
+    target = mi.render(truth, spp=SAMPLES, seed=0)
     scene = scene_of(START, SOLVER)
     before = np.array(mi.render(scene, spp=SAMPLES, seed=0))
     print("the material, by derivatives of the picture")
-    losses = recover(scene, seen)
+    losses = recover(scene, target)
     after = np.array(mi.render(scene, spp=SAMPLES, seed=0))
     expected, found = values_of(truth), values_of(scene)
     for name in FREE:
         for place, (one, other) in enumerate(zip(expected[name], found[name], strict=True)):
             print(f"  {name + (f'[{place}]' if len(expected[name]) > 1 else ''):22s} {one:7.3f}  found {other:7.3f}")
-    pictures = {"given: by RandomWalk": np.array(seen), "start": before, "found: by AddingDoubling": after}
+    pictures = {"given: by RandomWalk": np.array(target), "start": before, "found: by AddingDoubling": after}
     draw(pictures, losses, arguments.out / "inverse_rendering.png")
     print(f"{arguments.out / 'inverse_rendering.png'}")
 

@@ -2,9 +2,9 @@
 
     python examples/joint_steel.py --out DIR
 
-Both were read at 650 nm, by the same laboratory, not in one session: the stack is one, calibration and errors that
-readings share are each measurement's own. Prints what each says alone and what they say together, and writes a report
-of each part of the joint fit.
+Both were measured at 650 nm by the same laboratory, in separate sessions. The stack is common to them; calibration and
+model discrepancy are separate for each data set. Prints the separate fits beside the joint fit, and writes a report of
+each part of the joint fit.
 """
 
 import argparse
@@ -26,12 +26,12 @@ STARTS = 8
 
 
 def problems(data=None):
-    """A problem for each measurement: the same stack, a calibration of its own."""
-    given = fits.read_problem(STACK)
+    """A problem for each data set: the same stack, a separate calibration."""
+    problem = fits.read_problem(STACK)
     data = data or {part: fits.read(path) for part, path in DATA.items()}
     return {
-        part: fits.Problem(given.stack, readings, given.transport, given.noise, given.scale)
-        for part, readings in data.items()
+        part: fits.Problem(problem.stack, measurements, problem.transport, problem.noise, problem.scale)
+        for part, measurements in data.items()
     }
 
 
@@ -55,23 +55,23 @@ def main():
     out.mkdir(parents=True, exist_ok=True)
 
     parts = problems()
-    alone = {}
+    separate = {}
     for part, problem in parts.items():
-        print(f"{part} alone: {problem.count} readings", flush=True)
-        alone[part] = fits.fit(problem.stack, problem.data, noise=problem.noise, scale=problem.scale, starts=STARTS)
-    print("together", flush=True)
+        print(f"{part} only: {problem.count} measurements", flush=True)
+        separate[part] = fits.fit(problem.stack, problem.data, noise=problem.noise, scale=problem.scale, starts=STARTS)
+    print("joint fit", flush=True)
     joint = fits.fit(fits.Joint(parts, shared=SHARED), starts=STARTS, progress=progress)
 
     table = Table(title="A black coat on steel", box=None)
-    for heading in ("parameter", *(f"{part} alone" for part in parts), "together"):
+    for heading in ("parameter", *(f"{part} only" for part in parts), "joint fit"):
         table.add_column(heading)
     for name in joint.values:
         part, _, own = name.partition(".")
-        told = [shown(one, name if part not in parts else own if part == key else "") for key, one in alone.items()]
-        table.add_row(name, *told, shown(joint, name))
+        cells = [shown(one, name if part not in parts else own if part == key else "") for key, one in separate.items()]
+        table.add_row(name, *cells, shown(joint, name))
     table.add_row(
         "chi-square / dof",
-        *(f"{one.reduced_chi_square:.2f}" for one in alone.values()),
+        *(f"{one.reduced_chi_square:.2f}" for one in separate.values()),
         f"{joint.reduced_chi_square:.2f}",
     )
     Console(width=140).print(table)

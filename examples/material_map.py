@@ -25,7 +25,7 @@ SIZE = 512
 COPPER = {"ior": [0.21, 1.1, 1.2], "k": [3.7, 2.6, 2.3]}
 EYE = (0.5, -0.9, 1.6)
 HEIGHT, LAMPS = 0.6, (0.15, 0.5, 0.85)
-"""Of the lamp above the plate, and where it stands from left to right, in widths of the plate."""
+"""Height of the lamp above the plate, and its places from left to right, in widths of the plate."""
 
 
 def maps(size):
@@ -57,7 +57,7 @@ def towards(point, size):
     return ray / length, length
 
 
-def seen(stack, lamp, transport, size):
+def radiance(stack, lamp, transport, size):
     """Radiance of the plate towards the eye, (size, size, 3), of a lamp at a point."""
     wi, distance = towards(lamp, size)
     wo, _ = towards(EYE, size)
@@ -74,7 +74,7 @@ def main():
     pictures = []
     for x in LAMPS:
         began = time.perf_counter()
-        pictures.append(np.asarray(jax.block_until_ready(seen(stack, (x, 0.5, HEIGHT), transport, given.size))))
+        pictures.append(np.asarray(jax.block_until_ready(radiance(stack, (x, 0.5, HEIGHT), transport, given.size))))
         print(f"lamp at {x:g}: {time.perf_counter() - began:.2f} s")
     brightest = np.percentile(pictures, 99.5)
     figure, axes = plt.subplots(1, len(LAMPS) + 1, figsize=(15, 4.3), layout="constrained")

@@ -89,7 +89,7 @@ def main():
     geometry = fits.slices(incidence=(10, 35, 60), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     data = fits.simulate(coat(TRUTH), geometry, transport=lj.AddingDoubling(), noise=0.03, seed=SEED)
     free = coat({name: fits.Free(START[name], *BOX[name]) for name in TRUTH})
-    print(f"{len(data)} readings with 3 % noise", flush=True)
+    print(f"{len(data)} measurements with 3 % noise", flush=True)
 
     posteriors = {}
     for label, transport in MODELS.items():

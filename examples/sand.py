@@ -30,7 +30,7 @@ SURFACES = {
 
 
 def sand_data(noise=0.03, seed=SEED):
-    """Readings at four incidences in two planes."""
+    """Measurements at four incidences in two planes."""
     sand = lj.Stack([], lj.VMFDiffuse(ALBEDO, ROUGHNESS, form="all_orders"))
     geometry = fits.slices(incidence=(10, 35, 60, 75), outgoing=np.arange(-80, 81, 10), azimuth=(0, 90))
     return fits.simulate(sand, geometry, noise=noise, seed=seed)
@@ -43,7 +43,7 @@ def main():
     out.mkdir(parents=True, exist_ok=True)
 
     data = sand_data()
-    print(f"{len(data)} readings in {len(data.channels)} channels with 3 % noise", flush=True)
+    print(f"{len(data)} measurements in {len(data.channels)} channels with 3 % noise", flush=True)
     found = {}
     for name, surface in SURFACES.items():
         found[name] = fit = fits.fit(lj.Stack([], surface), data, starts=8, seed=SEED)

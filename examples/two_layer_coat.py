@@ -1,11 +1,11 @@
-"""A metal under an absorbing coat, recovered from noisy BRDF slices; and what such slices cannot tell apart.
+"""A metal under an absorbing coat, recovered from noisy BRDF slices; and which parameters they do not identify.
 
     python examples/two_layer_coat.py --out DIR
 
 Slices of a coat (index 1.5, roughness 0.1, optical depth 0.3, no scattering) over copper at 550 nm (n 0.95, k 2.6,
-roughness 0.3) are simulated with 3 % noise by `Statistical`. All six numbers are fitted three times: with bounds
-alone, with what a handbook of metals says beforehand, and with the extinction k known. Prints each fit beside the truth
-and which combinations its data do not separate, and writes a report of each.
+roughness 0.3) are simulated with 3 % noise by `Statistical`. All six parameters are fitted three times: with
+bounds only, with a prior from a handbook of metals, and with the extinction k known. Prints each fit beside the truth
+and which parameters are not identified separately, and writes a report of each.
 """
 
 import argparse
@@ -30,7 +30,7 @@ TRUTH = {
 COAT = (fits.Free(1.4, 1.2, 2.2), fits.Free(0.2, 0.02, 0.6), fits.Free(0.5, 0.01, 3.0))
 ROUGHNESS = fits.Free(0.2, 0.02, 0.8)
 METALS = {
-    "bounds alone": (fits.Free(1.0, 0.05, 6.0), fits.Free(3.0, 0.5, 10.0)),
+    "bounds only": (fits.Free(1.0, 0.05, 6.0), fits.Free(3.0, 0.5, 10.0)),
     "a handbook's metals (n 1, k 3, each within a factor of 1.6)": (
         fits.Free(1.0, 0.05, 6.0, fits.LogNormal(1.0, 0.5)),
         fits.Free(3.0, 0.5, 10.0, fits.LogNormal(3.0, 0.5)),
@@ -62,7 +62,7 @@ def main():
     for number, (known, metal) in enumerate(METALS.items()):
         began = time.perf_counter()
         fit = fits.fit(coat(*COAT, *metal, ROUGHNESS), data, transport=transport, starts=8, seed=SEED)
-        print(f"\nOf the metal beforehand: {known}; {time.perf_counter() - began:.0f} s", flush=True)
+        print(f"\nPrior of the metal: {known}; {time.perf_counter() - began:.0f} s", flush=True)
         for name, value in fit.values.items():
             truth, error = TRUTH[name], fit.standard_errors[name]
             off = f"{(value - truth) / error:+5.1f} errors off" if np.isfinite(error) else "at a bound"

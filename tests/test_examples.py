@@ -14,7 +14,7 @@ from tests.helpers.places import ROOT
 
 @pytest.mark.slow
 def test_a_mixture_is_told_from_a_metal(capsys: pytest.CaptureFixture[str]) -> None:
-    example = runpy.run_path(str(ROOT / "examples" / "kinds_of_readings.py"))
+    example = runpy.run_path(str(ROOT / "examples" / "measured_quantities.py"))
     example["mixture"]()
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     (found,) = (line for line in lines if line[:1] == ["weights.coat"])

@@ -134,7 +134,7 @@ def joint() -> dict[str, Any]:
 
 def slab() -> dict[str, Any]:
     """A slab by scans and by an integrating sphere."""
-    import kinds_of_readings as kinds
+    import measured_quantities as quantities
 
     solver = lj.AddingDoubling(nodes=8, modes=4)
     noise = fits.Noise(relative=0.02, floor=1e-6)
@@ -144,23 +144,23 @@ def slab() -> dict[str, Any]:
 
     free = of(fits.Free(1.0, 0.1, 20.0), fits.Free(0.3, 0.0, 5.0), fits.Free(0.0, -0.9, 0.9))
     parts = {
-        "scans": fits.Problem(free, kinds.readings(of(2.0, 0.1, 0.5), solver), solver, noise),
-        "sphere": kinds.sphere(free, 0.30, 0.55, solver),
+        "scans": fits.Problem(free, quantities.simulated(of(2.0, 0.1, 0.5), solver), solver, noise),
+        "sphere": quantities.sphere(free, 0.30, 0.55, solver),
     }
     return of_fit(fits.fit(fits.Joint(parts, shared=["layers"]), starts=STARTS))
 
 
 def mixture() -> dict[str, Any]:
     """A metal that a coat covers in part."""
-    import kinds_of_readings as kinds
+    import measured_quantities as quantities
 
     def partly(covered: Any, alpha: Any) -> Any:
         coat = lj.Stack([lj.Interface(1.5, 0.2)], lj.Lambertian(0.4))
         metal = lj.Stack([], lj.Conductor(0.2, 3.9, alpha))
         return lj.Mixture({"coat": coat, "metal": metal}, {"coat": covered, "metal": None})
 
-    data = kinds.readings(partly(0.7, 0.35))
-    return of_fit(kinds.fit(partly(fits.Free(0.5, 0.0, 1.0), fits.Free(0.3, 0.02, 1.0)), data, lj.Statistical()))
+    data = quantities.simulated(partly(0.7, 0.35))
+    return of_fit(quantities.fit(partly(fits.Free(0.5, 0.0, 1.0), fits.Free(0.3, 0.02, 1.0)), data, lj.Statistical()))
 
 
 def texels() -> dict[str, Any]:

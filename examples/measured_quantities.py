@@ -1,8 +1,8 @@
-"""What instruments and other kinds of readings say: an aperture, a surface that is partly bare, totals, a MERL table.
+"""Instruments and measured quantities beside scans: an aperture, a mixture of two stacks, totals, a MERL table.
 
-    python examples/kinds_of_readings.py [instrument] [mixture] [totals] [bins]
+    python examples/measured_quantities.py [instrument] [mixture] [totals] [bins]
 
-Each reads simulated data with 2 % noise, whose truth is known, in two ways, and prints what either finds.
+Each part fits simulated data with 2 % noise in two ways, and prints both results beside the truth.
 """
 
 import argparse
@@ -22,19 +22,19 @@ SCANS = fits.slices(incidence=(10.0, 30.0, 50.0, 70.0), outgoing=np.arange(-80.0
 
 
 def instrument():
-    """A glossy coat, seen by a detector of 4 degrees on a sample that leans by 0.3 degrees."""
+    """A glossy coat, measured through a detector aperture of 4 degrees at a sample tilt of 0.3 degrees."""
 
     def coat(ior, alpha, albedo):
         return lj.Stack([lj.Interface(ior, alpha)], lj.Lambertian(albedo))
 
     free = coat(fits.Free(1.6, 1.2, 2.2), fits.Free(0.12, 0.02, 0.5), fits.Free(0.4, 0.0, 1.0))
-    seen = fits.Instrument(detector_aperture=4.0, tilt=0.3)
-    exact = fits.Problem(free, readings(coat(1.5, 0.08, 0.3)), lj.Statistical(), NOISE, instrument=seen)
-    data = readings(np.asarray(exact.predict([1.5, 0.08, 0.3])))
+    true = fits.Instrument(detector_aperture=4.0, tilt=0.3)
+    exact = fits.Problem(free, simulated(coat(1.5, 0.08, 0.3)), lj.Statistical(), NOISE, instrument=true)
+    data = simulated(np.asarray(exact.predict([1.5, 0.08, 0.3])))
     known = fits.Instrument(detector_aperture=4.0, tilt=fits.Free(0.0, -2.0, 2.0))
     ways = {"exact directions": None, "its instrument": known}
-    found = {way: fit(free, data, lj.Statistical(), instrument=given) for way, given in ways.items()}
-    show("A detector of 4 degrees", {**dict(zip(exact.names, (1.5, 0.08, 0.3), strict=True)), LEAN: 0.3}, found)
+    results = {way: fit(free, data, lj.Statistical(), instrument=instrument) for way, instrument in ways.items()}
+    show("A detector of 4 degrees", {**dict(zip(exact.names, (1.5, 0.08, 0.3), strict=True)), TILT: 0.3}, results)
 
 
 def mixture():
@@ -46,31 +46,33 @@ def mixture():
         weight = fits.Free(0.5, 0.0, 1.0) if covered is None else covered
         return lj.Mixture({"coat": coat, "metal": metal}, {"coat": weight, "metal": None})
 
-    data = readings(partly(0.7))
+    data = simulated(partly(0.7))
     bare = lj.Stack([], lj.Conductor(0.2, 3.9, fits.Free(0.3, 0.02, 1.0)))
-    found = {"metal alone": fit(bare, data, lj.Statistical()), "mixture": fit(partly(None), data, lj.Statistical())}
-    show("A metal under patches of a coat", {"weights.coat": 0.7, "metal.base.alpha": 0.35, "base.alpha": 0.35}, found)
+    results = {"metal only": fit(bare, data, lj.Statistical()), "mixture": fit(partly(None), data, lj.Statistical())}
+    show(
+        "A metal under patches of a coat", {"weights.coat": 0.7, "metal.base.alpha": 0.35, "base.alpha": 0.35}, results
+    )
 
 
 def totals():
-    """A slab by what a sphere takes in, by scans, and by both."""
+    """A slab by scans alone, and by scans and an integrating sphere."""
 
-    def of(mu_s, mu_a, g):
+    def turbid(mu_s, mu_a, g):
         return lj.Stack([lj.TurbidMedium(1.0, mu_s, mu_a, lj.HenyeyGreenstein(g))])
 
-    slab = of(2.0, 0.1, 0.5)
-    free = of(fits.Free(1.0, 0.1, 20.0), fits.Free(0.3, 0.0, 5.0), fits.Free(0.0, -0.9, 0.9))
+    slab = turbid(2.0, 0.1, 0.5)
+    free = turbid(fits.Free(1.0, 0.1, 20.0), fits.Free(0.3, 0.0, 5.0), fits.Free(0.0, -0.9, 0.9))
     solver = lj.AddingDoubling(nodes=12, modes=8)
-    scans = readings(slab, solver)
+    scans = simulated(slab, solver)
     parts = {"scans": fits.Problem(free, scans, solver, NOISE), "sphere": sphere(free, 0.2, 0.3, solver)}
     reflected, transmitted = np.asarray(parts["sphere"].predict([2.0, 0.1, 0.5])).ravel()
     parts["sphere"] = sphere(free, reflected, transmitted, solver)
-    found = {
+    results = {
         "scans": fit(free, scans, solver),
         "and a sphere": fits.fit(fits.Joint(parts, shared=["layers"]), starts=4),
     }
     names = parts["scans"].names
-    show("A slab by scans and by totals", dict(zip(names, (2.0, 0.1, 0.5), strict=True)), found)
+    show("A slab by scans and by totals", dict(zip(names, (2.0, 0.1, 0.5), strict=True)), results)
 
 
 def bins():
@@ -92,24 +94,26 @@ def bins():
         path = Path(folder) / "flakes.binary"
         path.write_bytes(np.array(merl.SHAPE, "<i4").tobytes() + table.astype("<f8").tobytes())
         read = {"slices": fits.read(path), "5,000 bins": fits.read(path, bins=5000)}
-    found = {way: fit(free, data, lj.SingleScattering()) for way, data in read.items()}
-    names = found["slices"].problem.names
-    show("Flakes from a MERL table", dict(zip(names, (0.8, 0.2, 0.5), strict=True)), found)
+    results = {way: fit(free, data, lj.SingleScattering()) for way, data in read.items()}
+    names = results["slices"].problem.names
+    show("Flakes from a MERL table", dict(zip(names, (0.8, 0.2, 0.5), strict=True)), results)
 
 
-LEAN = "instrument.tilt"
+TILT = "instrument.tilt"
 
 
-def readings(of, transport=None):
-    """Noisy scans of a material; or of values that are given."""
+def simulated(material, transport=None):
+    """Scans of a stack, or scans of these values, with noise."""
     carrier = transport or lj.Statistical()
-    exact = of if isinstance(of, np.ndarray) else np.asarray(lj.evaluate(of, SCANS.wi, SCANS.wo, carrier))
+    exact = (
+        material if isinstance(material, np.ndarray) else np.asarray(lj.evaluate(material, SCANS.wi, SCANS.wo, carrier))
+    )
     noisy = exact * (1.0 + 0.02 * np.random.default_rng(0).standard_normal(exact.shape))
     return fits.Measurements(SCANS.wi, SCANS.wo, noisy, None, np.ones(len(noisy), bool), ("value",))
 
 
 def sphere(free, reflected, transmitted, transport):
-    """A problem of both totals of light along the normal, each to 0.005."""
+    """A problem of total reflectance and transmittance at normal incidence, with a standard deviation of 0.005 each."""
     shares = fits.Totals.of(0.0, reflectance=reflected, transmittance=transmitted, sigma=0.005)
     return fits.Problem(free, shares, transport, fits.Noise())
 
@@ -118,18 +122,18 @@ def fit(free, data, transport, **more):
     return fits.fit(free, data, transport=transport, noise=NOISE, starts=4, **more)
 
 
-def show(title, truth, found):
-    """A row for each parameter: the truth, and what each way finds."""
+def show(title, truth, results):
+    """A row for each parameter: the truth and each fitted value."""
     table = Table(title=title, box=None)
-    for heading in ("parameter", "truth", *found):
+    for heading in ("parameter", "truth", *results):
         table.add_column(heading)
     for name, value in truth.items():
         cells = []
-        for one in found.values():
+        for one in results.values():
             number, error = one.values.get(name), one.standard_errors.get(name)
             cells.append("" if number is None else f"{number:.4g} ± {error:.2g}")
         table.add_row(name, f"{value:g}", *cells)
-    chi_squares = [f"{one.reduced_chi_square:.2f}" for one in found.values()]
+    chi_squares = [f"{one.reduced_chi_square:.2f}" for one in results.values()]
     table.add_row("chi-square / dof", "", *chi_squares)
     Console(width=120).print(table)
 
@@ -140,8 +144,8 @@ PARTS = {part.__name__: part for part in (instrument, mixture, totals, bins)}
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", help=f"{', '.join(PARTS)} (default: all)")
-    asked = parser.parse_args().parts or list(PARTS)
-    for name in asked:
+    chosen = parser.parse_args().parts or list(PARTS)
+    for name in chosen:
         if name not in PARTS:
             parser.error(f"{name!r} is none of {', '.join(PARTS)}")
         PARTS[name]()
