@@ -54,7 +54,6 @@ JITTERY = {
     ("Statistical", "hazy coat on metal"),
     ("Statistical", "plate"),
     ("Statistical", "clear plate"),
-    ("Statistical, single", "two coats on paint"),
     ("Statistical, forward", "hazy varnish"),
     ("Statistical, forward", "plate"),
 }
@@ -81,7 +80,7 @@ QUICK = {
 SOME = {
     "AddingDoubling, multiple": ("varnish", "coated metal", "plate", "hazy coat on metal"),
     "Statistical, forward": ("varnish on rough paint", "coated metal", "hazy varnish", "plate"),
-    "Statistical, single": ("varnish", "coated metal", "two coats on paint"),
+    "Statistical, single": ("varnish", "coated metal"),
 }
 """Structures of transports that are others but for one option."""
 

@@ -11,9 +11,13 @@ import layerjax as lj
 
 INDICES, WIDTHS, SHARES = (1.33, 1.5, 2.0, 1 / 1.5), (0.05, 0.2, 0.6), (0.1, 0.5, 0.9)
 
-# every index and width with every kind of coat; the albedo of the base goes round
-KINDS = itertools.product(INDICES, WIDTHS, (False, True), (1, 2))
-CASES = [(*kind, SHARES[number % 3], False) for number, kind in enumerate(KINDS)]
+# every index with every width; kinds of coat and the albedo of the base go round
+COATS = list(itertools.product((False, True), (1, 2)))
+CASES = [
+    (ior, alpha, *COATS[(number + place) % 4], SHARES[(number + 2 * place) % 3], False)
+    for number, ior in enumerate(INDICES)
+    for place, alpha in enumerate(WIDTHS)
+]
 CASES += [
     (1.5, 0.05, False, 1, 0.9, True),
     (1.5, 0.6, False, 1, 0.1, True),
