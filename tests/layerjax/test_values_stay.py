@@ -1,7 +1,7 @@
 """Values and gradients of every transport stay what they were: a change of their code that should change none is seen.
 
-``python -m tests.layerjax.test_values_stay "NAME" ...`` writes these cases anew (all of them without a name), where a
-change is meant.
+``JAX_ENABLE_X64=1 python -m tests.layerjax.test_values_stay "NAME" ...`` writes these cases anew (all of them without a
+name), where a change is meant: under the `XLA_FLAGS` of `tests/conftest.py`, as others round differently.
 """
 
 import json
@@ -111,7 +111,8 @@ def test_values_stay(name, dtype):
 
 
 def _write(names: list[str]) -> None:
-    jax.config.update("jax_enable_x64", True)
+    if not jax.config.jax_enable_x64:  # later than on import some of the numbers would be rounded
+        sys.exit("set JAX_ENABLE_X64=1")
     before = json.loads(FILE.read_text()) if names else {}
     lines = []
     for name in ALL:
