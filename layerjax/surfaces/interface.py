@@ -40,8 +40,16 @@ def interface_transmission(
         ior: index on the far side over index on the side of wi, > 0. At 1 the BTDF is a delta, and 0 is returned.
         alpha, distribution: of the normals.
     """
-    lobe, transmitted = refraction_lobe(wi, wo, ior, alpha, distribution)
-    return 4.0 * visibility(wi[2], wi, -wo[2], wo, alpha, distribution) * lobe * transmitted
+    value, height = continued_transmission(wi, wo, ior, alpha, distribution)
+    return jnp.where(height > 0, value, 0.0)
+
+
+def continued_transmission(
+    wi: Vector, wo: Vector, ior: Array, alpha: Array, distribution: Distribution
+) -> tuple[Array, Array]:
+    """`interface_transmission` with facets that face down as well, and their height: see `continued_lobe`."""
+    lobe, transmitted, height = continued_lobe(wi, wo, ior, alpha, distribution)
+    return 4.0 * visibility(wi[2], wi, -wo[2], wo, alpha, distribution) * lobe * transmitted, height
 
 
 def refraction_lobe(

@@ -19,8 +19,7 @@ from layerjax._numerics import horizon, safe_sqrt, smooth_step
 from layerjax.channels import Channels, each, total
 from layerjax.directions import Vector, flip, sanitised, select
 from layerjax.stack import Interface, Medium, Stack, optical_depths
-from layerjax.surfaces.interface import continued_lobe, is_index_matched
-from layerjax.surfaces.microfacet import visibility
+from layerjax.surfaces.interface import continued_transmission, is_index_matched
 from layerjax.transport.adding_doubling.facet_light import Normals, facet_spacing, refracted_rays
 from layerjax.transport.adding_doubling.operators import Layer, Operator, left, matmul, plus, right, times
 from layerjax.transport.adding_doubling.requested import requested_region, turn
@@ -184,8 +183,7 @@ def _passed(state: Ballistic, cosine_i: Array, cosine_o: Array, azimuth: Array) 
 
 
 def _lobe(wi: Vector, wo: Vector, ratio: Array, facets: Normals, edge: Array) -> Lobe:
-    lobe, transmitted, height = continued_lobe(wi, wo, ratio, *facets)
-    value = 4.0 * visibility(wi[2], wi, -wo[2], wo, *facets) * lobe * transmitted
+    value, height = continued_transmission(wi, wo, ratio, *facets)
     return Lobe(value, value * smooth_step(height / (edge + TINY)))
 
 

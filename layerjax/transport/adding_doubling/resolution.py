@@ -48,6 +48,9 @@ alpha 0.3, 12 nodes and 32 modes, 9e-4; index 1.5, alpha 0.3, 8 and 16, 7e-4, an
 ASSUMED_WIDTH, ASSUMED_INDEX = 0.05, 1.5
 """Width of lobes, and the index around them, where nothing is known while tracing."""
 
+NARROW = 1e-4
+"""Width of lobes below which none counts."""
+
 NODES_AS_UNDER = 1.5
 """Media that stand bare need no more nodes than under this index, but the modes of light of any inclination.
 
@@ -148,19 +151,13 @@ def shortage(stack: Stack, followed: bool) -> str | None:
     return f"{found.nodes} nodes and {found.modes} modes, where about {nodes:.0f} and {modes:.0f} are needed"
 
 
-def is_guessed(stack: Stack) -> bool:
+def is_guessed(stack: Stack, followed: bool) -> bool:
     """Whether a lobe has to be resolved of whose width nothing is known while tracing, as under ``jit``."""
-    within = False
-    for layer in stack.layers:
-        if isinstance(layer, Interface):
-            if within and known_values(layer.alpha) is None:
-                return True
-            within = True
-        elif not is_known(layer.albedo, 0.0) and any(
-            known_values(leaf) is None for leaf in jax.tree.leaves(layer.phase)
-        ):
-            return True
-    return isinstance(stack.base, Conductor) and bool(stack.layers) and known_values(stack.base.alpha) is None
+    media = [layer for layer in stack.layers if not isinstance(layer, Interface) and not is_known(layer.albedo, 0.0)]
+    # phase functions assume a g by themselves
+    if any(known_values(leaf) is None for layer in media for leaf in jax.tree.leaves(layer.phase)):
+        return True
+    return _needed(stack, followed, assumed=NARROW) != _needed(stack, followed, assumed=1.0)
 
 
 class Needed(NamedTuple):
@@ -264,7 +261,7 @@ def _refracted(stack: Stack, assumed: float) -> Iterator[tuple[float, float | No
 
 def _least(value: Any, assumed: float) -> float:
     values = known_values(value)
-    return assumed if values is None else max(float(np.min(values)), 1e-4)
+    return assumed if values is None else max(float(np.min(values)), NARROW)
 
 
 def rungs(stack: Stack) -> Iterator[Resolution]:

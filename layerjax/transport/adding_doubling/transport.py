@@ -202,7 +202,7 @@ class AddingDoubling(DeterministicTransport):
                     f"AddingDoubling: the lobes of this stack are too narrow for an error of 1e-3: {short}; "
                     "evaluate_with_error tells the error, and a resolution can be given"
                 )
-            elif is_guessed(stack):
+            elif is_guessed(stack, directions is not None):
                 _warn(
                     f"AddingDoubling: under jit no lobe is taken to be narrower than {ASSUMED_WIDTH}, nor g above "
                     f"{ASSUMED_FORWARD} or below {-ASSUMED_BACKWARD}; transport=lj.choose_transport(stack, wi, wo), "

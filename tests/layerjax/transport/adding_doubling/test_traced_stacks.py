@@ -149,6 +149,9 @@ def test_a_guess_under_jit_is_told():
         "inner interface": lambda alpha: lj.Stack(
             [lj.Interface(1.5, 0.2), lj.Interface(1.3, alpha)], lj.Lambertian(0.5)
         ),
+        "index of three": lambda ior: lj.Stack(
+            [lj.Interface(1.5, 0.2), lj.Interface(1.0 + ior, 0.2), lj.Interface(1.0, 0.2)]
+        ),
         "haze": lambda g: lj.Stack([lj.Medium(1.0, 0.9, lj.HenyeyGreenstein(g))], lj.Lambertian(0.5)),
         "flakes": lambda alpha: lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("surface", alpha))], lj.Lambertian(0.5)),
     }
