@@ -22,6 +22,9 @@ from fits.sampling.proposals import Density, FittedProposal, propose
 FITS = (25 * 1.5 ** np.arange(40.0)).astype(int)
 """Steps after which proposals are fitted again: often while the chain is short, seldom once it is long."""
 
+FEWEST = 1000
+"""Draws that a density is fitted to, at least: on a ridge one that is fitted to fewer is worse than the first."""
+
 DIFFERENCE = 1.2
 """Length of differential evolution, where 2.38 is best for a normal posterior: curved ones are narrower than they are
 long."""
@@ -77,7 +80,7 @@ def proposals_of(chain: Chain) -> Density:
     fits only.
     """
     initial, last = Mixture(**chain.moves["initial"]), FITS[chain.iteration >= FITS].max(initial=0)
-    if not last:
+    if (last - last // 2) * chain.shape[0] < FEWEST:
         return initial
     positions = chain.chain[last // 2 : last].reshape(-1, chain.shape[-1])
     with one_thread():  # the same to the last bit, whatever else runs
