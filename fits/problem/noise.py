@@ -19,11 +19,12 @@ from jax import Array
 from jax.scipy.special import gammaln
 from numpy.typing import NDArray
 
+from fits._files import require_switch
 from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short, require_choice
+from layerjax._checks import in_short
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -68,7 +69,7 @@ class Noise:
                     _check_range(f"{field}.{end}", float(value), least, most)
             elif level is not None and not (isinstance(level, int | float) and level == 0):
                 _check_range(field, level, least, most)
-        require_choice("Noise.use_sigma", self.use_sigma, (True, False))
+        require_switch("Noise.use_sigma", self.use_sigma)
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
