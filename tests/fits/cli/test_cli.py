@@ -235,6 +235,16 @@ def test_help_imports_no_jax() -> None:
     assert "simulate" in done.stdout
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Eleven of them had a traceback instead."""
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    words, one = capsys.readouterr().out, COMMANDS[command]
+    assert all(option in words for option in (*one.particular, *one.shared.split()) if option.startswith("--"))
+
+
 def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
     def dropped(phase: str, info: dict[str, int]) -> None:
         gc.callbacks.remove(dropped)
