@@ -26,6 +26,13 @@ def given_path(name: str, path: object) -> Path:
     return Path(path)
 
 
+def require_switch(name: str, value: object, *others: None) -> None:
+    """ValueError for what is neither True nor False, nor None if that is given besides: any text is true."""
+    if not isinstance(value, bool) and not (value is None and others):
+        allowed = "True, False or None" if others else "True or False"
+        raise ValueError(f"{name}: {' '.join(repr(value).split()):.60} is not {allowed}")
+
+
 def require_file(path: Path) -> None:
     """FileNotFoundError if it does not exist, ValueError if it is no file: pipes cannot be read more than once."""
     require_there(path)
@@ -52,6 +59,7 @@ def write_bytes(path: str | Path, content: bytes, force: bool = False, durable: 
     durable: the content has reached the disk before it replaces an existing file. An OSError names the file.
     """
     path = given_path("path", path)
+    require_switch("force", force)
     if path.exists() and not force:
         raise ValueError(f"{path}: the file exists already (--force, or force=True, overwrites it)")
     if not path.parent.is_dir():

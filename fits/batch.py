@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from fits._files import given_path, named, read_json, require_there, text_checksum, write_text
+from fits._files import given_path, named, read_json, require_switch, require_there, text_checksum, write_text
 from fits.data.formats import sniff
 from fits.data.formats.csv import write_csv
 from fits.data.measurements import Measurements
@@ -182,6 +182,8 @@ def fit_files(
     require_count("starts", starts, 1)
     require_seed(seed)
     require_count("processes", processes, 1)
+    require_switch("reports", reports)
+    require_switch("force", force)
     files, stacks = _several("files", files), _several("stacks", stacks)
     read_options, out, progress = read_options or ReadOptions(), given_path("out", out), given_progress(progress)
     paths, skipped = _measurement_files(files, read_options.format)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from fits._files import given_path
+from fits._files import given_path, require_switch
 from fits.data.measurements import Measurements
 from fits.data.scans import correlation, neighbours
 from fits.data.totals import Totals
@@ -43,7 +43,7 @@ from fits.problem.noise import DEFAULT_RELATIVE, Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import FittingProblem, Problem
 from fits.progress import Progress, given_progress, silent
-from layerjax._checks import require_choice, require_count, require_kind, require_seed
+from layerjax._checks import require_count, require_kind, require_seed
 from layerjax.compiling import programs_kept
 
 Floats = NDArray[np.float64]
@@ -117,7 +117,7 @@ def fit(
         )
     require_count("starts", starts, 1)
     require_seed(seed)
-    require_choice("screen", screen, (False, True))
+    require_switch("screen", screen)
     checkpoint = None if checkpoint is None else given_path("checkpoint", checkpoint)
     if solver not in get_args(Solver):
         raise ValueError(f"solver is {solver!r}; it must be one of {', '.join(get_args(Solver))}")

@@ -19,11 +19,12 @@ from jax import Array
 from jax.scipy.special import gammaln
 from numpy.typing import NDArray
 
-from fits.data.measurements import Measurements
+from fits._files import require_switch
+from fits.data.measurements import LARGEST, Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
 from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short, require_choice
+from layerjax._checks import in_short
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -68,7 +69,7 @@ class Noise:
                     _check_range(f"{field}.{end}", float(value), least, most)
             elif level is not None and not (isinstance(level, int | float) and level == 0):
                 _check_range(field, level, least, most)
-        require_choice("Noise.use_sigma", self.use_sigma, (True, False))
+        require_switch("Noise.use_sigma", self.use_sigma)
         if self.tails not in get_args(Tails):
             raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
         _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
@@ -160,6 +161,8 @@ class Levels(NamedTuple):
     variance: Floats
     relative: float | Free
     floor: float | Free
+    floor_is_share: bool
+    """Whether the floor is a share of the values, by default."""
 
     @property
     def smallest(self) -> Floats:
@@ -184,7 +187,7 @@ class Levels(NamedTuple):
         """What measurements (N, C) tell of a process of the discrepancy; None where it depends on parameters."""
         if self.fitted:
             return None
-        variance, relative, floor = (jnp.asarray(level) for level in self)
+        variance, relative, floor = (jnp.asarray(level) for level in self[:3])
         sigma = total_sigma(jnp.asarray(values), variance, relative, floor)
         return process.gram_of(size(values, self.softness(values)) / sigma)
 
@@ -203,7 +206,20 @@ def noise_levels(noise: Noise, used: Measurements) -> Levels:
     if floor is None:
         alone = not is_free(relative) and relative == 0
         floor = 0.0 if alone else DEFAULT_FLOOR * float(np.median(np.abs(used.values)))
-    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor)
+    return Levels(np.zeros(1) if sigma is None else np.square(sigma), relative, floor, noise.floor is None)
+
+
+def require_size(levels: Levels) -> None:
+    """Refuse values of which a share has a square that vanishes or overflows."""
+    if not levels.floor_is_share or is_free(levels.floor) or levels.floor == 0:
+        return
+    precision, median = jnp.finfo(jnp.result_type(float)), _start(levels.floor) / DEFAULT_FLOOR
+    least, most = max(LEVELS[0], math.sqrt(precision.tiny)) / DEFAULT_FLOOR, min(LARGEST, math.sqrt(precision.max))
+    if not least <= median <= most:
+        raise ValueError(
+            f"values: the median of |value| is {median:.3g} 1/sr; for noise relative to them it must be in "
+            f"[{least:.2g}, {most:.2g}], or Noise.floor be given"
+        )
 
 
 def _lowest(level: float | Free) -> float:

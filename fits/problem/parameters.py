@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 import layerjax as lj
+from fits._files import require_switch
 from layerjax._checks import in_short
 from layerjax._parameters import PER_CHANNEL
 from layerjax._shown import Shown
@@ -216,8 +217,7 @@ class Free:
             raise ValueError(
                 f"Free.prior is {in_short(prior)}; it must be Uniform, LogUniform, Normal, LogNormal or None"
             )
-        if not isinstance(same_for_all_texels, bool):
-            raise ValueError(f"Free.same_for_all_texels is {in_short(same_for_all_texels)}; it must be True or False")
+        require_switch("Free.same_for_all_texels", same_for_all_texels)
         object.__setattr__(self, "prior", prior)
         object.__setattr__(self, "same_for_all_texels", same_for_all_texels)
         given = {"start": start, "low": low, "high": high, "random_walk_sd": random_walk_sd}

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import logit
 from scipy.stats import qmc
 
-from fits._files import given_path
+from fits._files import given_path, require_switch
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 from fits.progress import Progress
@@ -77,6 +77,8 @@ def sample(
         raise ValueError(f"objective {fit.problem.objective!r} is no likelihood, so there is no posterior to sample")
     fit.require_alone("sample")
     require_seed(seed)
+    require_switch("resume", resume)
+    require_switch("allow_unconverged", allow_unconverged)
     if path is not None and not given_path("path", path).parent.is_dir():
         raise ValueError(f"{path}: there is no directory {Path(path).parent}")
     count = len(fit.problem.names)

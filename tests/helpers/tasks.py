@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -35,6 +36,14 @@ def picky(shared: Any, task: int) -> int:
 
 def nothing(shared: Any, task: Any) -> None:
     """What it costs to ask."""
+
+
+def warned(shared: Any, task: int) -> None:
+    """Warns users of the same whatever the task, and once of its own."""
+    from layerjax import ResolutionWarning
+
+    for words in ("too narrow", f"task {task}"):
+        warnings.warn(words, ResolutionWarning, stacklevel=1)
 
 
 def deadly(shared: str, task: int) -> int:

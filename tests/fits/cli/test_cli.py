@@ -22,11 +22,13 @@ from fits.cli.arguments import COMMANDS
 from fits.cli.parser import main, raised_again
 from fits.data.measurements import Measurements
 from fits.data.reading import read
+from fits.engines import run
 from fits.optimise.result import Fit
 from fits.problem.problem import Problem
 from fits.reports.html import FitReport
 from fits.reports.plots.data import MOST_CHANNELS, data_picture
 from fits.reports.results import load_fit, load_posterior, save_fit
+from tests.helpers import tasks
 from tests.helpers.coats import make_folder
 from tests.helpers.commands import refused
 from tests.helpers.places import ROOT
@@ -233,6 +235,16 @@ def test_help_imports_no_jax() -> None:
     assert "simulate" in done.stdout
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_its_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Eleven of them had a traceback instead."""
+    with pytest.raises(SystemExit) as stop:
+        main([command, "--help"])
+    assert stop.value.code == 0
+    words, one = capsys.readouterr().out, COMMANDS[command]
+    assert all(option in words for option in (*one.particular, *one.shared.split()) if option.startswith("--"))
+
+
 def test_an_interrupt_that_a_callback_drops_comes_again() -> None:
     def dropped(phase: str, info: dict[str, int]) -> None:
         gc.callbacks.remove(dropped)
@@ -265,6 +277,21 @@ def test_a_warning_for_users_is_one_line_and_shown_once(
     with pytest.warns(RuntimeWarning, match="of the program"):
         assert main(["info", "data.csv"]) == 0
     assert capsys.readouterr().err == "layerjax: warning: too narrow\nlayerjax: warning: another\n"
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_so_is_one_of_workers(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, processes: int
+) -> None:
+    """In processes of their own it had been printed by each of them, with the file and the line."""
+    monkeypatch.setitem(
+        commands.COMMANDS, "info", lambda _: len(dict(run(tasks.warned, None, range(3), processes=processes))) - 3
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["info", "data.csv"]) == 0
+    lines = sorted(capfd.readouterr().err.splitlines())
+    assert lines == [f"layerjax: warning: {words}" for words in ("task 0", "task 1", "task 2", "too narrow")]
 
 
 def test_a_fit_of_angles_in_radians_is_doubted(

@@ -106,6 +106,8 @@ MAP, MANY = "fit-map map.npy --stack coat.toml --out coat.zarr", "fit-many scans
         ("", "COMMAND"),
         ("fot", "invalid choice: 'fot'"),
         ("fit data.csv", "required: --out, --stack"),
+        (FIT.replace("--stack", "--stakc"), "layerjax fit: error: unrecognized argument: --stakc; is it --stack?"),
+        (f"{FIT} --zzz=here", "unrecognized argument: --zzz (see layerjax fit --help)"),
         (f"{FIT} --starts 0", "0 given, must be a whole number >= 1"),
         (f"{FIT} --min-retro-angle nan", "nan given, must be a number in [0, 90]"),
         ("simulate --stack coat.toml --incidence 95.5 200 --out x.csv", "200 given, must be a number in [0, 180]"),

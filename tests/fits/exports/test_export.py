@@ -23,6 +23,7 @@ METAL = lj.Stack([], lj.Conductor([0.2, 0.9, 1.1], [3.9, 2.4, 2.2], 0.15))
 GLOSSY = lj.Stack([lj.Interface(1.5, 0.05)], lj.Lambertian([0.5, 0.3, 0.1]))
 FIBERS = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("fiber", 0.5, (1.0, 0.4, 0.0)))], lj.Lambertian(0.3))
 TILTED = lj.Stack([lj.Medium(1.0, 0.9, lj.SGGX("surface", 0.5, (0.3, 0.1, 1.0)))], lj.Lambertian(0.3))
+LYING = (1.0, 0.4, 0.0)
 HAZE = lj.Stack([lj.Medium(0.7, [0.9, 0.8, 0.7], lj.HenyeyGreenstein(0.3))])
 
 
@@ -80,11 +81,21 @@ def test_an_rgl_file_holds_the_stack(
 @pytest.mark.parametrize(
     ("phase", "median", "most"),
     [
-        (lj.SGGX("fiber", 0.3, (1.0, 0.4, 0.0)), 0.002, 0.023),
-        (lj.SGGX("fiber", 0.1, (1.0, 0.4, 0.0)), 0.009, 0.18),
+        (lj.SGGX("fiber", 0.3, LYING), 0.002, 0.023),
+        (lj.SGGX("fiber", 0.1, LYING), 0.009, 0.18),
         (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085),
+        *(
+            pytest.param(*row, marks=pytest.mark.slow)
+            for row in (
+                (lj.SGGX("fiber", 0.5, LYING), 0.001, 0.013),
+                (lj.SGGX("fiber", 0.05, LYING), 0.021, 0.6),
+                (lj.SGGX("surface", 0.3, (0.3, 0.2, 0.9)), 0.002, 0.012),
+                (lj.SGGX("surface", 0.1, (0.3, 0.2, 0.9)), 0.004, 0.039),
+                (lj.HenyeyGreenstein(0.9), 0.001, 0.007),
+            )
+        ),
     ],
-    ids=["fibers 0.3", "fibers 0.1", "haze"],
+    ids=lambda value: repr(value) if isinstance(value, lj.PhaseFunction) else "",
 )
 def test_narrow_lobes_are_held_as_well_as_the_page_says(
     tmp_path: Path, phase: lj.PhaseFunction, median: float, most: float

@@ -96,7 +96,7 @@ def sand_fits() -> dict[str, Fit]:
     noisy = exact * (1 + 0.03 * np.random.default_rng(3).standard_normal(exact.shape))
     sand = replace(data, values=noisy, sigma=0.03 * exact)
     surfaces = {
-        "transport": lj.VMFDiffuse(COLOURS, WIDTH, form="transport"),
+        "transport": lj.VMFDiffuse(COLOURS, WIDTH, form="all_orders"),
         "Oren-Nayar": lj.OrenNayar(COLOURS, WIDTH),
         "Lambertian": lj.Lambertian(COLOURS),
     }
