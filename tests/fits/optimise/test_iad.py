@@ -8,6 +8,7 @@ from fits.data.formats.rxt import read_slab
 from fits.optimise.fit import fit
 from fits.problem.parameters import Free, LogUniform
 
+pytestmark = pytest.mark.peers
 WITHIN = 0.02
 """What is asked of coefficients, relative to iad's."""
 
@@ -31,7 +32,7 @@ sample as well, which it follows by Monte Carlo; iadpython does not, and neither
 G = 0.9
 
 
-def coefficients(slab, g: float) -> dict[str, float]:
+def coefficients(slab, g):
     stack = slab.stack(Free(1.0, 0.1, 50.0, LogUniform()), Free(0.05, 1e-3, 5.0, LogUniform()), lj.HenyeyGreenstein(g))
     found = fit(stack, slab.totals, starts=1)
     mu_s, mu_a = (next(v for k, v in found.values.items() if k.endswith(name)) for name in ("mu_s", "mu_a"))
@@ -46,18 +47,24 @@ def inverted(read, **sample):
     return iad.Experiment(sample=slab, r=reflected, t=passed, default_g=sample["g"]).invert_rt()[:2]
 
 
-@pytest.mark.peers
-def test_a_measured_slab_is_what_it_inverts_it_to(tmp_path):
-    path = tmp_path / "pdms.rxt"
-    path.write_text(PDMS)
-    slab = read_slab(path, incidence=8.0, sigma=0.001, corrected=True)
-    found = coefficients(slab, G)
-    a, b = inverted(slab.totals.values[:, 0], g=G, n=slab.ior)
-    expected = {"mu_a": b * (1 - a) / slab.thickness_mm, "mu_s'": a * b * (1 - G) / slab.thickness_mm}
+def assert_found(folder, text, mu_a, mu_s, g, **reading):
+    """The coefficients of a slab are these, where its file holds this."""
+    path = folder / "slab.rxt"
+    path.write_text(text)
+    found = coefficients(read_slab(path, sigma=0.001, **reading), g)
+    expected = {"mu_a": mu_a, "mu_s'": mu_s * (1.0 - g)}
     np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
 
 
-@pytest.mark.peers
+def test_a_measured_slab_is_what_it_inverts_it_to(tmp_path):
+    (tmp_path / "pdms.rxt").write_text(PDMS)
+    reading = {"incidence": 8.0, "corrected": True}
+    slab = read_slab(tmp_path / "pdms.rxt", sigma=0.001, **reading)
+    a, b = inverted(slab.totals.values[:, 0], g=G, n=slab.ior)
+    thickness = slab.thickness_mm
+    assert_found(tmp_path, PDMS, b * (1 - a) / thickness, a * b / thickness, G, **reading)
+
+
 @pytest.mark.parametrize(
     ("albedo", "depth", "g", "ior", "slides"),
     [(0.9, 1.0, 0.0, 1.0, 1.0), (0.95, 2.0, 0.8, 1.4, 1.0), (0.98, 5.0, 0.7, 1.33, 1.5)],
@@ -68,15 +75,11 @@ def test_slabs_of_its_forward_model_are_what_it_inverts_them_to(tmp_path, albedo
     reflected, passed = (float(part) for part in sample.rt()[:2])
     a, b = inverted((reflected, passed), g=g, n=ior, n_above=slides, n_below=slides)
     assert (a, b) == (pytest.approx(albedo, rel=WITHIN), pytest.approx(depth, rel=WITHIN))
-    path = tmp_path / "slab.rxt"
     glass = f"{slides} 1 1" if slides > 1 else "1 1 0"
-    path.write_text(f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}")
-    found = coefficients(read_slab(path, sigma=0.001), g)
-    expected = {"mu_a": b * (1 - a), "mu_s'": a * b * (1 - g)}
-    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+    text = f"IAD1 {ior} {glass} 5 1 0 200 25 12 1 .96 200 25 12 1 .96 2 {reflected} {passed}"
+    assert_found(tmp_path, text, b * (1 - a), a * b, g)
 
 
-@pytest.mark.peers
 @pytest.mark.parametrize("g", [0.0, 0.8])
 def test_slabs_that_a_sphere_reads_are_told_from_its_gain(tmp_path, g):
     """Readings by the gains of iadpython's sphere, whose `gain` is one over what it documents, of its own slab."""
@@ -87,8 +90,5 @@ def test_slabs_that_a_sphere_reads_are_told_from_its_gain(tmp_path, g):
     sphere._r_wall = 0.95
     reflected = ur1 * sphere.gain(0.98) / sphere.gain(uru)
     passed = ut1 * sphere.gain(0.0) / sphere.gain(uru)
-    path = tmp_path / "slab.rxt"
-    path.write_text(f"IAD1 {ior} 1 1 0 5 0.98 1 100 30 15 10 .95 100 30 15 10 .95 2 {reflected} {passed}")
-    found = coefficients(read_slab(path, sigma=0.001), g)
-    expected = {"mu_a": depth * (1 - albedo), "mu_s'": albedo * depth * (1 - g)}
-    np.testing.assert_allclose([found[name] for name in expected], list(expected.values()), rtol=WITHIN)
+    text = f"IAD1 {ior} 1 1 0 5 0.98 1 100 30 15 10 .95 100 30 15 10 .95 2 {reflected} {passed}"
+    assert_found(tmp_path, text, depth * (1 - albedo), albedo * depth, g)
