@@ -80,9 +80,16 @@ def surroundings(shared: Any, task: Any) -> dict[str, Any]:
 
 @contextmanager
 def started(words: list[str], *paths: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program of Python in a process group of its own, with these paths to import from; killed in the end."""
+    """A program of Python in a process group of its own, with these paths to import from; killed in the end.
+
+    It finds the programs that tests have compiled.
+    """
+    import jax
+
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*paths, ROOT)))}
     environment |= {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    for setting in ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"):
+        environment[setting.upper()] = str(jax.config.values[setting])
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's ignoring is inherited
     try:
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
