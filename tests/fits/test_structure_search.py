@@ -116,8 +116,8 @@ def test_a_budget_of_time_ends_a_search_that_another_goes_on_with(data, tmp_path
 
 def test_every_structure_has_the_instrument_and_another_search_is_refused(data, tmp_path):
     instrument = fits.Instrument(gain_sd=0.02)
-    given = {"data": data, "library": LIBRARY, **GIVEN, "options": SHORT, "directory": tmp_path / "it"}
-    given["instrument"] = instrument
+    given = {"data": data, "library": Library({"haze": COAT}, {"diffuse": BASE}), **GIVEN, "instrument": instrument}
+    given |= {"options": SHORT, "directory": tmp_path / "it"}
     for one in search(**given).candidates:
         assert one.fit.problem.instrument == instrument
         assert sum(name.startswith("instrument.gains") for name in one.fit.values) == 3

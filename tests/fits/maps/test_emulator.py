@@ -110,6 +110,7 @@ def test_a_map_by_an_emulator_ends_where_it_does_without(tmp_path):
         assert np.all(np.abs(direct.values[name] - truth) < 4.0 * direct.errors[name])
 
 
+@pytest.mark.slow  # an exact transport compiles for ten seconds
 def test_an_exact_transport_is_emulated_where_that_pays(tmp_path):
     transport = lj.AddingDoubling(nodes=4, modes=4)
     map = fitted(tmp_path / "coat.zarr", transport, emulator_min_texels=6)

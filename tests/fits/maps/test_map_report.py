@@ -143,6 +143,8 @@ def test_the_verdict_is_a_matter_of_its_thresholds(arrays, more, sound, sentence
         assert sentence in " ".join(words)
     if np.nanmax(arrays["reduced_chi_square"], initial=0.0) > 1e6:
         assert "No texel is poor" not in " ".join(words)
+    if "chunks" in more:
+        assert ("done so far", "200", "33.33 %") in summary.count_table(summarise(map)).rows
     if more.get("common") is OFF:
         rows = (("layers[0].ior", "1.50", "0.10", "1"), ("layers[0].thickness_mm", "2", "unknown", "mm"))
         assert summary.common_table(map).rows == rows
