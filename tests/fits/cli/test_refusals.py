@@ -37,10 +37,7 @@ REFUSALS = (
     (f"{FIT} --select incidence=10 --hold-out incidence=50", "--hold-out leaves nothing to score"),
     (f"{FIT} --hold-out channel=value", "the parameters of a channel cannot be predicted from others"),
     (f"{FIT} --select channel=blue", "channel blue is not in the data; there are"),
-    (
-        "fit data.csv --stack root.toml --out result --hold-out share=0.2",
-        "--hold-out needs the objective 'likelihood'",
-    ),
+    ("fit data.csv --stack root.toml --out result --hold-out share=0.2", "--hold-out needs the objective 'likelihood'"),
     ("convert data.csv data.bsdf", ".csv"),
     ("simulate --stack coat.toml --out data.csv", "--force"),
     ("simulate --stack coat.toml --incidence 20,95.5 --out new.csv", "a light at 95.5 degrees sees nothing"),

@@ -73,10 +73,7 @@ def test_an_rgl_file_holds_the_stack(tmp_path, stack, transport, share, azimuths
 
 @pytest.mark.parametrize(
     ("phase", "median", "most"),
-    [
-        (lj.SGGX("fiber", 0.1, (1.0, 0.4, 0.0)), 0.009, 0.18),
-        (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085),
-    ],
+    [(lj.SGGX("fiber", 0.1, (1.0, 0.4, 0.0)), 0.009, 0.18), (lj.HenyeyGreenstein(-0.9), 0.0024, 0.085)],
     ids=["fibers", "haze"],
 )
 def test_narrow_lobes_are_held_as_well_as_the_page_says(tmp_path, phase, median, most):

@@ -122,8 +122,8 @@ def test_a_report_tells_the_error_and_draws_the_values_of_the_fit(refined):
     np.testing.assert_allclose(drawn, found.predicted[rows, 0], rtol=1e-6)
 
 
-def coated(index, alpha, axis=None):
-    flakes = lj.SGGX("surface", alpha=alpha, axis=axis)
+def coated(index, alpha):
+    flakes = lj.SGGX("surface", alpha=alpha)
     return lj.Stack([lj.Interface(ior=index, alpha=0.1), lj.Medium(thickness=1.0, albedo=0.9, phase=flakes)])
 
 
