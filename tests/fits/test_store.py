@@ -3,8 +3,6 @@
 import os
 import random
 import sqlite3
-import subprocess
-import sys
 import time
 from contextlib import closing, contextmanager
 
@@ -14,12 +12,11 @@ import pytest
 
 from fits.store import Store, differences, fingerprint
 from tests.helpers.files import contents, largest_file, read_only
-from tests.helpers.places import ROOT
+from tests.helpers.tasks import started
 
 WHOSE = fingerprint(data=np.arange(3.0), seed=0)
 SCRIPT = """
 import sys, os, signal
-from pathlib import Path
 import numpy as np
 from fits.store import Store, fingerprint
 path, hold = sys.argv[1:]
@@ -41,14 +38,10 @@ with Store.open(path, fingerprint(data=np.arange(3.0), seed=0)) as store:
 @contextmanager
 def writer(path, hold=""):
     """A process that writes until it is killed in the end; it stops between two records, or within one."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", SCRIPT, str(path), hold], env=environment) as process:
-        try:
-            if hold:
-                os.waitid(os.P_PID, process.pid, os.WSTOPPED)
-            yield process
-        finally:
-            process.kill()
+    with started(["-c", SCRIPT, str(path), hold]) as process:
+        if hold:
+            os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        yield process
 
 
 def steps_of(store):
