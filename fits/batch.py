@@ -227,7 +227,8 @@ def fit_files(
                 rows[task.key] = outcome
                 progress("fits", count, total, f"{task.path.name} by {task.stack}")
         finally:
-            result = FittedFiles(out, ranked(list(rows.values())), skipped)
+            every = [row if _is_there(out, row) else _removed(row) for row in rows.values()]
+            result = FittedFiles(out, ranked(every), skipped)
             write_text(out / TABLE, table_csv(result.rows), force=True)
             write_text(out / PAGE, page(result), force=True)
     return result
@@ -361,6 +362,15 @@ def _kept_row(job: Job, task: Task, done: Store) -> Row | None:
     except (ValueError, OSError):
         return None
     return None if words else record["row"]
+
+
+def _is_there(out: Path, row: Row) -> bool:
+    """Whether a row has no result, or has it still: others may remove one while the rest are fitted."""
+    return row["result"] == "failed" or (out / row["file"] / row["stack"] / results.FIT).is_file()
+
+
+def _removed(row: Row) -> Row:
+    return Task(Path(row["file"]), "", row["stack"]).failed("its result was removed during the run; run it again")
 
 
 def fit_one(job: Job, task: Task) -> Row:

@@ -1,10 +1,11 @@
 """The starts of a fit: where they begin, where each of them ends, and the lowest followed to its very minimum.
 
-Levenberg-Marquardt follows them. L-BFGS-B of scipy, with gradients only, shares nothing with it but the objective: it
-checks a minimum that lies on a bound or has not converged. A start that reaches the maximum of steps is continued while
-it gains something: the number of steps says nothing about how good its outcome is.
+Levenberg-Marquardt follows them. L-BFGS-B of scipy, by jaxopt and with gradients only, shares nothing with it but the
+objective: it checks a minimum that lies on a bound or has not converged. A start that reaches the maximum of steps is
+continued while it gains something: the number of steps says nothing about how good its outcome is.
 """
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -14,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.stats import qmc
 
 import layerjax
@@ -162,23 +162,27 @@ def lbfgsb_polish(problem: FittingProblem, end: StartOutcome) -> tuple[StartOutc
     of them improves has converged if one of them says so.
     """
 
-    def value_and_gradient(unit: Floats) -> tuple[float, Floats]:  # the gradient in reverse would be compiled for this
+    def value_and_gradient(unit: Floats) -> tuple[Floats, Floats]:  # the gradient in reverse would be compiled for this
         found = evaluate_at(problem, unit)
-        return float(found.cost), np.asarray(found.gradient, float)
+        return found.cost, found.gradient
 
     enough = LEAST_STEP_GAIN / max(abs(end.cost), 1.0) if problem.objective == "likelihood" else LBFGSB_TOLERANCE
-    begin, bounds, options = np.clip(unit_of(problem, end.vector), 0.0, 1.0), (0.0, 1.0), {"maxiter": LBFGSB_STEPS}
-    found = minimize(
-        value_and_gradient,
-        begin,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[bounds] * len(begin),
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        from jaxopt import ScipyBoundedMinimize
+
+    solver = ScipyBoundedMinimize(
+        fun=value_and_gradient,
+        method="l-bfgs-b",
+        value_and_grad=True,
+        jit=False,  # the function is compiled already, and for all problems of this structure
         tol=enough,
-        options=options,
+        maxiter=LBFGSB_STEPS,
     )
-    settled = bool(found.success) and bool(np.isfinite(found.fun))
-    other = least_squares_descent(problem, np.asarray(found.x), fresh=False)
+    begin = jnp.clip(jnp.asarray(unit_of(problem, end.vector)), 0.0, 1.0)
+    point, info = solver.run(begin, bounds=(jnp.zeros_like(begin), jnp.ones_like(begin)))
+    settled = bool(info.success) and bool(np.isfinite(info.fun_val))
+    other = least_squares_descent(problem, np.asarray(point, float), fresh=False)
     if other.cost < end.cost - max(COST_TOLERANCE, 1e-9 * abs(end.cost)):
         return other._replace(converged=other.converged or settled, steps=end.steps + other.steps), True
     return end._replace(converged=end.converged or other.converged or settled), False

@@ -171,6 +171,26 @@ def test_a_result_of_something_else_is_refused_by_name_and_damage_is_fitted_agai
     refused(r"no batch\.store of theirs\): choose another directory")
 
 
+def test_a_result_that_is_removed_during_the_run_is_not_counted(folder, counted, monkeypatch):
+    """It had been: 6 of 6 fits were said to be there, and one was gone."""
+    fit_one = batch.fit_one
+
+    def remove(job, task):
+        if task.key == "paint.csv/bare":  # after both of the other file
+            shutil.rmtree(job.out / "coated.csv/coat")
+        return fit_one(job, task)
+
+    scans = ["scans/coated.csv", "scans/paint.csv"]
+    monkeypatch.setattr(batch, "fit_one", remove)
+    found = fits.fit_files(scans, STACKS, "out", **FEW)
+    assert [row["stack"] for row in found.rows if "was removed" in row["status"]] == ["coat"]
+    assert not found.complete
+    assert [line["result"] for line in table()].count("failed") == 1
+    monkeypatch.setattr(batch, "fit_one", fit_one)
+    assert fits.fit_files(scans, STACKS, "out", **FEW).complete
+    assert len(counted) == 5
+
+
 @pytest.mark.slow
 def test_held_out_data_decide(folder):
     reading = ReadOptions(hold_out=("incidence=50",))
