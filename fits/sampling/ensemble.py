@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fits.optimise.result import Fit
-from fits.problem.compilation import cores, in_shares, one_thread
+from fits.problem.compilation import one_thread
 from fits.sampling.chain import Chain
-from fits.sampling.initial import first_positions, initial_mixture, log_posteriors
+from fits.sampling.initial import first_positions, initial_mixture, log_posteriors, share_of
 from fits.sampling.mixture import Mixture
 from fits.sampling.options import SamplerOptions
 from fits.sampling.proposals import Density, FittedProposal, propose
@@ -34,9 +34,9 @@ class Ensemble:
 
     def __init__(self, fit: Fit, chain: Chain, seed: int, options: SamplerOptions):
         self.problem, self.chain, self.seed, self.options = fit.problem, chain, seed, options
-        self._compiled = False
+        self.share, self._compiled = share_of(chain.shape[0]), False
         if not chain.moves:
-            chain.decide({"initial": initial_mixture(fit, options.smallest_mode).record()})
+            chain.decide({"initial": initial_mixture(fit, self.share, options.smallest_mode).record()})
 
     def advance(self, step: int, show: Callable[[], None]) -> None:
         """Append steps to the chain until it has `step` of them, and `show` each."""
@@ -58,11 +58,7 @@ class Ensemble:
                 show()
 
     def log_posteriors(self, positions: Floats) -> Floats:
-        """At positions (count, P), on all cores: half of the walkers, which move together, are a share for each."""
-        share = max(1, self.chain.shape[0] // (2 * cores()))
-        (found,) = in_shares(
-            lambda part: [self.problem.call(log_posteriors, part)], positions, share, compiled=self._compiled
-        )
+        found = log_posteriors(self.problem, positions, self.share, self._compiled)
         self._compiled = True
         return found
 

@@ -97,6 +97,7 @@ def test_albedo_over_metal_is_the_mean_of_walks(alpha):
     np.testing.assert_allclose(found, walks, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_slope_of_the_albedo_of_a_narrow_lobe_is_that_of_a_mirror():
     @jax.jit
     def slope(ior, alpha):
