@@ -1,4 +1,4 @@
-"""The painted map: its readings are those of its truth, texel by texel, with the noise that it states."""
+"""The painted map: its measurements are those of its truth, texel by texel, with the noise that it states."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def flakes() -> Painted:
         return painted(SHAPE, lj.SingleScattering(), material="flakes", seed=3)
 
 
-def test_readings_are_those_of_the_truth(flakes: Painted) -> None:
+def test_measurements_are_those_of_the_truth(flakes: Painted) -> None:
     assert flakes.values.shape == (*SHAPE, 64, 1)
     found = map_data(flakes.values, flakes.geometry)
     assert (found.shape, found.samples, found.channels) == (SHAPE, 64, 1)
