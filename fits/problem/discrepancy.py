@@ -22,7 +22,7 @@ the change of that covariance between white numbers; with c = B^-1 A'z,
 and C^-1 (B - 1) = C' - C^-1. So a Jacobian by many parameters makes matrices for those few of the process alone.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,8 +33,7 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from numpy.typing import ArrayLike, NDArray
 
-from fits.problem.parameters import Free, LogNormal, Normal
-from layerjax._checks import in_short
+from fits.problem.parameters import Free, LogNormal, Normal, require_number_or_free
 
 Floats = NDArray[np.float64]
 Trio = tuple[Array, Array, Array]
@@ -105,22 +104,9 @@ class Discrepancy:
     channel_correlation: float | Free | None = None
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            low, high = RANGES.get(entry.name, ANGLES)
-            value = getattr(self, entry.name)
-            if isinstance(value, Free):
-                if value.shape != ():
-                    raise ValueError(
-                        f"Noise.discrepancy.{entry.name} has {value.shape[0]} channels; it must be a single number"
-                    )
-                ends = {f"{entry.name}.{end}": getattr(value, end) for end in ("low", "high")}
-            else:
-                ends = {} if value is None else {entry.name: value}
-            for name, number in ends.items():
-                if not (isinstance(number, int | float) and low <= number <= high):
-                    raise ValueError(
-                        f"Noise.discrepancy.{name} is {in_short(number)}; it must be a number in [{low:g}, {high:g}]"
-                    )
+        for name, value in vars(self).items():
+            if value is not None:
+                require_number_or_free(f"Noise.discrepancy.{name}", value, *RANGES.get(name, ANGLES))
 
 
 def numbers_of(discrepancy: Discrepancy, shortest: Floats, channels: int) -> Correlation:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from fits.data.geometry import AT_NORMAL, LIGHT_AZIMUTH, polar
 from fits.data.scans import SAME_ANGLE
 from fits.problem.apertures import MOST_RINGS, Spread, ray_counts, rays, spread_over_lobes
-from fits.problem.parameters import Free, LogNormal
-from layerjax._checks import in_short
+from fits.problem.parameters import Free, LogNormal, require_number_or_free
+from layerjax._checks import require_count, require_number
 from layerjax.transport.known_directions import KnownDirections, known_directions
 
 Floats = NDArray[np.float64]
@@ -56,19 +56,14 @@ class Instrument:
     rings: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("source_aperture", "detector_aperture"):
-            _require(name, getattr(self, name), 0.0, WIDEST)
-        if isinstance(self.tilt, Free):
-            if self.tilt.shape != ():
-                raise ValueError("Instrument.tilt has channels; it must be a single number")
-            for end in ("low", "high"):
-                _require(f"tilt.{end}", getattr(self.tilt, end), -MOST_TILT, MOST_TILT)
-        elif self.tilt is not None:
-            _require("tilt", self.tilt, -MOST_TILT, MOST_TILT)
+        require_number("Instrument.source_aperture", self.source_aperture, 0.0, WIDEST)
+        require_number("Instrument.detector_aperture", self.detector_aperture, 0.0, WIDEST)
+        if self.tilt is not None:
+            require_number_or_free("Instrument.tilt", self.tilt, -MOST_TILT, MOST_TILT)
         if self.gain_sd is not None:
-            _require("gain_sd", self.gain_sd, *GAIN_SPREADS)
-        if self.rings is not None and not (type(self.rings) is int and 1 <= self.rings <= MOST_RINGS):
-            raise ValueError(f"Instrument.rings is {in_short(self.rings)}; it must be an integer in [1, {MOST_RINGS}]")
+            require_number("Instrument.gain_sd", self.gain_sd, *GAIN_SPREADS)
+        if self.rings is not None:
+            require_count("Instrument.rings", self.rings, 1, MOST_RINGS)
 
     @property
     def has_cones(self) -> bool:
@@ -256,9 +251,3 @@ def _tilted(w: Any, forward: Any, offset: Any) -> Array:
     turned = along * cosine - w[:, 2] * sine
     flat = w[:, :2] + (turned - along)[:, None] * forward
     return jnp.concatenate([flat, (along * sine + w[:, 2] * cosine)[:, None]], axis=-1)
-
-
-def _require(name: str, value: Any, low: float, high: float) -> None:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (number and low <= value <= high):
-        raise ValueError(f"Instrument.{name} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]")

@@ -233,14 +233,12 @@ class Model(Density):
         return -self.whitened_at(vector, predicted, self._noise_at(vector, predicted)).residuals
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         if self.process is None:
             return self.standardised_at(vector, predicted)
         scaled = self._logarithmic(predicted, self._noise_at(vector, predicted))
         return -self.process.whitened_residuals(*scaled, self._correlation(vector))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         if self.process is None:
             return jnp.sum(self.standardised_at(vector, predicted) ** 2)
         found = self.whitened_at(vector, predicted, self._noise_at(vector, predicted))
@@ -263,15 +261,12 @@ class Model(Density):
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
-        """See `Density`."""
         return tuple(range(2, 2 + self.varying + (self.process is not None)))
 
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """See `Density`."""
         return self._residuals(vector, predicted, self._noise_at(vector, predicted))
 
     def initial_sigma(self, vector: Array) -> Array:
-        """See `Density`."""
         parts = self.build(vector)
         typical = jnp.mean(jnp.abs(self.values))  # a tenth of it keeps data near 0 from outweighing all others
         return total_sigma(jnp.abs(self.values) + 0.1 * typical, self.variance, parts.relative, parts.floor)
@@ -292,7 +287,6 @@ class Model(Density):
         return self._residuals(vector, predicted, held, shared), (predicted, rows)
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         sigma = self._noise_at(vector, predicted)
         if self.process is None:
             z = (self.values - predicted) / sigma
@@ -304,7 +298,6 @@ class Model(Density):
         return log_density(own / jnp.sqrt(precision), width, self.tails, self.degrees_of_freedom)
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         if self.process is None:
             return jnp.sum(self.log_likelihood_per_datum_at(vector, predicted))
         sigma = self._noise_at(vector, predicted)
@@ -401,35 +394,27 @@ class JointModel(Density):
 
     @property
     def logarithmic(self) -> tuple[int, ...]:
-        """See `Density`."""
         return (2,) if any(part.logarithmic for part in self.parts) else ()
 
     def predict(self, vector: Array) -> Array:
-        """See `Density`."""
         return _column([part.predict(own) for part, own in self._with_vectors(vector)])
 
     def initial_sigma(self, vector: Array) -> Array:
-        """See `Density`."""
         return _column([part.initial_sigma(own) for part, own in self._with_vectors(vector)])
 
     def whitened_residuals_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return _column(self._each(Model.whitened_residuals_at, vector, predicted))
 
     def log_likelihood_per_datum_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return _column(self._each(Model.log_likelihood_per_datum_at, vector, predicted))
 
     def chi_square_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return jnp.sum(jnp.stack(self._each(Model.chi_square_at, vector, predicted)))
 
     def log_likelihood_at(self, vector: Array, predicted: Array) -> Array:
-        """See `Density`."""
         return jnp.sum(jnp.stack(self._each(Model.log_likelihood_at, vector, predicted)))
 
     def residuals_at(self, vector: Array, predicted: Array) -> tuple[Array, ...]:
-        """See `Density`."""
         return self._together(vector, self._each(Model.residuals_at, vector, predicted))
 
     def linear_parts(

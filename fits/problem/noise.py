@@ -11,7 +11,8 @@ constant, so that a least-squares solver maximises the likelihood exactly:
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, get_args
+from numbers import Real
+from typing import Literal, NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +23,8 @@ from numpy.typing import NDArray
 from fits.data.measurements import Measurements
 from fits.names import Objective
 from fits.problem.discrepancy import Discrepancy, Process, size, softness
-from fits.problem.parameters import Free, is_free
-from layerjax._checks import in_short, require_choice
+from fits.problem.parameters import Free, is_free, require_number_or_free
+from layerjax._checks import in_short, require_choice, require_number
 
 Tails = Literal["gaussian", "student"]
 DEFAULT_RELATIVE = 0.05
@@ -59,19 +60,13 @@ class Noise:
     discrepancy: Discrepancy | bool | None = None
 
     def __post_init__(self) -> None:
-        for field, (least, most) in (("relative", (0.0, 1.0)), ("floor", LEVELS)):
-            level = getattr(self, field)
-            if isinstance(level, Free):
-                if level.shape != ():
-                    raise ValueError(f"Noise.{field} has {level.shape[0]} channels; it must be a single number")
-                for end, value in zip(("low", "high"), level.arrays()[1:], strict=True):
-                    _check_range(f"{field}.{end}", float(value), least, most)
-            elif level is not None and not (isinstance(level, int | float) and level == 0):
-                _check_range(field, level, least, most)
+        if self.relative is not None:
+            require_number_or_free("Noise.relative", self.relative, 0.0, 1.0)
+        if self.floor is not None and not (isinstance(self.floor, Real) and self.floor == 0.0):
+            require_number_or_free("Noise.floor", self.floor, *LEVELS)
         require_choice("Noise.use_sigma", self.use_sigma, (True, False))
-        if self.tails not in get_args(Tails):
-            raise ValueError(f"Noise.tails is {self.tails!r}; it must be one of {', '.join(get_args(Tails))}")
-        _check_range("degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
+        require_choice("Noise.tails", self.tails, get_args(Tails))
+        require_number("Noise.degrees_of_freedom", self.degrees_of_freedom, *DEGREES_OF_FREEDOM)
         if self.discrepancy is True:
             object.__setattr__(self, "discrepancy", Discrepancy())
         if not (self.discrepancy in (False, None) or isinstance(self.discrepancy, Discrepancy)):
@@ -80,12 +75,6 @@ class Noise:
             )
         if self.discrepancy and self.tails != "gaussian":
             raise ValueError(f"Noise.tails is {self.tails!r}; with model discrepancy it must be gaussian")
-
-
-def _check_range(field: str, value: Any, low: float, high: float) -> None:
-    if not (isinstance(value, int | float) and low <= value <= high):
-        share = " (0.05 is 5 %)" if field.startswith("relative") else ""
-        raise ValueError(f"Noise.{field} is {in_short(value)}; it must be a number in [{low:g}, {high:g}]{share}")
 
 
 def total_sigma(predicted: Array, variance: Array, relative: Array, floor: Array) -> Array:

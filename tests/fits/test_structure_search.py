@@ -15,7 +15,7 @@ from fits.optimise.result import Fit
 from fits.prediction import cross_validation
 from fits.problem.compilation import cores
 from fits.problem.noise import Noise
-from fits.problem.parameters import Free, split
+from fits.problem.parameters import Free, names_of, split
 from fits.store import Store
 from fits.structure_search import STORE, Library, SearchOptions, default_library, read_library, search
 from tests.helpers.files import contents
@@ -202,7 +202,7 @@ def test_every_part_of_the_default_is_free_and_has_as_many_colours(channels: int
     library = default_library(channels)
     for base in library.bases:
         assert all(split(library.stack((layer, base)))[1] for layer in library.layers)
-    names = split(library.stack(("particles", "diffuse")))[1]
+    names = names_of(split(library.stack(("particles", "diffuse")))[1])
     assert sum("albedo" in name for name in names) == 2 * channels
 
 

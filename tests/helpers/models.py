@@ -1,11 +1,13 @@
 """Small models with known answers: data at given directions, and functions that stand in for a transport."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fits.data.geometry import Pairs
 from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
@@ -32,6 +34,15 @@ def measured(values: ArrayLike, sigma: ArrayLike | None = None, mask: ArrayLike 
         mask=np.ones(count, bool) if mask is None else np.asarray(mask),
         channels=tuple(f"c{channel}" for channel in range(channels)),
     )
+
+
+def along(
+    geometry: Pairs, values: ArrayLike = 1.0, sigma: ArrayLike | None = None, channels: Sequence[str] = ("value",)
+) -> Measurements:
+    """Values (N, C) along the directions of a geometry, all of them used."""
+    shape = len(geometry), len(channels)
+    values, sigma = (None if one is None else np.broadcast_to(one, shape) for one in (values, sigma))
+    return Measurements(geometry.wi, geometry.wo, values, sigma, np.ones(len(geometry), bool), tuple(channels))
 
 
 def line(stack: Any, wi: Any, wo: Any) -> Any:
