@@ -192,6 +192,11 @@ class Model(Density):
     varying: bool = eqx.field(static=True)
     moving: int = eqx.field(static=True)
 
+    @property
+    def places(self) -> tuple[tuple[int, ...], ...]:
+        """Of the parameters of the one data set: all of them."""
+        return (tuple(range(len(self.box.low))),)
+
     def build(self, vector: Array) -> Parts:
         """Stack, scale and noise levels with these parameters."""
         return Parts(*with_values(self.template.fill(vector)))

@@ -29,7 +29,7 @@ from fits.problem.compilation import Static, run
 from fits.problem.discrepancy import Discrepancy, Process, make_process, numbers_of
 from fits.problem.hemispherical import Totalling
 from fits.problem.instrument import Instrument, optics_of, setting_of
-from fits.problem.model import Density, JointModel, Model, Parts, Transport
+from fits.problem.model import Density, JointModel, Model, Transport
 from fits.problem.noise import Levels, Noise, is_assumed, noise_levels
 from fits.problem.parameters import Box, Free, LogNormal, Normal, is_free, names_of, require_in_range, split
 from layerjax._checks import in_short, require_choice, require_kind, require_number
@@ -58,14 +58,10 @@ PLACES = ("", "scale", "instrument", "noise.relative", "noise.floor", "noise.dis
 
 
 class Assembled(NamedTuple):
-    """What follows from a problem as it was given.
-
-    free: its parameters, by name. places: where those of each data set stand in the vector (P,), by its name.
-    """
+    """What follows from a problem as it was given: its parameters by name, and their density."""
 
     free: dict[str, Free]
     model: Any
-    places: dict[str, tuple[int, ...]]
 
 
 class FittingProblem(abc.ABC):
@@ -133,7 +129,7 @@ class FittingProblem(abc.ABC):
         """Where the parameters of one data set stand in the vector."""
         if name not in self.problems:
             raise ValueError(f"part {name!r} is not one of {', '.join(self.problems)}")
-        return self._assembled.places[name]
+        return dict(zip(self.problems, self.model.places, strict=True))[name]
 
     def shares(self, predicted: Floats) -> dict[str, Floats]:
         """What `predict` gives of each data set, in the shape of its data."""
@@ -174,7 +170,11 @@ class FittingProblem(abc.ABC):
         own of that name."""
         if function in vars(Density).values():
             function = getattr(type(self.model), function.__name__)
-        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=_is_vector) for argument in arguments)
+
+        def is_vector(argument: Any) -> bool:  # numbers that are listed make an array; a named tuple holds arrays
+            return type(argument) in (list, tuple)
+
+        arrays = (jax.tree.map(jnp.asarray, argument, is_leaf=is_vector) for argument in arguments)
         return run(function, self.split_model, *arrays)
 
     @cached_property
@@ -182,11 +182,6 @@ class FittingProblem(abc.ABC):
         """The model's arrays, and what is static in it wrapped for use as a key."""
         arrays, static = eqx.partition(self.model, eqx.is_array)
         return arrays, Static(static)
-
-
-def _is_vector(argument: Any) -> bool:
-    """Whether numbers are listed, which make an array; a named tuple holds arrays."""
-    return type(argument) in (list, tuple)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,16 +244,12 @@ class Problem(FittingProblem):
         """What stands in its place."""
         return changed.get("", self)
 
-    def build(self, vector: ArrayLike) -> Parts:
-        """Stack, scale and noise levels with the physical vector (P,)."""
-        return super().build(vector)
-
     def predict_at(self, vectors: ArrayLike, wi: ArrayLike, wo: ArrayLike) -> Array:
         """Scaled BSDF along other directions, (M, 3) each, with D vectors (D, P): (D, M, C), in 1/sr."""
         wi, wo = np.asarray(wi, float), np.asarray(wo, float)
         model = replace(self.model, **_directions(self, wi, wo))
         arrays, static = eqx.partition(model, eqx.is_array)
-        return run(_over_vectors, (arrays, Static(static)), jnp.asarray(vectors))
+        return run(_predictions, (arrays, Static(static)), jnp.asarray(vectors))
 
     def with_other_rays(self) -> "Problem":
         """The problem with other numbers of rays for the cones of its instrument: what differs is their error."""
@@ -322,11 +313,10 @@ class Joint(FittingProblem):
         }
         free = common | {name: one for some in own.values() for name, one in some.items() if name not in common}
         place = {name: index for index, name in enumerate(names_of(free))}
-        places = {part: tuple(place[name] for name in names_of(some)) for part, some in own.items()}
+        places = tuple(tuple(place[name] for name in names_of(some)) for some in own.values())
         models = tuple(problem.model for problem in self.parts.values())
         varying = any(one.varying for one in models)
-        model = JointModel(parts=models, box=Box.of(free.values()), places=tuple(places.values()), varying=varying)
-        return Assembled(free, model, places)
+        return Assembled(free, JointModel(parts=models, box=Box.of(free.values()), places=places, varying=varying))
 
     def _common(self) -> dict[str, Free]:
         """What is shared, as the first data set has it. ValueError where it is not in every one, or differs."""
@@ -435,7 +425,7 @@ def _assemble(problem: Problem) -> Assembled:
         raise ValueError(f"stack: it has {shape[-1]} channels, the data {used.values.shape[-1]}: {used.channels}")
     if np.broadcast_shapes(shape, used.values.shape) != used.values.shape:
         raise ValueError(f"transport: it gives values of shape {shape}, the data have {used.values.shape}")
-    return Assembled(free, model, {"": tuple(range(len(names)))})
+    return Assembled(free, model)
 
 
 def _require_kinds(problem: Problem) -> None:
@@ -523,7 +513,7 @@ def polar_angles(data: Measurements) -> Floats:
     return np.round([np.mean(theta[rows]) for rows in groups(theta)], 2)
 
 
-def _over_vectors(model: Model, vectors: Array) -> Array:
+def _predictions(model: Model, vectors: Array) -> Array:
     return jax.lax.map(model.predict, vectors)
 
 

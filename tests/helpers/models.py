@@ -12,6 +12,7 @@ from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.problem.parameters import Free
+from fits.problem.problem import Problem
 
 
 def directions(count: int, seed: int, lowest_cosine: float = 0.2) -> np.ndarray:
@@ -53,6 +54,13 @@ def line(stack: Any, wi: Any, wo: Any) -> Any:
 def design(count: int) -> np.ndarray:
     """The columns of `line` at the directions of `measured`."""
     return np.stack([np.ones(count), directions(count, 2)[:, 2]], axis=-1)
+
+
+def drawn_discrepancy(problem: Problem, vector: ArrayLike, generator: np.random.Generator) -> np.ndarray:
+    """A draw of the model discrepancy of the logarithms of a problem's data, (N, 1), with these parameters."""
+    process = problem.model.process
+    white = generator.standard_normal((1, len(process.where)))
+    return np.asarray(process.sample(white, problem.build(vector).correlation))
 
 
 COUNT = 100
