@@ -11,6 +11,7 @@ from fits.data.geometry import Pairs
 from fits.data.measurements import Measurements
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
+from fits.problem.noise import Noise
 from fits.problem.parameters import Free
 from fits.problem.problem import Problem
 
@@ -77,6 +78,12 @@ def line_data(sigma: float = 0.05, seed: int = 0) -> Measurements:
 def line_fit(seed: int = 0) -> Fit:
     """The fit of a line to `line_data`."""
     return fit(LINE, line_data(seed=seed), transport=line, starts=2)
+
+
+def student_fit() -> Fit:
+    """The fit of a line, the level of its noise, and tails of Student's."""
+    noise = Noise(relative=0.0, floor=Free(0.1, 1e-3, 1.0), tails="student")
+    return fit(LINE, measured(line_data().values), transport=line, noise=noise, starts=4)
 
 
 def lobe(stack: Any, wi: Any, wo: Any) -> Any:

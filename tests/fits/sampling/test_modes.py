@@ -13,7 +13,7 @@ import layerjax as lj
 from fits.optimise.fit import fit
 from fits.optimise.result import Fit
 from fits.prediction.importance import importance_draws
-from fits.problem.parameters import Free, Normal
+from fits.problem.parameters import Free, Normal, Prior, Uniform
 from fits.reports import verdicts
 from fits.reports.tables import parameter_table, posterior_table
 from fits.sampling.convergence import Convergence
@@ -36,11 +36,14 @@ def pair(stack, wi, wo):
     return jnp.exp(-stack["p"] / wo[:, 2:]) + jnp.exp(-stack["q"] / wo[:, 2:])
 
 
+def pair_fit(prior: Prior) -> Fit:
+    stack = {"p": Free(0.5, 0.0, HIGH, prior), "q": Free(0.6, 0.0, HIGH)}
+    return fit(stack, DATA, transport=pair, starts=8)
+
+
 @pytest.fixture(scope="module", params=["alike", "with a prior"])
 def fitted(request: pytest.FixtureRequest) -> Fit:
-    prior = {} if request.param == "alike" else {"prior": Normal(0.3, NARROW)}
-    stack = {"p": Free(0.5, 0.0, HIGH, **prior), "q": Free(0.6, 0.0, HIGH)}
-    return fit(stack, DATA, transport=pair, starts=8)
+    return pair_fit(Uniform() if request.param == "alike" else Normal(0.3, NARROW))
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +66,9 @@ def summed(fitted: Fit) -> tuple[float, float, float, float]:
     top = max(height.max() for _, height in parts)
     weights = [np.exp(height - top).sum(axis=1) for _, height in parts]
     total = sum(weight.sum() for weight in weights)
-    mean = sum(float(weight @ p) for (p, _), weight in zip(parts, weights, strict=True)) / total
-    square = sum(float(weight @ p**2) for (p, _), weight in zip(parts, weights, strict=True)) / total
+    mean, square = (
+        sum(float(weight @ p**power) for (p, _), weight in zip(parts, weights, strict=True)) / total for power in (1, 2)
+    )
     step = x[1] - x[0]
     return mean, math.sqrt(square - mean**2), float(weights[1].sum() / total), top + math.log(total * step**2)
 
@@ -72,17 +76,13 @@ def summed(fitted: Fit) -> tuple[float, float, float, float]:
 Sums = tuple[float, float, float, float]
 
 
-def test_the_evidence_is_that_of_all_modes(fitted: Fit, summed: Sums) -> None:
-    *_, log_evidence = summed
+def test_evidence_and_draws_by_weight_are_those_of_all_modes(fitted: Fit, summed: Sums) -> None:
+    """Predictions are made with such draws."""
+    *_, share, log_evidence = summed
     found = fits.evidence(fitted)
     assert found.reliable
     assert found.log_evidence == pytest.approx(log_evidence, abs=4.0 * found.error)
     assert found.error < 0.05  # one mode alone of two alike is 0.69 off
-
-
-def test_draws_by_weight_are_of_all_modes(fitted: Fit, summed: Sums) -> None:
-    """Those that predictions are made with."""
-    *_, share, _ = summed
     draws = importance_draws(fitted, 1000, np.random.RandomState(0)).resample(np.random.RandomState(1), 1000)
     larger = draws[:, 0] > special.logit(0.9 / HIGH)
     assert np.mean(larger) == pytest.approx(share, abs=4.0 * math.sqrt(share * (1.0 - share) / 500.0))
@@ -121,8 +121,7 @@ def test_errors_of_one_of_several_minima_are_said_to_be(fitted: Fit) -> None:
 
 
 def test_minima_that_hold_next_to_nothing_are_no_modes() -> None:
-    stack = {"p": Free(0.5, 0.0, HIGH, Normal(0.3, 0.25)), "q": Free(0.6, 0.0, HIGH)}
-    found = fit(stack, DATA, transport=pair, starts=8)  # the other is 11 lower in the log-posterior
+    found = pair_fit(Normal(0.3, 0.25))  # the other is 11 lower in the log-posterior
     assert len(found.minima) >= 2
     assert initial_mixture(found).mode_count == 1
 
